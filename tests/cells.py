@@ -1,0 +1,57 @@
+"""Runs the stages on simulated corners, without images: what detection would give is given."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.steps import STAGES
+from visioncal.session import MemoryImages, Session, View
+from visioncal.simulation import Cell
+from visioncal.transforms import invert, log
+
+
+def session_of(cell: Cell) -> Session:
+    """The session of a cell as it stands in memory, its images not rendered."""
+    options = cell.options
+    camera = options.camera
+    table = {"resolution": list(camera.resolution), "model": camera.model}
+    if options.state_intrinsics:
+        table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
+    document = {"schema": 1, "name": "cell", "mount": options.mount, "camera": table}
+    return Session(
+        document,
+        ("view", "image"),
+        tuple(View(at, image=f"{at}.png") for at in range(len(cell.corners))),
+        options.target,
+        None,
+        MemoryImages({}),
+    )
+
+
+def known_of(cell: Cell, **changes) -> Known:
+    """What is known after detection."""
+    poses = dict(enumerate(cell.base_from_flange))
+    return replace(
+        Known(session_of(cell), "joint"),
+        base_from_flange=poses,
+        corners={it.view: it for it in cell.corners},
+        resolution=cell.options.camera.resolution,
+        **changes,
+    )
+
+
+def calibrated(cell: Cell, **changes) -> Known:
+    """What is known at the end of the way."""
+    known = known_of(cell, **changes)
+    for stage in STAGES:
+        if stage.name not in ("robot", "detect"):
+            known = stage.run(known)
+    return known
+
+
+def error_of(cell: Cell, known: Known) -> np.ndarray:
+    """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
+    x_true, z_true = cell.transforms.values()
+    result = known.solved
+    return np.concatenate([log(invert(x_true) @ result.x), log(invert(z_true) @ result.z)])

@@ -1,0 +1,245 @@
+"""Recordings: the session in them is the session that was written, to the last bit."""
+
+import datetime
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+from samples import Sample, made_up
+
+from visioncal.calibration import ViewEvidence, to_document
+from visioncal.errors import DataError
+from visioncal.recording import notes, paths, read_session, write_recording
+from visioncal.recording.measures import magnification
+from visioncal.session import MemoryImages, Session
+from visioncal.types import Corners
+from visioncal.viewer import blueprint
+
+DATA = Path(__file__).parents[2] / "shared" / "data" / "sessions"
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun() -> Iterator[None]:
+    """Turns rerun's warnings, which it prints and forgets, into errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return made_up()
+
+
+@pytest.fixture(scope="module")
+def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
+    write_recording(
+        path, sample.session, sample.calibration, sample.evidence, blueprint(sample.session)
+    )
+    return path
+
+
+def write_session(path: Path, session: Session) -> Path:
+    write_recording(path, session, None, (), None)
+    return path
+
+
+def assert_same(one: Session, other: Session) -> None:
+    """Compares every fact exactly; repr tells -0.0 from 0.0, which == does not."""
+    assert other.document == one.document
+    assert other.columns == one.columns
+    assert other.target == one.target
+    assert other.target_document == one.target_document
+    # Written to calibration.json as they stand: their order counts too.
+    assert json.dumps(other.robot_document) == json.dumps(one.robot_document)
+    for a, b in zip(one.views, other.views, strict=True):
+        assert repr(vars(b)) == repr(vars(a))
+        if a.image:
+            assert other.images.exists(a.image) == one.images.exists(a.image)
+        if a.image and one.images.exists(a.image):
+            assert other.images.read(a.image) == one.images.read(a.image)
+    assert other.digest() == one.digest()
+
+
+def test_recording_gives_the_session_back(sample: Sample, recorded: Path) -> None:
+    assert_same(sample.session, Session.load(recorded))
+
+
+def test_results_do_not_change_the_session(sample: Sample, tmp_path: Path) -> None:
+    alone = write_session(tmp_path / "session.rrd", sample.session)
+    assert_same(sample.session, read_session(alone))
+
+
+def test_folder_to_recording_to_folder(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+    sample.session.save(tmp_path / "folder")
+    read_session(recorded).save(tmp_path / "again")
+    assert_same(Session.load(tmp_path / "folder"), Session.load(tmp_path / "again"))
+
+
+@pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
+def test_real_session_round_trip(name: str, tmp_path: Path) -> None:
+    folder = DATA / name
+    if not folder.is_dir():
+        pytest.skip("the shared sessions are not beside this checkout")
+    session = Session.load(folder)
+    assert_same(session, read_session(write_session(tmp_path / "real.rrd", session)))
+
+
+def test_odd_facts_survive(tmp_path: Path) -> None:
+    document = {
+        "schema": 1,
+        "name": 'Prüf\n\t"1" \N{ROBOT FACE}',
+        "mount": "eye-in-hand",
+        "extra": {"list": [1, 1.0, -0.0], "day": datetime.date(2026, 11, 20)},
+    }
+    pose = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+    columns = ["note", "view", "stamp_s", "ambient_c", *(f"cft_{name}" for name in pose)]
+    cells = [
+        ['a,"b"\n', "7", "5e-324", "1.7976931348623157e+308", "-0.0", "0", "1", "0", "0", "0", "1"],
+        ["", "-3", "", "0.1", "0.30000000000000004", "0", "1", "0", "0", "0", "1"],
+    ]
+    session = Session.assemble(document, columns, cells, MemoryImages({}))
+    assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
+
+
+def test_missing_and_shared_images_stay_so(sample: Sample, tmp_path: Path) -> None:
+    first, second, third = sample.session.views[:3]
+    views = (first, replace(second, image=first.image), replace(third, image="images/none.png"))
+    session = replace(sample.session, views=views)
+    again = read_session(write_session(tmp_path / "few.rrd", session))
+    assert_same(session, again)
+    assert not again.images.exists("images/none.png")
+
+
+def test_flipped_byte_in_an_image_is_named(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+    image = sample.session.views[4].image
+    data = bytearray(recorded.read_bytes())
+    # A PNG's content cannot be compressed further, so it lies in the file as it is.
+    place = data.find(sample.session.images.read(image)[100:130])
+    assert place > 0
+    data[place + 10] ^= 1
+    broken = tmp_path / "broken.rrd"
+    broken.write_bytes(data)
+    with pytest.raises(DataError, match="SHA-256") as error:
+        read_session(broken)
+    assert image in error.value.message
+    assert error.value.culprits == (image,)
+
+
+def test_changed_number_is_noticed(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+    number = sample.session.views[5].numbers["qy"]
+    data = recorded.read_bytes()
+    assert np.float64(number).tobytes() in data
+    broken = tmp_path / "broken.rrd"
+    broken.write_bytes(data.replace(np.float64(number).tobytes(), np.float64(-number).tobytes()))
+    with pytest.raises(DataError, match="row 6 was changed or damaged"):
+        read_session(broken)
+
+
+def test_what_is_no_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
+    junk, cut, foreign = (tmp_path / f"{name}.rrd" for name in ("junk", "cut", "foreign"))
+    junk.write_bytes(b"no recording" * 100)
+    cut.write_bytes(recorded.read_bytes()[:-20_000])
+    with rr.RecordingStream("other") as stream:
+        stream.save(foreign)
+        stream.log("points", rr.Points2D([[1.0, 2.0]]))
+        stream.disconnect()
+    for path in (junk, cut, foreign, tmp_path / "absent.rrd"):
+        with pytest.raises(DataError) as error:
+            Session.load(path)
+        assert path.name in error.value.message
+
+
+def test_failed_write_leaves_the_old_file(sample: Sample, tmp_path: Path) -> None:
+    class Broken(MemoryImages):
+        def read(self, path: str) -> bytes:
+            raise DataError(f"{path} cannot be read.")
+
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"old")
+    broken = replace(sample.session, images=Broken({it.image: b"" for it in sample.session.views}))
+    with pytest.raises(DataError, match=r"000\.png"):
+        write_session(path, broken)
+    assert path.read_bytes() == b"old"
+    assert [it.name for it in tmp_path.iterdir()] == ["recording.rrd"]
+    shutil.rmtree(tmp_path)
+    with pytest.raises(DataError, match="cannot be written"):
+        write_session(path, sample.session)
+
+
+def column(path: Path, entity: str, component: str) -> list[object]:
+    """Reads one component of one entity, in the order of the views."""
+    found: dict[int, object] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            keys = range(1) if chunk.is_static else batch.column(paths.TIMELINE).to_pylist()
+            found |= dict(zip(keys, batch.column(component).to_pylist(), strict=True))
+    return [found[key] for key in sorted(found)]
+
+
+def test_results_are_kept_exactly(sample: Sample, recorded: Path) -> None:
+    (document,) = column(recorded, paths.CALIBRATION, "TextDocument:text")
+    assert json.loads(document[0]) == json.loads(json.dumps(to_document(sample.calibration)))
+    predicted = column(recorded, paths.EVIDENCE, "visioncal.Evidence:predicted_px")
+    expected = [it.predicted_px.ravel() for it in sample.evidence if it.predicted_px is not None]
+    for one, other in zip(predicted, expected, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_corners_are_drawn_where_the_viewer_has_the_pixels(sample: Sample, recorded: Path) -> None:
+    drawn = column(recorded, paths.DETECTED, "Points2D:positions")
+    # View 3 found no corners: an empty batch takes those of view 2 off the screen.
+    assert drawn[3] == []
+    corners = sample.evidence[4].corners
+    assert corners is not None
+    # Single precision holds 640 px to 3e-5.
+    np.testing.assert_allclose(drawn[4], corners.px + 0.5, atol=1e-4)
+
+
+def test_camera_is_drawn_at_the_end_of_the_chain(sample: Sample, recorded: Path) -> None:
+    drawn = column(recorded, paths.CAMERA, "Transform3D:translation")
+    edge = sample.calibration.transforms["flange_from_cam"].as_matrix()
+    for position, seen in zip(drawn, sample.evidence, strict=True):
+        assert seen.base_from_flange is not None
+        base_from_cam = seen.base_from_flange @ edge
+        # Single precision holds 1 m to 6e-8.
+        np.testing.assert_allclose(position[0], base_from_cam[:3, 3], atol=1e-6)
+
+
+def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
+    sample = made_up(images=False)
+    path = tmp_path / "poses.rrd"
+    write_recording(
+        path, sample.session, sample.calibration, sample.evidence, blueprint(sample.session)
+    )
+    assert_same(sample.session, read_session(path))
+    assert column(path, paths.DETECTED, "Points2D:positions") == []
+
+
+def test_notes_cannot_load_or_link_anything(sample: Sample) -> None:
+    view = sample.calibration.views[6]
+    assert "](http" not in notes.view_markdown(view)
+    assert r"\[it\]\(http://example\.org\)" in notes.view_markdown(view)
+    assert "| park | " in notes.solvers_markdown(sample.calibration)
+    assert "# Check before use" in notes.verdict_markdown(sample.calibration)
+
+
+def test_magnification_fits_the_residuals() -> None:
+    px = np.zeros((4, 2))
+
+    def shown(error_px: float) -> ViewEvidence:
+        return ViewEvidence(0, Corners(0, np.arange(4), px, 1.0), px + np.array([error_px, 0.0]))
+
+    # A fiftieth of 1000 px is 20 px: 0.1 px may grow 200 times, 30 px not at all.
+    assert magnification([shown(0.1)], 1000) == 200
+    assert magnification([shown(30.0)], 1000) == 1
+    assert magnification([shown(0.0)], 1000) == 1
+    assert magnification([], 1000) == 1

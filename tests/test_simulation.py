@@ -1,0 +1,424 @@
+"""The simulated cell: is its truth true, and do its pictures show it where it says?"""
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import visioncal.simulation
+from visioncal.errors import DataError
+from visioncal.session import Session
+from visioncal.simulation import (
+    Cell,
+    CellOptions,
+    charuco_target,
+    checkerboard_target,
+    exact,
+    fine_camera,
+    fisheye_camera,
+    forward,
+    measured_poses,
+    prepare_scene,
+    project,
+    rays,
+    read_truth,
+    render,
+    render_view,
+    simulate,
+    truth_path,
+    ur_arm,
+    wide_camera,
+    write_session,
+)
+from visioncal.transforms import invert, log, rotation_angle
+from visioncal.types import Camera, Target
+
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+SMALL = dataclasses.replace(
+    wide_camera(), resolution=(640, 400), matrix=np.array([457.1, 456.8, 322.4, 198.2])
+)
+RATIONAL = dataclasses.replace(
+    wide_camera(), distortion=np.array([0.31, -0.12, 4e-4, -3e-4, 0.01, 0.42, -0.1, 0.02])
+)
+
+
+def base_from_target_chain(cell: Cell, base_from_flange: np.ndarray) -> np.ndarray:
+    """(m, 4, 4) the board's pose through the arm and the camera, or on its way through the arm."""
+    if cell.options.mount == "eye-in-hand":
+        return base_from_flange @ cell.transforms["flange_from_cam"] @ cell.cam_from_target
+    return base_from_flange @ cell.transforms["flange_from_target"]
+
+
+def base_from_target(cell: Cell) -> np.ndarray:
+    """The same without the arm."""
+    if cell.options.mount == "eye-in-hand":
+        return cell.transforms["base_from_target"]
+    return cell.transforms["base_from_cam"] @ cell.cam_from_target
+
+
+def cv_matrix(camera: Camera) -> np.ndarray:
+    fx, fy, cx, cy = camera.matrix
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def cv_project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    matrix = cv_matrix(camera)
+    zero = np.zeros(3)
+    if camera.model == "fisheye":
+        px, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, camera.distortion)
+    else:
+        px, _ = cv2.projectPoints(points[:, None], zero, zero, matrix, camera.distortion)
+    return px.reshape(-1, 2)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("robot", ["ur3e", "ur5e", "ur10e"])
+def test_exact_chain_closes(mount, robot):
+    cell = simulate(exact(CellOptions(mount=mount, robot=robot, views=8, seed=4)))
+    # A dozen products of matrices of order one: a few units in the last place each.
+    np.testing.assert_allclose(
+        base_from_target_chain(cell, cell.base_from_flange),
+        np.broadcast_to(base_from_target(cell), (8, 4, 4)),
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(cell.base_from_flange, forward(cell.arm, cell.joints))
+
+
+def test_noisy_chain_closes_on_the_truth_only():
+    cell = simulate(CellOptions(views=6, dh_sigma_m=3e-4, dh_sigma_rad=5e-4, wrong_views=1))
+    truth = base_from_target_chain(cell, cell.true_base_from_flange) - base_from_target(cell)
+    report = base_from_target_chain(cell, cell.base_from_flange) - base_from_target(cell)
+    assert np.abs(truth).max() < 1e-12  # Rounding, as above.
+    # Arm errors of 0.3 mm and 0.5 mrad at a metre cannot leave any report within 0.01 mm.
+    assert np.linalg.norm(report[:, :3, 3], axis=1).min() > 1e-5
+
+
+def test_stretched_ur_arm_is_where_its_data_sheet_puts_it():
+    # With all joints at zero the arm lies along -x and the flange looks along -y.
+    flange = forward(ur_arm("ur10e"), np.zeros((1, 6)))[0]
+    expected = [-0.6127 - 0.57155, -0.17415 - 0.11655, 0.1807 - 0.11985]
+    np.testing.assert_allclose(flange[:3, 3], expected, atol=1e-12)  # Sums of six lengths.
+    np.testing.assert_allclose(flange[:3, 2], [0.0, -1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", [wide_camera(), RATIONAL, fine_camera(), fisheye_camera()])
+def test_projection_agrees_with_opencv_and_rays_invert_it(camera):
+    rng = np.random.default_rng(3)
+    px = rng.uniform(0.0, 1.0, (500, 2)) * np.array(camera.resolution)
+    points = rays(camera, px) * rng.uniform(0.2, 3.0, (500, 1))
+    # Pixels of order a thousand, in double precision.
+    np.testing.assert_allclose(project(camera, points), px, atol=1e-9)
+    np.testing.assert_allclose(cv_project(camera, points), px, atol=1e-9)
+
+
+def test_wrong_number_of_coefficients_is_named():
+    camera = dataclasses.replace(wide_camera(), distortion=np.zeros(6))
+    with pytest.raises(DataError, match="6 distortion coefficients, 5 or 8 are needed"):
+        project(camera, np.array([[0.0, 0.0, 1.0]]))
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_corners_are_the_projected_board(mount):
+    options = CellOptions(mount=mount, views=3, pixel_sigma_px=0.2, board_scale=1.002)
+    cell = simulate(options)
+    side, found = 0.030 * 1.002, cell.exact_corners[1]
+    column, row = found.ids % 8 + 1, found.ids // 8 + 1
+    points = np.stack([column * side, row * side, 0 * side * row], axis=1)
+    pose = cell.cam_from_target[1]
+    # The same numbers through OpenCV's code.
+    expected = cv_project(options.camera, points @ pose[:3, :3].T + pose[:3, 3])
+    np.testing.assert_allclose(found.px, expected, atol=1e-9)
+    pairs = zip(cell.corners, cell.exact_corners, strict=True)
+    noise = np.concatenate([noisy.px - true.px for noisy, true in pairs])
+    # Some 200 draws give their spread to 5 %.
+    assert noise.std() == pytest.approx(0.2, rel=0.2)
+
+
+def test_views_show_the_board_from_the_front_and_mostly_whole():
+    cell = simulate(CellOptions(views=60, tilt_rad=(0.2, 0.6)))
+    tilt = rotation_angle_of_normal(cell)
+    # Repeatability moves the board by some 0.1 mrad.
+    assert 0.199 < tilt.min() < 0.3
+    assert 0.5 < tilt.max() < 0.601
+    corners = np.array([found.ids.size for found in cell.exact_corners])
+    assert (corners == 40).mean() > 0.8  # A tenth of the draws may be cut, whole ones more often.
+    assert corners.min() >= 24
+
+
+def rotation_angle_of_normal(cell: Cell) -> np.ndarray:
+    """(m,) angle between the optical axis and the board's normal [rad]."""
+    return np.arccos(cell.cam_from_target[:, 2, 2])
+
+
+def test_same_seed_same_cell_and_each_option_has_its_own_randomness():
+    options = CellOptions(views=4, seed=11)
+    once, again = simulate(options), simulate(options)
+    np.testing.assert_array_equal(once.cam_from_target, again.cam_from_target)
+    np.testing.assert_array_equal(once.corners[2].px, again.corners[2].px)
+    np.testing.assert_array_equal(render_view(once, 0), render_view(again, 0))
+    shaken = simulate(dataclasses.replace(options, robot_sigma_m=1e-3, pixel_sigma_px=0.5))
+    np.testing.assert_array_equal(shaken.joints, once.joints)
+    assert not np.array_equal(shaken.cam_from_target, once.cam_from_target)
+    other = simulate(dataclasses.replace(options, seed=12))
+    assert np.abs(other.joints - once.joints).max() > 0.1
+
+
+def test_repeatability_comes_out_as_asked():
+    sigmas = {"robot_sigma_m": 2e-4, "robot_sigma_rad": 5e-4}
+    cell = simulate(dataclasses.replace(exact(CellOptions(views=200)), **sigmas))
+    twists = log(invert(cell.base_from_flange) @ cell.true_base_from_flange)
+    # 600 draws give a spread to 3 %, and each axis' mean to 7 % of it.
+    assert twists[:, :3].std() == pytest.approx(5e-4, rel=0.1)
+    assert twists[:, 3:].std() == pytest.approx(2e-4, rel=0.1)
+    assert np.abs(twists.mean(axis=0) / twists.std(axis=0)).max() < 0.3
+
+
+def test_arm_errors_are_drawn_in_proportion():
+    small, large = (
+        simulate(dataclasses.replace(exact(CellOptions(views=5)), dh_sigma_m=s, dh_sigma_rad=s))
+        for s in (1e-5, 1e-4)
+    )
+    np.testing.assert_array_equal(small.joints, large.joints)
+    shifts = [
+        cell.true_base_from_flange[:, :3, 3] - cell.base_from_flange[:, :3, 3]
+        for cell in (small, large)
+    ]
+    # Linear to within the square of the larger error, 1e-4 of a metre or so.
+    np.testing.assert_allclose(10.0 * shifts[0], shifts[1], atol=1e-6)
+    assert np.linalg.norm(shifts[1], axis=1).min() > 1e-5
+    # The nominal arm stays the maker's.
+    np.testing.assert_array_equal(large.arm.a, ur_arm("ur10e").a)
+
+
+def test_wrong_views_are_as_wrong_as_promised():
+    cell = simulate(dataclasses.replace(exact(CellOptions(views=30, seed=5)), wrong_views=9))
+    error = invert(cell.true_base_from_flange) @ cell.base_from_flange
+    shift, turn = np.linalg.norm(error[:, :3, 3], axis=1), np.rad2deg(rotation_angle(error))
+    wrong = np.isin(np.arange(30), cell.wrong_views)
+    assert wrong.sum() == 9
+    # The inverse kinematics ends within 1e-9 of what was drawn.
+    assert np.all((shift[wrong] > 0.005 - 1e-8) & (shift[wrong] < 0.030 + 1e-8))
+    assert np.all((turn[wrong] > 1.0 - 1e-6) & (turn[wrong] < 5.0 + 1e-6))
+    assert shift[~wrong].max() < 1e-12  # Rounding.
+    assert np.ptp(shift[wrong]) > 0.005
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_poor_motions_are_as_poor_as_they_say(mount):
+    shifted = simulate(exact(CellOptions(mount=mount, views=6, motion="translation")))
+    relative = invert(shifted.base_from_flange[:1]) @ shifted.base_from_flange[1:]
+    # The inverse kinematics ends at machine precision or a little above it.
+    assert rotation_angle(relative).max() < 1e-8
+    assert np.linalg.norm(relative[:, :3, 3], axis=1).min() > 0.005
+    turned = simulate(exact(CellOptions(mount=mount, views=6, motion="one_axis")))
+    twists = log(invert(turned.base_from_flange[:1]) @ turned.base_from_flange[1:])[:, :3]
+    angles = np.linalg.norm(twists, axis=1)
+    assert angles.max() > 0.3
+    axes = twists / angles[:, None]
+    cosines = np.abs(axes @ axes[0])
+    assert cosines.min() > 1.0 - 1e-10  # An angle of 1e-5 rad, for the smallest turns drawn.
+
+
+def test_views_out_of_reach_are_refused():
+    # From 1.5 m away and 60 degrees aside the camera would have to be beyond any small arm.
+    with pytest.raises(DataError, match="of 20 views found in which the ur3e reaches"):
+        simulate(CellOptions(robot="ur3e", distance_m=(1.5, 1.6), tilt_rad=(1.0, 1.2)))
+
+
+def test_impossible_options_are_refused():
+    with pytest.raises(DataError, match="0 to 5 are possible"):
+        CellOptions(views=5, wrong_views=6)
+    with pytest.raises(DataError, match="kr16"):
+        simulate(CellOptions(robot="kr16"))
+
+
+def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    size = (target.columns, target.rows)
+    board = cv2.aruco.CharucoBoard(size, target.square_m, target.marker_m, dictionary)
+    board.setLegacyPattern(target.legacy)
+    return board
+
+
+def found_corners(target: Target, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ids and pixels of the corners that OpenCV finds."""
+    if target.kind == "charuco":
+        px, ids, _, _ = cv2.aruco.CharucoDetector(charuco_board(target)).detectBoard(image)
+        return ids.ravel(), px.reshape(-1, 2)
+    size = (target.columns, target.rows)
+    done, px = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
+    assert done
+    # OpenCV starts such a board at its light side.
+    return np.arange(len(px))[::-1], px.reshape(-1, 2)
+
+
+def detection_errors(options: CellOptions) -> np.ndarray:
+    """(n, 2) found minus true corners [px], half of the pictures taken upside down."""
+    cell = simulate(options)
+    scene = prepare_scene(cell)
+    errors = []
+    for view in range(options.views):
+        image = render(scene, view)
+        true = cell.exact_corners[view]
+        # Upside down for a detector that has a bias of its own: there its sign changes.
+        ids, px = found_corners(options.target, image)
+        _, here, there = np.intersect1d(ids, true.ids, return_indices=True)
+        errors.append(px[here] - true.px[there])
+        ids, px = found_corners(options.target, np.ascontiguousarray(image[::-1, ::-1]))
+        _, here, there = np.intersect1d(ids, true.ids, return_indices=True)
+        errors.append(np.array(image.shape[::-1]) - 1.0 - px[here] - true.px[there])
+    return np.concatenate(errors)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        CellOptions(),
+        CellOptions(camera=fisheye_camera(), tilt_rad=(0.1, 0.5)),
+        CellOptions(target=checkerboard_target(), blur_px=1.0),
+        CellOptions(target=dataclasses.replace(charuco_target(), legacy=True)),
+        CellOptions(board_scale=1.01, board_bow_m=0.003),
+        CellOptions(mount="eye-to-hand", distance_m=(0.5, 0.8)),
+    ],
+    ids=["charuco", "fisheye", "checkerboard", "legacy", "bowed", "to-hand"],
+)
+def test_pictures_show_the_corners_where_they_are(options):
+    errors = detection_errors(dataclasses.replace(options, views=2, seed=2))
+    assert len(errors) > 120
+    # Half a pixel's shift, or a third of one from the sub-pixels, would stand out. Some 150
+    # corners at 0.04 px give their mean to 0.003 px.
+    assert np.abs(errors.mean(axis=0)).max() < 0.02
+    assert np.sqrt((errors**2).mean()) < 0.08  # What the detectors reach at this blur and noise.
+
+
+def test_print_is_opencvs_board():
+    # Seen straight and exactly, the print is the image that OpenCV would print.
+    target = charuco_target()
+    cell = simulate(exact(CellOptions(views=1, camera=SMALL, vignetting=0.0)))
+    pose = cell.cam_from_target[0]
+    image = render_view(cell, 0).astype(float)
+    board = charuco_board(target).generateImage((900, 600))
+    # Centres of a 6x6 grid in each square, where neither image has an edge within a module.
+    u, v = np.meshgrid(np.arange(2.5, 900, 5.0), np.arange(2.5, 600, 5.0))
+    flat = np.stack([u, v, 0 * u], axis=-1).reshape(-1, 3) * 0.030 / 100.0
+    px = cv_project(SMALL, flat @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+    seen = cv2.remap(image, px[:, 0], px[:, 1], cv2.INTER_LINEAR).ravel()
+    printed = board[v.astype(int), u.astype(int)].ravel()
+    white, black = seen[printed > 128], seen[printed < 128]
+    # Edges blur; a wrong or turned marker would put a tenth of all samples on the wrong side.
+    threshold = 0.5 * (np.median(white) + np.median(black))
+    assert (white > threshold).mean() > 0.97
+    assert (black < threshold).mean() > 0.97
+
+
+def test_noise_blur_and_vignetting_are_in_the_picture():
+    plain = exact(CellOptions(views=1, camera=SMALL, vignetting=0.0, seed=1))
+    clean = render_view(simulate(plain), 0).astype(float)
+    noisy = render_view(simulate(dataclasses.replace(plain, image_noise=3.0)), 0) - clean
+    # 256,000 draws; rounding to grey levels adds 0.4 to 3.0 in squares.
+    assert noisy.std() == pytest.approx(3.0, rel=0.05)
+    dark = render_view(simulate(dataclasses.replace(plain, vignetting=0.4)), 0)
+    # The outermost pixels are a little inside the corner, and the black level stays.
+    ratio = (dark[:8, :8].mean() - 4.0) / (clean[:8, :8].mean() - 4.0)
+    assert ratio == pytest.approx(0.6, abs=0.03)
+    soft = render_view(simulate(dataclasses.replace(plain, blur_px=2.0)), 0)
+    sharpness = [cv2.Laplacian(np.float32(image), cv2.CV_32F).std() for image in (clean, soft)]
+    # A Laplacian of sigma 0.7 against 2.0 px: its response falls with the square of the sigma.
+    assert sharpness[1] < 0.4 * sharpness[0]
+
+
+@pytest.mark.parametrize("quality", [None, 90])
+def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
+    target = dataclasses.replace(charuco_target(), name="own", square_m=0.025, marker_m=0.018)
+    options = CellOptions(
+        views=2, camera=SMALL, target=target, jpeg_quality=quality, wrong_views=1, seed=3
+    )
+    cell = simulate(options)
+    shares = []
+    folder = write_session(cell, tmp_path / "cell", shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    session = Session.load(folder)
+    assert session.warnings == ()
+    assert dataclasses.replace(session.target, name="own") == target
+    np.testing.assert_array_equal(session.camera.matrix, SMALL.matrix)
+    for view in session.views:
+        np.testing.assert_array_equal(view.joints_rad, cell.joints[view.number])
+        # Through a quaternion and back: rounding.
+        reported = view.base_from_flange().as_matrix()
+        np.testing.assert_allclose(reported, cell.base_from_flange[view.number], atol=1e-12)
+        data = np.frombuffer(session.images.read(view.image), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED).astype(float)
+        # JPEG at 90 keeps grey levels to a few; PNG keeps them all.
+        difference = image - render_view(cell, view.number)
+        assert np.abs(difference).mean() < (1e-12 if quality is None else 3.0)
+    assert not list(folder.rglob("*truth*"))
+    truth = read_truth(folder)
+    for name, matrix in cell.transforms.items():
+        np.testing.assert_array_equal(truth.transforms[name], matrix)
+    np.testing.assert_array_equal(truth.cam_from_target, cell.cam_from_target)
+    assert truth.wrong_views == cell.wrong_views
+    assert truth.options["robot_sigma_m"] == options.robot_sigma_m
+    np.testing.assert_array_equal(truth.camera.distortion, SMALL.distortion)
+
+
+@pytest.mark.parametrize("target", [charuco_target(), checkerboard_target()])
+def test_shipped_boards_are_named_and_say_the_same(tmp_path, target):
+    options = CellOptions(views=1, camera=SMALL, target=target, state_intrinsics=False)
+    session = Session.load(write_session(simulate(options), tmp_path / "cell"))
+    assert session.document["target"] == target.name
+    assert session.target == target
+    assert session.camera is None
+    assert session.resolution == SMALL.resolution
+
+
+def test_pose_pairs_are_exact_without_noise(tmp_path):
+    cell = simulate(exact(CellOptions(views=3, mount="eye-to-hand")))
+    session = Session.load(write_session(cell, tmp_path / "pairs", images=False))
+    assert session.target is None
+    assert session.camera is None
+    for view in session.views:
+        # Through a quaternion and back: rounding.
+        measured = view.cam_from_target().as_matrix()
+        np.testing.assert_allclose(measured, cell.cam_from_target[view.number], atol=1e-12)
+
+
+def test_pose_pairs_spread_as_pnp_on_the_noisy_corners_does():
+    options = CellOptions(views=60, pixel_sigma_px=0.3)
+    cell = simulate(options)
+    matrix = cv_matrix(options.camera)
+    solved = []
+    for found, pose in zip(cell.corners, cell.cam_from_target, strict=True):
+        points = 0.030 * np.stack([found.ids % 8 + 1, found.ids // 8 + 1, 0 * found.ids], axis=1)
+        start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
+        distortion = options.camera.distortion
+        _, turn, shift = cv2.solvePnP(points, found.px, matrix, distortion, *start, True)
+        guess = np.eye(4)
+        guess[:3, :3], guess[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+        solved.append(guess)
+    drawn = log(invert(cell.cam_from_target) @ measured_poses(cell))
+    fitted = log(invert(cell.cam_from_target) @ np.array(solved))
+    # Two spreads from 60 draws each: their ratio is known to 13 %, so 40 % is three sigmas.
+    np.testing.assert_allclose(drawn.std(axis=0) / fitted.std(axis=0), 1.0, atol=0.4)
+
+
+def test_other_files_are_no_truth(tmp_path):
+    truth_path(tmp_path / "cell").write_text('{"schema": 1}', encoding="utf-8")
+    with pytest.raises(DataError, match="not the truth"):
+        read_truth(tmp_path / "cell")
+
+
+def test_simulation_shares_no_model_with_the_application():
+    allowed = ("errors", "types", "transforms", "files", "session", "simulation")
+    folder = Path(visioncal.simulation.__file__).parent
+    imported = {
+        node.module
+        for path in folder.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("visioncal")
+    }
+    assert len(imported) > 5
+    assert {name.split(".")[1] for name in imported} <= set(allowed)

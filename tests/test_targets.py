@@ -1,0 +1,171 @@
+"""Targets: their files are checked, and their corners are where OpenCV and the print put them."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from visioncal.errors import DataError
+from visioncal.targets import (
+    DEFAULT_RELATIVE_SIGMA,
+    charuco_board,
+    corner_positions,
+    load_target,
+    rotation_transforms,
+    rotations,
+    target_document,
+    target_from_document,
+    target_names,
+)
+from visioncal.types import Target
+
+CHARUCO: dict[str, Any] = {
+    "kind": "charuco",
+    "columns": 9,
+    "rows": 6,
+    "square_m": 0.03,
+    "square_sigma_m": 1e-5,
+    "marker_m": 0.022,
+    "dictionary": "DICT_5X5_100",
+}
+MARKER: dict[str, Any] = {
+    "kind": "marker",
+    "id": 7,
+    "size_m": 0.1,
+    "dictionary": "DICT_APRILTAG_36h11",
+}
+
+
+def checkerboard(columns: int, rows: int) -> Target:
+    return Target("board", "checkerboard", columns, rows, 0.02, 1e-5)
+
+
+@pytest.mark.parametrize("name", target_names())
+def test_shipped_targets_load_and_round_trip(name: str, tmp_path: Path) -> None:
+    target, document = load_target(name, tmp_path)
+    assert target.name == name
+    assert target_from_document(target_document(target), name) == target
+    assert target_from_document(document, name) == target
+
+
+def test_the_promised_boards_are_shipped() -> None:
+    promised = {"charuco_9x6_30mm", "charuco_14x9_20mm", "checkerboard_9x6_25mm"}
+    assert promised <= set(target_names())
+
+
+def test_a_path_is_relative_to_the_folder_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "boards").mkdir()
+    (tmp_path / "boards" / "my board.toml").write_text(
+        '\ufeffkind = "checkerboard"\ncolumns = 4\nrows = 3\nsquare_m = 0.05\n', encoding="utf-8"
+    )
+    target, _ = load_target("boards\\my board.toml", tmp_path)
+    assert (target.name, target.columns) == ("my board", 4)
+    assert target.square_sigma_m == DEFAULT_RELATIVE_SIGMA * 0.05
+
+
+def test_an_unknown_name_lists_the_names_and_a_near_one() -> None:
+    with pytest.raises(DataError, match="checkerboard_9x6_25mm") as caught:
+        load_target("charuco_9x6", None)
+    assert "Did you mean charuco_9x6_30mm" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "chess"}, "kind is 'chess'; \"charuco\" or"),
+        ({"columns": 2}, "columns is 2; a whole number from 3 to 100"),
+        ({"rows": 6.0}, r"rows is 6\.0"),
+        ({"square_m": 0}, "square_m is 0; a number above 0"),
+        ({"square_sigma_m": -1e-5}, "square_sigma_m is -1e-05"),
+        ({"marker_m": 0.03}, r"marker_m is 0\.03; less than square_m = 0\.03"),
+        ({"dictionary": "DICT_5X5_10"}, "dictionary is 'DICT_5X5_10', which OpenCV does not"),
+        ({"dictionary": "CharucoBoard"}, "which OpenCV does not have"),
+        ({"columns": 20, "rows": 11}, "has 100 markers; a board of 20 x 11 squares needs 110"),
+        ({"legacy": 1}, "legacy is 1; true or false"),
+    ],
+)
+def test_a_wrong_field_is_named_with_what_it_must_be(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        target_from_document(CHARUCO | change, "mine")
+
+
+def test_a_marker_needs_an_id_of_its_dictionary() -> None:
+    assert target_from_document(MARKER, "tag").marker_id == 7
+    with pytest.raises(DataError, match="id is 587; a whole number from 0 to 586"):
+        target_from_document(MARKER | {"id": 587}, "tag")
+
+
+@pytest.mark.parametrize(("columns", "rows", "legacy"), [(9, 6, False), (9, 6, True), (5, 7, True)])
+def test_charuco_corners_are_opencvs(columns: int, rows: int, legacy: bool) -> None:
+    document = CHARUCO | {"columns": columns, "rows": rows, "legacy": legacy}
+    target = target_from_document(document, "b")
+    board = charuco_board(target)
+    # OpenCV keeps single precision: 1e-7 of the board's size.
+    np.testing.assert_allclose(corner_positions(target), board.getChessboardCorners(), atol=1e-7)
+    assert board.getLegacyPattern() is legacy
+
+
+def test_charuco_corners_lie_where_the_printed_page_has_them() -> None:
+    target = target_from_document(CHARUCO, "b")
+    page = charuco_board(target).generateImage((900, 600))
+    px, ids, _, _ = cv2.aruco.CharucoDetector(charuco_board(target)).detectBoard(page)
+    assert sorted(ids.ravel()) == list(range(40))
+    seen = px.reshape(-1, 2)[np.argsort(ids.ravel())]
+    # 100 px a square; pixel centres at integers put the page's edge at -0.5; the detector is good
+    # to a few tenths of a pixel on a page without blur.
+    expected = corner_positions(target)[:, :2] / target.square_m * 100 - 0.5
+    np.testing.assert_allclose(seen, expected, atol=0.6)
+
+
+def test_marker_corners_are_in_opencvs_order_around_the_centre() -> None:
+    target = target_from_document(MARKER, "tag")
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    page = np.full((400, 400), 255, np.uint8)
+    page[100:300, 100:300] = cv2.aruco.generateImageMarker(dictionary, 7, 200)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(page)
+    assert ids.ravel().tolist() == [7]
+    seen = corners[0].reshape(4, 2)
+    expected = corner_positions(target)[:, :2] / target.square_m * 200 + 199.5
+    # Without refinement the detector's corners are whole pixels.
+    np.testing.assert_allclose(seen, expected, atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows"), [(9, 6), (8, 6), (7, 5), (5, 5), (6, 6), (4, 4), (3, 4), (3, 3)]
+)
+def test_rotations_are_those_that_leave_the_printed_page_as_it_is(columns: int, rows: int) -> None:
+    target = checkerboard(columns, rows)
+    page = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2
+    turns = [k for k in range(4) if np.array_equal(np.rot90(page, k), page)]
+    assert len(rotations(target)) == len(turns)
+
+    # A colour is looked up at each square's centre, before and after the turn.
+    centres = np.stack([*np.mgrid[0 : columns + 1, 0 : rows + 1]], axis=-1).reshape(-1, 2) - 0.5
+    for turn in rotation_transforms(target):
+        moved = centres * target.square_m @ turn[:2, :2].T + turn[:2, 3]
+        there = np.rint(moved / target.square_m + 0.5).astype(int)
+        here = np.rint(centres + 0.5).astype(int)
+        assert np.array_equal(page[there[:, 1], there[:, 0]], page[here[:, 1], here[:, 0]])
+        assert np.linalg.det(turn[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(8, 6), (6, 6), (5, 5)])
+def test_permutations_belong_to_their_transforms(columns: int, rows: int) -> None:
+    target = checkerboard(columns, rows)
+    positions = corner_positions(target)
+    pairs = list(zip(rotations(target), rotation_transforms(target), strict=True))
+    assert np.array_equal(pairs[0][0], np.arange(columns * rows))
+    for permutation, turn in pairs:
+        assert sorted(permutation) == list(range(columns * rows))
+        turned = positions @ turn[:3, :3].T + turn[:3, 3]
+        # Exact but for the rounding of one product and one sum.
+        np.testing.assert_allclose(positions[permutation], turned, atol=1e-15)
+
+
+@pytest.mark.parametrize("document", [CHARUCO | {"columns": 8}, MARKER])
+def test_markers_break_every_symmetry(document: dict[str, Any]) -> None:
+    target = target_from_document(document, "b")
+    assert len(rotations(target)) == 1
+    assert np.array_equal(rotation_transforms(target), np.eye(4)[None])

@@ -1,0 +1,53 @@
+"""The application: its commands, and how their ends become exit statuses."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from visioncal.cli.calibrate import calibrate_command
+from visioncal.cli.console import report_error
+from visioncal.cli.demo import demo_command
+from visioncal.cli.simulate import simulate_command
+from visioncal.errors import VisioncalError
+from visioncal.version import __version__
+
+# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result.
+EXIT_NO_RESULT = 2
+
+app = typer.Typer(
+    name="visioncal",
+    help="Calibrates vision-guided robot cells with a printed board, and says how far the result "
+    "can be trusted.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("demo")(demo_command)
+app.command("calibrate")(calibrate_command)
+app.command("simulate")(simulate_command)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
+    """Options of the application itself."""
+
+
+def main() -> None:
+    """Runs the command line; an error of the user's input ends with status 2 and one message."""
+    try:
+        app()
+    except VisioncalError as error:
+        report_error(error, as_json="--json" in sys.argv[1:])
+        sys.exit(EXIT_NO_RESULT)

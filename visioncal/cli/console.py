@@ -1,0 +1,108 @@
+"""What the commands share: messages to stderr, results to stdout, progress between."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from visioncal.calibration import Calibration
+from visioncal.errors import VisioncalError
+from visioncal.recording.measures import pose_difference
+from visioncal.types import Progress as Told
+
+_COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
+_LISTED_CULPRITS = 10
+
+
+def messages() -> Console:
+    """The console for messages: stderr."""
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def shown_progress(quiet: bool) -> Iterator[Told]:
+    """Shows a bar of the stage at work, where somebody looks at a terminal."""
+    columns = (
+        TextColumn("{task.description:<12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    console = messages()
+    with Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as bar:
+        task = bar.add_task("", total=None)
+
+        def told(stage: str, done: int, total: int) -> None:
+            bar.update(task, description=stage, completed=done, total=total)
+
+        yield told
+
+
+def report_error(error: VisioncalError, *, as_json: bool) -> None:
+    """Prints an error: one message to stderr, or a JSON object to stdout."""
+    if as_json:
+        document = {
+            "class": type(error).__name__,
+            "message": error.message,
+            "culprits": list(error.culprits),
+            "next": error.next_step,
+        }
+        typer.echo(json.dumps({"error": document}, indent=2))
+        return
+    console = messages()
+    console.print(f"[bold red]error:[/] {escape(error.message)}")
+    for culprit in error.culprits[:_LISTED_CULPRITS]:
+        if culprit not in error.message:
+            console.print(f"  - {escape(culprit)}")
+    more = len(error.culprits) - _LISTED_CULPRITS
+    if more > 0:
+        console.print(f"  - and {more} more")
+    if error.next_step:
+        console.print(escape(error.next_step))
+
+
+def print_summary(calibration: Calibration, *, verbose: bool) -> None:
+    """Prints a result for people: the verdict first, then the figures it rests on."""
+    console = messages()
+    verdict = calibration.verdict
+    colour = _COLOURS[verdict.status]
+    console.print(f"[{colour}]{verdict.status}[/]  {escape(calibration.session_name)}")
+    for reason in verdict.reasons:
+        console.print(f"  - {escape(reason)}")
+    for name, edge in calibration.edges.items():
+        x, y, z = 1e3 * edge.transform.translation
+        console.print(
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm and "
+            f"{edge.sigma_deg:.2g} deg"
+        )
+    used = sum(view.used for view in calibration.views)
+    held = calibration.validation.held_out
+    console.print(
+        f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
+        f"{held.mm:.2g} mm, {held.deg:.2g} deg" + (f", {held.px:.2g} px" if held.px else "")
+    )
+    for view in calibration.views:
+        if not view.used:
+            console.print(f"  view {view.view}: {escape(view.reason)}")
+    if verbose:
+        console.print(_solver_table(calibration))
+
+
+def _solver_table(calibration: Calibration) -> Table:
+    differences = [f"{name} differs by" for name in calibration.edges]
+    table = Table("solver", "rms [mm]", "rms [deg]", *differences, box=None)
+    for name, result in calibration.solvers.items():
+        away = [
+            pose_difference(edge.transform.as_matrix(), result.transforms[it].as_matrix())
+            for it, edge in calibration.edges.items()
+        ]
+        cells = [f"{mm:.3f} mm, {deg:.4f} deg" for mm, deg in away]
+        table.add_row(name, f"{result.rms_mm:.3f}", f"{result.rms_deg:.4f}", *cells)
+    return table

@@ -1,0 +1,79 @@
+"""`visioncal simulate`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from visioncal.cli.console import messages, shown_progress
+from visioncal.simulation import (
+    CellOptions,
+    charuco_target,
+    checkerboard_target,
+    fine_camera,
+    fisheye_camera,
+    simulate,
+    truth_path,
+    wide_camera,
+    write_session,
+)
+from visioncal.types import Mount
+
+_CAMERAS = {"wide": wide_camera, "fine": fine_camera, "fisheye": fisheye_camera}
+_BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
+
+
+def simulate_command(
+    folder: Annotated[Path, typer.Argument(help="Where to write the session.")],
+    mount: Annotated[Mount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
+    views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20,
+    robot: Annotated[str, typer.Option(help="ur3e, ur5e or ur10e.")] = "ur10e",
+    camera: Annotated[
+        Literal["wide", "fine", "fisheye"],
+        typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
+    ] = "wide",
+    board: Annotated[
+        Literal["charuco", "checkerboard"], typer.Option(help="What is printed.")
+    ] = "charuco",
+    robot_sigma_mm: Annotated[
+        float, typer.Option(min=0.0, help="Repeatability of the robot [mm].")
+    ] = 0.03,
+    robot_sigma_mrad: Annotated[
+        float, typer.Option(min=0.0, help="Repeatability of its rotation [mrad].")
+    ] = 0.05,
+    wrong_views: Annotated[
+        int, typer.Option(min=0, help="Views whose reported pose is wrong.")
+    ] = 0,
+    board_scale: Annotated[
+        float, typer.Option(min=0.5, max=2.0, help="Printed over stated size of the board.")
+    ] = 1.0,
+    with_intrinsics: Annotated[
+        bool, typer.Option(help="Whether the session states the camera's intrinsics.")
+    ] = True,
+    images: Annotated[
+        bool, typer.Option(help="Whether to render images; pose pairs are written otherwise.")
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Another cell for every number.")] = 0,
+) -> None:
+    """Write a simulated session, and its truth in a file beside it."""
+    options = CellOptions(
+        robot=robot,
+        mount=mount,
+        views=views,
+        target=_BOARDS[board](),
+        camera=_CAMERAS[camera](),
+        state_intrinsics=with_intrinsics,
+        robot_sigma_m=1e-3 * robot_sigma_mm,
+        robot_sigma_rad=1e-3 * robot_sigma_mrad,
+        wrong_views=wrong_views,
+        board_scale=board_scale,
+        seed=seed,
+    )
+    with shown_progress(quiet=False) as told:
+        write_session(
+            simulate(options),
+            folder,
+            lambda share: told("render", round(share * views), views),
+            images=images,
+        )
+    messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")

@@ -1,0 +1,38 @@
+"""The errors of visioncal: one class for each way in which a caller can react."""
+
+from collections.abc import Sequence
+
+
+class VisioncalError(Exception):
+    """Base of all errors that visioncal raises on purpose.
+
+    Attributes:
+        message: What is wrong: the value seen and the value needed.
+        culprits: The files, rows, views, columns or directions to look at.
+        next_step: What the user can do about it; empty where the message already says it.
+    """
+
+    def __init__(self, message: str, *, culprits: Sequence[str] = (), next_step: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.culprits = tuple(culprits)
+        self.next_step = next_step
+
+    def __str__(self) -> str:
+        return f"{self.message} {self.next_step}".strip()
+
+
+class DataError(VisioncalError):
+    """The input is wrong or missing: mend the file or the row that is named."""
+
+
+class DegenerateError(VisioncalError):
+    """The input is sound but cannot determine the answer: add the views that are named."""
+
+
+class ConvergenceError(VisioncalError):
+    """An iteration did not settle on data that should allow it: report it with the session."""
+
+
+class DriverError(VisioncalError):
+    """A device is absent or misbehaves: look at the cable or install the extra that is named."""

@@ -1,0 +1,135 @@
+"""Intrinsics and poses together, from corners alone (Zhang 2000, section 3.2).
+
+The poses are eliminated view by view with a Schur complement (Triggs et al. 2000, section 6.1), so
+that each step solves a system of the size of the intrinsics.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.estimator.corners import CornerStack, Reprojection, reproject
+from visioncal.estimator.linalg import covariance, damped_step
+from visioncal.transforms import exp
+from visioncal.types import Camera, FloatArray
+
+_ITERATIONS = 100
+_SETTLED = 1e-9  # relative decrease of the cost below which the fit has settled
+_START_DAMPING = 1e-3
+_WORST_DAMPING = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class BundleFit:
+    """Intrinsics and poses.
+
+    Attributes:
+        camera: The intrinsics.
+        cam_from_target: (v, 4, 4).
+        residuals: (n, 2) [px].
+        sigma_px: Standard deviation of a corner's coordinate, by the residuals [px].
+        covariance: (4 + k, 4 + k) of the intrinsics, poses marginalised.
+        settled: Whether the iteration came to rest.
+    """
+
+    camera: Camera
+    cam_from_target: FloatArray
+    residuals: FloatArray
+    sigma_px: float
+    covariance: FloatArray
+    settled: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Normal equations in blocks: intrinsics (k), poses (v, 6), and between them (v, 6, k)."""
+
+    by_intrinsics: FloatArray
+    by_pose: FloatArray
+    between: FloatArray
+    intrinsics_gradient: FloatArray
+    pose_gradient: FloatArray
+
+    def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Eliminates the poses.
+
+        Returns:
+            (k, k) information and (k,) gradient of the intrinsics alone, and (v, 6, k + 1): what
+            the poses do in answer to a step of the intrinsics, and by themselves.
+        """
+        damped = self.by_pose + damping * self.by_pose * np.eye(6)
+        right = np.concatenate([self.between, self.pose_gradient[:, :, None]], axis=2)
+        answer = np.linalg.solve(damped, right)
+        taken = np.swapaxes(self.between, 1, 2) @ answer
+        taken = taken.sum(axis=0)
+        return (
+            self.by_intrinsics - taken[:, :-1],
+            self.intrinsics_gradient - taken[:, -1],
+            answer,
+        )
+
+
+def fit_bundle(
+    stack: CornerStack, camera: Camera, cam_from_target: FloatArray, prior_sigma: FloatArray
+) -> BundleFit:
+    """Estimates intrinsics and poses by Levenberg-Marquardt.
+
+    Args:
+        stack: The corners of v views.
+        camera: The start, and the mean of the prior.
+        cam_from_target: (v, 4, 4) starts.
+        prior_sigma: (4 + k,) weak prior, which keeps what the views cannot determine in place.
+
+    Returns:
+        The fit. Its covariance counts the corners only, not the prior.
+    """
+    poses, damping, settled = cam_from_target, _START_DAMPING, False
+    start = intrinsics(camera)
+    weight = 1.0 / prior_sigma**2
+    now = reproject(stack, camera, poses)
+    cost = float(np.sum(now.residuals**2))
+    for _ in range(_ITERATIONS):
+        if settled or damping > _WORST_DAMPING:
+            break
+        blocks = _blocks(stack, now)
+        offset = intrinsics(camera) - start
+        information, gradient, answer = blocks.reduced(damping)
+        # The prior is in units of a corner's noise of 1 px, as the information is.
+        step = damped_step(information + np.diag(weight), gradient + weight * offset, damping)
+        pose_step = -(answer[:, :, :-1] @ step) - answer[:, :, -1]
+        candidate = with_intrinsics(camera, intrinsics(camera) + step)
+        candidate_poses = poses @ exp(pose_step)
+        then = reproject(stack, candidate, candidate_poses)
+        moved = intrinsics(candidate) - start
+        cost_then = float(np.sum(then.residuals**2) + weight @ moved**2)
+        if not cost_then <= cost:
+            damping *= 10
+            continue
+        settled = cost - cost_then <= _SETTLED * cost
+        camera, poses, now, cost = candidate, candidate_poses, then, cost_then
+        damping = max(damping / 10, 1e-12)
+    return _finished(stack, camera, poses, now, settled=settled)
+
+
+def _finished(
+    stack: CornerStack, camera: Camera, poses: FloatArray, now: Reprojection, *, settled: bool
+) -> BundleFit:
+    information, _, _ = _blocks(stack, now).reduced(0.0)
+    freedom = 2 * len(stack.px) - 6 * len(poses) - len(information)
+    sigma_px = float(np.sqrt(np.sum(now.residuals**2) / max(freedom, 1)))
+    spread = sigma_px**2 * covariance(information)
+    return BundleFit(camera, poses, now.residuals, sigma_px, spread, settled)
+
+
+def _blocks(stack: CornerStack, at: Reprojection) -> _Blocks:
+    by_pose, by_intrinsics = at.by_pose, at.by_intrinsics
+    transposed = np.swapaxes(by_pose, 1, 2)
+    flat = by_intrinsics.reshape(-1, by_intrinsics.shape[2])
+    return _Blocks(
+        flat.T @ flat,
+        stack.sum_by_view(transposed @ by_pose),
+        stack.sum_by_view(transposed @ by_intrinsics),
+        flat.T @ at.residuals.reshape(-1),
+        stack.sum_by_view((transposed @ at.residuals[:, :, None])[:, :, 0]),
+    )

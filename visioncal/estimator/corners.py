@@ -1,0 +1,117 @@
+"""The corners of all views in one stack, and the normal equations of their reprojection.
+
+The model: px = camera(cam_from_target * p_target) + noise. All views are worked on at once; sums
+over a view's corners are segments of the stack.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from visioncal.camera import project_with_jacobian
+from visioncal.transforms import skew
+from visioncal.types import Camera, Corners, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class CornerStack:
+    """The corners of v views, n in all.
+
+    Attributes:
+        views: (v,) view numbers.
+        starts: (v,) where each view's corners begin.
+        view_of: (n,) index of each corner's view.
+        ids: (n,) each corner's number on the target.
+        points: (n, 3) corners on the target [m].
+        px: (n, 2) where they were seen [px].
+    """
+
+    views: tuple[int, ...]
+    starts: IntArray
+    view_of: IntArray
+    ids: IntArray
+    points: FloatArray
+    px: FloatArray
+
+    @classmethod
+    def of(cls, corners: Mapping[int, Corners], positions: FloatArray) -> Self:
+        """Stacks the corners by view; `positions` are the target's (c, 3) corners [m]."""
+        counts = [len(it.ids) for it in corners.values()]
+        return cls(
+            tuple(corners),
+            np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
+            np.repeat(np.arange(len(counts)), counts),
+            np.concatenate([it.ids for it in corners.values()]),
+            np.concatenate([positions[it.ids] for it in corners.values()]),
+            np.concatenate([it.px for it in corners.values()]),
+        )
+
+    def keep(self, mask: FloatArray) -> "CornerStack":
+        """Returns the stack of the corners in an (n,) mask; views left without any vanish."""
+        kept_views, view_of = np.unique(self.view_of[mask], return_inverse=True)
+        return CornerStack(
+            tuple(self.views[at] for at in kept_views),
+            np.searchsorted(view_of, np.arange(len(kept_views))),
+            view_of,
+            self.ids[mask],
+            self.points[mask],
+            self.px[mask],
+        )
+
+    @property
+    def counts(self) -> IntArray:
+        """(v,) corners a view."""
+        return np.diff(np.append(self.starts, len(self.px)))
+
+    def sum_by_view(self, values: FloatArray) -> FloatArray:
+        """Sums (n, ...) values over the corners of each view, to (v, ...)."""
+        return np.asarray(np.add.reduceat(values, self.starts, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Reprojection:
+    """Reprojection of a stack, and its normal equations where they were asked for.
+
+    Attributes:
+        residuals: (n, 2) predicted minus seen [px].
+        by_pose: (n, 2, 6) derivatives by each view's right perturbation of cam_from_target.
+        by_intrinsics: (n, 2, k) derivatives by the intrinsics.
+    """
+
+    residuals: FloatArray
+    by_pose: FloatArray
+    by_intrinsics: FloatArray
+
+
+def reproject(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> Reprojection:
+    """Reprojects a stack.
+
+    Args:
+        stack: The corners of v views.
+        camera: The intrinsics.
+        cam_from_target: (v, 4, 4) one pose a view.
+
+    Returns:
+        Residuals and derivatives. A point at or behind the camera counts as seen a whole image
+        away, without a derivative, so that a step that puts it there is not taken.
+    """
+    poses = cam_from_target[stack.view_of]
+    rotation = poses[:, :3, :3]
+    points_cam = (rotation @ stack.points[:, :, None])[:, :, 0] + poses[:, :3, 3]
+    projection = project_with_jacobian(camera, points_cam)
+    by_translation = projection.by_point @ rotation
+    by_pose = np.concatenate([-by_translation @ skew(stack.points), by_translation], axis=2)
+    residuals = projection.px - stack.px
+    behind = ~np.isfinite(residuals).all(axis=1)
+    if behind.any():
+        residuals[behind] = max(camera.resolution)
+        by_pose[behind] = 0.0
+        projection.by_intrinsics[behind] = 0.0
+    return Reprojection(residuals, by_pose, projection.by_intrinsics)
+
+
+def mean_square_by_view(stack: CornerStack, residuals: FloatArray) -> FloatArray:
+    """Mean squared residual of each view's corners, (v,) [px^2]."""
+    return stack.sum_by_view(np.sum(residuals**2, axis=1)) / stack.counts

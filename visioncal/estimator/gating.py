@@ -1,0 +1,64 @@
+"""Telling wrong corners and wrong views from noise by their reprojection residuals."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.estimator.corners import CornerStack, mean_square_by_view
+from visioncal.types import FloatArray
+
+# Views differ in noise by two or so, and eight sigma of all are four of the noisiest; a corner that
+# belongs elsewhere is off by a good part of a square.
+_CORNER_SIGMAS = 8.0
+# Views differ in blur and distance, so that their noise differs by two or three; a view with a
+# wrong layout, a moving board or another board is off by far more.
+_VIEW_RATIO = 5.0
+# No corner and no view is thrown out for less [px]: such errors do no harm.
+_CORNER_FLOOR_PX, _VIEW_FLOOR_PX = 0.5, 1.0
+# A view that loses more than this share of its corners is wrong as a whole; so is one that keeps
+# too few for a homography.
+_CORNER_SHARE, _FEWEST_CORNERS = 0.5, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """What passes: an (n,) mask of corners, and the reason for each view thrown out."""
+
+    mask: FloatArray
+    reasons: Mapping[int, str]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether everything passes."""
+        return bool(self.mask.all())
+
+
+def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
+    """Finds the corners and the views whose residuals are no noise.
+
+    Args:
+        stack: The corners.
+        residuals: (n, 2) their reprojection residuals [px].
+
+    Returns:
+        The corners that pass and the views that do not.
+    """
+    # Median of the length of a two-dimensional Gaussian: sqrt(2 ln 2) sigma (Rayleigh).
+    length = np.linalg.norm(residuals, axis=1)
+    sigma = np.median(length) / np.sqrt(2 * np.log(2))
+    passes = length <= max(_CORNER_SIGMAS * sigma, _CORNER_FLOOR_PX)
+
+    rms = np.sqrt(mean_square_by_view(stack, residuals))
+    limit = max(_VIEW_RATIO * float(np.median(rms)), _VIEW_FLOOR_PX)
+    kept = stack.sum_by_view(passes.astype(float))
+    too_few = (kept < (1 - _CORNER_SHARE) * stack.counts) | (kept < _FEWEST_CORNERS)
+    # A few wrong corners spoil a view's rms without spoiling the view.
+    inner = np.sqrt(mean_square_by_view(stack, residuals * passes[:, None]))
+    wrong = too_few | ((rms > limit) & (inner > limit))
+    reasons = {
+        view: f"residual too large: {value:.2f} px (limit {limit:.2f}, set by the other views)"
+        for view, value, is_wrong in zip(stack.views, rms, wrong, strict=True)
+        if is_wrong
+    }
+    return Gate(passes & ~wrong[stack.view_of], reasons)

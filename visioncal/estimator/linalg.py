@@ -1,0 +1,83 @@
+"""Linear algebra of least squares: solving, covariance, and the spectrum of the information."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from visioncal.types import FloatArray
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keeps small dense solves on one thread: on a busy machine threads make them far slower."""
+    with threadpool_limits(1):
+        yield
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Eigenvalues of an information matrix scaled to a unit diagonal.
+
+    The scaling makes them independent of the units of the parameters.
+
+    Attributes:
+        values: (n,) ascending, not negative.
+        vectors: (n, n), one direction a column, in the parameters' own units, of unit length.
+    """
+
+    values: FloatArray
+    vectors: FloatArray
+
+    @property
+    def ratio(self) -> float:
+        """Smallest over largest eigenvalue: 0 where a direction is not determined at all."""
+        return float(self.values[0] / self.values[-1]) if self.values[-1] > 0 else 0.0
+
+
+def spectrum(information: FloatArray) -> Spectrum:
+    """Computes the scaled spectrum of an (n, n) information matrix."""
+    scale = _scale(information)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    directions = vectors * scale[:, None]
+    return Spectrum(np.maximum(values, 0.0), directions / np.linalg.norm(directions, axis=0))
+
+
+def covariance(information: FloatArray) -> FloatArray:
+    """Inverts (..., n, n) information matrices, scaled first to a unit diagonal.
+
+    A direction without information gets a large but finite variance, never a NaN; whoever asks
+    for a covariance has looked at the spectrum before.
+    """
+    scale = _scale(information)
+    outer = scale[..., :, None] * scale[..., None, :]
+    values, vectors = np.linalg.eigh(information * outer)
+    floor = np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
+    inverse = (vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(inverse * outer)
+
+
+def damped_step(
+    information: FloatArray, gradient: FloatArray, damping: FloatArray | float
+) -> FloatArray:
+    """Solves for Levenberg-Marquardt's step (Marquardt 1963: damping scaled by the diagonal).
+
+    Args:
+        information: (..., n, n) normal matrices.
+        gradient: (..., n) gradients of half the squared error.
+        damping: Share of the diagonal that is added to it, one for all or (..., 1).
+
+    Returns:
+        (..., n) steps.
+    """
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    added = damping * np.maximum(diagonal, np.finfo(float).tiny) + np.finfo(float).tiny
+    matrix = information + added[..., :, None] * np.eye(information.shape[-1])
+    return np.asarray(-np.linalg.solve(matrix, gradient[..., None])[..., 0])
+
+
+def _scale(information: FloatArray) -> FloatArray:
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))

@@ -1,0 +1,73 @@
+"""Poses of a target from its corners, the camera being known: all views at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.estimator.corners import CornerStack, Reprojection, reproject
+from visioncal.estimator.linalg import covariance, damped_step
+from visioncal.transforms import exp
+from visioncal.types import Camera, FloatArray
+
+_ITERATIONS = 30
+_SETTLED = 1e-10  # step of a pose [rad or m] below which it no longer moves
+_START_DAMPING = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """Poses of v views.
+
+    Attributes:
+        cam_from_target: (v, 4, 4).
+        information: (v, 6, 6) of each pose's right perturbation, for corners of 1 px noise.
+        by_intrinsics: (v, 6, k) how each pose moves with the intrinsics that it was fitted with.
+        residuals: (n, 2) of the stack [px].
+    """
+
+    cam_from_target: FloatArray
+    information: FloatArray
+    by_intrinsics: FloatArray
+    residuals: FloatArray
+
+
+def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> PoseFit:
+    """Minimises each view's reprojection error by Levenberg-Marquardt.
+
+    Args:
+        stack: The corners.
+        camera: The intrinsics, held.
+        cam_from_target: (v, 4, 4) starts.
+
+    Returns:
+        The poses with their information.
+    """
+    poses = cam_from_target
+    damping = np.full(len(poses), _START_DAMPING)
+    now = reproject(stack, camera, poses)
+    cost = stack.sum_by_view(np.sum(now.residuals**2, axis=1))
+    for _ in range(_ITERATIONS):
+        information, gradient = _normal_equations(stack, now)
+        step = damped_step(information, gradient, damping[:, None])
+        candidate = poses @ exp(step)
+        then = reproject(stack, camera, candidate)
+        cost_then = stack.sum_by_view(np.sum(then.residuals**2, axis=1))
+        better = cost_then <= cost
+        poses = np.where(better[:, None, None], candidate, poses)
+        cost = np.where(better, cost_then, cost)
+        damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e6)
+        now = then if better.all() else reproject(stack, camera, poses)
+        if np.all(np.abs(step).max(axis=1) < _SETTLED):
+            break
+    information, _ = _normal_equations(stack, now)
+    between = stack.sum_by_view(np.swapaxes(now.by_pose, 1, 2) @ now.by_intrinsics)
+    return PoseFit(poses, information, -covariance(information) @ between, now.residuals)
+
+
+def _normal_equations(stack: CornerStack, at: Reprojection) -> tuple[FloatArray, FloatArray]:
+    """Sums (v, 6, 6) information and (v, 6) gradient over each view's corners."""
+    transposed = np.swapaxes(at.by_pose, 1, 2)
+    return (
+        stack.sum_by_view(transposed @ at.by_pose),
+        stack.sum_by_view((transposed @ at.residuals[:, :, None])[:, :, 0]),
+    )

@@ -1,0 +1,28 @@
+"""Finding a target's corners in an image: one module a kind of target."""
+
+from visioncal.finders.charuco import find_charuco, fitting_layouts
+from visioncal.finders.checkerboard import find_checkerboard
+from visioncal.finders.marker import find_marker
+from visioncal.finders.result import NotFound, Seen
+from visioncal.types import Image, Target
+
+__all__ = ["NotFound", "Seen", "find_target", "fitting_layouts"]
+
+
+def find_target(image: Image, target: Target) -> Seen | NotFound:
+    """Finds a target's corners to sub-pixel accuracy.
+
+    Args:
+        image: (h, w) grey image.
+        target: What to look for.
+
+    Returns:
+        The corners, or why there are none.
+    """
+    match target.kind:
+        case "charuco":
+            return find_charuco(image, target)
+        case "checkerboard":
+            return find_checkerboard(image, target)
+        case "marker":
+            return find_marker(image, target)

@@ -1,0 +1,107 @@
+"""Finding ChArUco boards, and telling which layout was printed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+
+from visioncal.finders.result import NotFound, Seen
+from visioncal.targets import charuco_board
+from visioncal.types import FloatArray, Image, Target
+
+# Rms distance of markers from a plane's homography, in sides of a marker. Lens distortion and
+# noise stay under a tenth; another layout moves every second row by more than a whole side.
+_LAYOUT_MISFIT = 0.35
+# A homography has eight unknowns and a marker gives eight equations: three markers check it.
+_LAYOUT_MARKERS = 3
+
+# (4, 2) corners [px] by a marker's id.
+_Markers: TypeAlias = Mapping[int, FloatArray]
+
+
+def find_charuco(image: Image, target: Target) -> Seen | NotFound:
+    """Finds the chessboard corners of a ChArUco board (Garrido-Jurado et al. 2014; OpenCV).
+
+    OpenCV's check of interpolated corners against neighbouring markers is off, because it drops
+    whole boards at steep tilts; the residual of the pose takes its place later.
+
+    Args:
+        image: (h, w) grey image.
+        target: A ChArUco target.
+
+    Returns:
+        The corners, or why there are none.
+    """
+    board = charuco_board(target)
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.checkMarkers = False
+    detector = cv2.aruco.CharucoDetector(board, parameters)
+    px, ids, marker_px, marker_ids = detector.detectBoard(image)
+    if not marker_px:
+        return NotFound(f"no board: no marker of {target.dictionary} is seen")
+    if _misfit(_by_id(marker_px, marker_ids), target) > _LAYOUT_MISFIT:
+        return NotFound("the markers do not lie as the target describes them", misfit=True)
+    if np.size(ids) == 0 or px is None:
+        return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
+    order = np.argsort(ids.ravel())
+    return Seen(ids.ravel()[order].astype(np.int64), px.reshape(-1, 2)[order].astype(np.float64))
+
+
+def fitting_layouts(image: Image, target: Target) -> tuple[Target, ...]:
+    """Finds which variants of a ChArUco description fit the markers in an image.
+
+    Args:
+        image: (h, w) grey image.
+        target: A ChArUco target as declared.
+
+    Returns:
+        The variants that fit: other corner layout, columns and rows exchanged, or both.
+    """
+    turned = replace(target, columns=target.rows, rows=target.columns)
+    variants = [
+        replace(target, legacy=not target.legacy),
+        turned,
+        replace(turned, legacy=not target.legacy),
+    ]
+    dictionary = charuco_board(target).getDictionary()
+    marker_px, marker_ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    if not marker_px:
+        return ()
+    markers = _by_id(marker_px, marker_ids)
+    enough = [it for it in variants if len(_matches(markers, it)[0]) >= 4 * _LAYOUT_MARKERS]
+    return tuple(it for it in enough if _misfit(markers, it) <= _LAYOUT_MISFIT)
+
+
+def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's
+    return {
+        int(marker): np.asarray(px, dtype=float).reshape(4, 2)
+        for marker, px in zip(np.ravel(marker_ids), marker_px, strict=True)
+    }
+
+
+def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]:
+    """Pairs the corners of the seen markers on the board [m] with those in the image [px]."""
+    board = charuco_board(target)
+    ids = np.ravel(np.asarray(board.getIds()))
+    places = dict(zip(ids.tolist(), board.getObjPoints(), strict=True))
+    known = [marker for marker in markers if marker in places]
+    if not known:
+        return np.empty((0, 2)), np.empty((0, 2))
+    on_board = np.concatenate([places[marker][:, :2] for marker in known])
+    return on_board.astype(np.float64), np.concatenate([markers[marker] for marker in known])
+
+
+def _misfit(markers: _Markers, target: Target) -> float:
+    """Rms distance of the markers from their places on a plane, in sides of a marker."""
+    on_board, in_image = _matches(markers, target)
+    if len(on_board) < 4 * _LAYOUT_MARKERS:
+        return 0.0
+    homography = np.asarray(cv2.findHomography(on_board, in_image)[0])
+    if homography.shape != (3, 3):
+        return 0.0
+    predicted = cv2.perspectiveTransform(on_board[None], homography)[0]
+    sides = np.linalg.norm(np.diff(in_image.reshape(-1, 4, 2), axis=1), axis=2)
+    errors = np.linalg.norm(predicted - in_image, axis=1)
+    return float(np.sqrt(np.mean(errors**2)) / np.median(sides))

@@ -1,0 +1,50 @@
+"""What `visioncal calibrate` writes: the result, the report and the recording."""
+
+import tempfile
+from pathlib import Path
+
+from visioncal.errors import DataError
+from visioncal.pipeline import Run
+from visioncal.recording import write_recording
+from visioncal.report import write_report
+from visioncal.session import Session
+from visioncal.viewer import blueprint
+
+CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
+
+
+def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
+    """Writes the three files into a folder.
+
+    They are made aside first: where one of them fails, none appears, and files that an earlier
+    calibration left there stay as they were.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        session: What was calibrated.
+        run: The result and its evidence.
+
+    Returns:
+        The files.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
+            aside = Path(name)
+            run.calibration.save(aside / CALIBRATION)
+            write_report(aside / REPORT, run.calibration, session, run.evidence)
+            write_recording(
+                aside / RECORDING, session, run.calibration, run.evidence, blueprint(session)
+            )
+            for file in (RECORDING, REPORT, CALIBRATION):
+                (aside / file).replace(folder / file)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written: {error.strerror or error}.",
+            culprits=[str(folder)],
+            next_step="Choose another folder with -o.",
+        ) from error
+    return tuple(folder / file for file in (CALIBRATION, REPORT, RECORDING))

@@ -1,0 +1,98 @@
+"""What became of each view: its figures for the result, and its evidence for people."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration import Rms, ViewEvidence, ViewResult
+from visioncal.estimator.closure import distances
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.steps import rms_of
+from visioncal.stages.validate import chain_rms_px, predict_corners
+from visioncal.targets import corner_positions
+from visioncal.transforms import invert, mean_transform
+from visioncal.types import FloatArray
+
+_HELD_BACK = "held out of the fit by the session (role = holdout)"
+_NO_POSE = "no pose of the target: it has neither image nor cft_ columns"
+
+
+def view_results(known: Known) -> tuple[ViewResult, ...]:
+    """Tells of each view of the session, in its order, what became of it."""
+    measured = _measurable(known)
+    away_m, away_rad, rms_px = _residuals(known, measured)
+    at = {view: index for index, view in enumerate(measured)}
+    results = []
+    for view in (it.number for it in known.session.views):
+        result = ViewResult(view, view in known.used, _reason(known, view), _corners(known, view))
+        if view in at:
+            index = at[view]
+            result = replace(
+                result,
+                rms_px=float(rms_px[index]) if np.isfinite(rms_px[index]) else None,
+                residual_mm=float(1e3 * away_m[index]),
+                residual_deg=float(np.rad2deg(away_rad[index])),
+            )
+        results.append(result)
+    return tuple(results)
+
+
+def holdout_rms(known: Known) -> Rms | None:
+    """Residuals of the views that the session held back; None where there are none."""
+    views = [view for view in _measurable(known) if view in known.held_back]
+    return rms_of(*_residuals(known, views)) if views else None
+
+
+def view_evidence(known: Known) -> tuple[ViewEvidence, ...]:
+    """Collects what was seen and computed of each view."""
+    return tuple(_evidence(known, view.number) for view in known.session.views)
+
+
+def _measurable(known: Known) -> list[int]:
+    """The views whose chain can be closed: used ones, and those held back."""
+    held = known.held_back & known.poses.keys() & known.base_from_flange.keys()
+    return [it.number for it in known.session.views if it.number in {*known.used, *held}]
+
+
+def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Deviations (m,) [m], [rad] from the used views' mean, and through the chain [px]."""
+    result, data = known.solved, known.closure(views)
+    centre = mean_transform(known.closure(known.used).placed(result.x))
+    camera = None if known.camera is None else known.camera.camera
+    rms_px = chain_rms_px(data, result.x, result.z, known.seen(views), camera)
+    return (*distances(data.placed(result.x), centre), rms_px)
+
+
+def _reason(known: Known, view: int) -> str:
+    if view in known.used:
+        return ""
+    if view in known.held_back and view not in known.reasons:
+        return _HELD_BACK
+    return known.reasons.get(view, _NO_POSE)
+
+
+def _corners(known: Known, view: int) -> int | None:
+    found = known.corners.get(view)
+    return None if found is None else len(found.ids)
+
+
+def _evidence(known: Known, view: int) -> ViewEvidence:
+    poses, target, result = known.poses.get(view), known.session.target, known.solved
+    corners = known.corners.get(view) if poses is None else poses.corners
+    base_from_flange = known.base_from_flange.get(view)
+    predicted = None
+    if corners is not None and target is not None and base_from_flange is not None:
+        robot = (
+            base_from_flange if known.session.mount == "eye-in-hand" else invert(base_from_flange)
+        )
+        cam_from_target = invert(robot @ result.x) @ result.z
+        if known.camera is not None:
+            positions = corner_positions(target)[corners.ids]
+            predicted = predict_corners(known.camera.camera, cam_from_target, positions)
+    return ViewEvidence(
+        view=view,
+        corners=corners,
+        predicted_px=predicted,
+        base_from_flange=base_from_flange,
+        cam_from_target=None if poses is None else poses.cam_from_target[0],
+    )

@@ -1,0 +1,83 @@
+"""What was detected and predicted, drawn over the images."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from visioncal.calibration import Calibration, ViewEvidence
+from visioncal.recording import paths
+from visioncal.recording.measures import magnification
+from visioncal.session import Session
+
+_DETECTED_RGB = (50, 220, 110)
+_PREDICTED_RGB = (80, 160, 255)
+_RESIDUAL_RGB = (255, 70, 60)
+
+# Rerun puts the image's corner, not the first pixel's centre, at the origin.
+_CENTRE = 0.5
+# Radii are shares of the image's width, so that they look alike in small and large images.
+_DOT, _LINE = 1 / 280, 1 / 800
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """How residuals and corners are drawn, the same in all views.
+
+    Attributes:
+        factor: How many times longer residuals are drawn than they are.
+        width: Width of the images [px].
+        active: Whether there is anything to draw in any view.
+    """
+
+    factor: int
+    width: float
+    active: bool
+
+    @classmethod
+    def of(
+        cls,
+        session: Session,
+        calibration: Calibration | None,
+        evidence: Mapping[int, ViewEvidence],
+    ) -> "Overlay":
+        """Chooses the factor by the used views."""
+        resolution = session.resolution
+        if calibration is not None and calibration.camera is not None:
+            resolution = calibration.camera.camera.resolution
+        width = 1280 if resolution is None else resolution[0]
+        used = [] if calibration is None else [it.view for it in calibration.views if it.used]
+        shown = [evidence[view] for view in used if view in evidence]
+        active = any(it.corners is not None for it in evidence.values())
+        return cls(magnification(shown, width), float(width), active)
+
+    def log_view(self, stream: rr.RecordingStream, seen: ViewEvidence) -> None:
+        """Logs one view's corners and residuals at the stream's current time."""
+        if not self.active:
+            return
+        corners, predicted = seen.corners, seen.predicted_px
+        px = np.zeros((0, 2)) if corners is None else corners.px
+        predicted_px = np.zeros((0, 2)) if predicted is None else predicted
+        # Empty batches take back what the view before has left.
+        stream.log(
+            paths.DETECTED,
+            rr.Points2D(px + _CENTRE, colors=_DETECTED_RGB, radii=_DOT * self.width),
+        )
+        stream.log(
+            paths.PREDICTED,
+            rr.Points2D(
+                predicted_px + _CENTRE, colors=_PREDICTED_RGB, radii=0.5 * _DOT * self.width
+            ),
+        )
+        paired = len(predicted_px) == len(px)
+        vectors = predicted_px - px if paired else np.zeros((0, 2))
+        stream.log(
+            paths.magnified_residuals(self.factor),
+            rr.Arrows2D(
+                vectors=self.factor * vectors,
+                origins=px + _CENTRE if paired else np.zeros((0, 2)),
+                colors=_RESIDUAL_RGB,
+                radii=_LINE * self.width,
+            ),
+        )

@@ -1,0 +1,138 @@
+"""Puts the report together and writes it."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from visioncal.calibration import Calibration, ViewEvidence, ViewResult
+from visioncal.files import write_atomically
+from visioncal.recording.measures import magnification
+from visioncal.report import content, plots
+from visioncal.report.thumbnails import Thumbnail, thumbnail
+from visioncal.session import Session
+from visioncal.version import __version__
+
+_MAX_REJECTED_PICTURES = 4
+
+
+def write_report(
+    path: Path,
+    calibration: Calibration,
+    session: Session | None,
+    evidence: Sequence[ViewEvidence],
+) -> None:
+    """Writes the report as one HTML file that needs no network and no script.
+
+    Args:
+        path: The file to write; it appears whole or not at all.
+        calibration: What to report.
+        session: Where its images are; without it the report has no pictures.
+        evidence: What was seen and computed of each view, in any order.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    write_atomically(path, render(calibration, session, evidence))
+
+
+def render(
+    calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
+) -> str:
+    """Renders the report as HTML text."""
+    environment = Environment(
+        loader=PackageLoader("visioncal", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    seen = {it.view: it for it in evidence}
+    extremes = _extremes(calibration, seen)
+    magnify = _magnification(calibration, [seen[view.view] for _, view in extremes])
+    pictures = None if session is None else _Pictures(session, seen)
+    return environment.get_template("report.html.j2").render(
+        calibration=calibration,
+        headline=content.headline(calibration),
+        key_figures=content.key_figures(calibration),
+        edges=content.edge_cards(calibration),
+        method=content.method_facts(calibration),
+        residuals=content.residual_rows(calibration),
+        solvers=content.solver_rows(calibration),
+        views=content.view_rows(calibration.views),
+        residual_plot=plots.residuals(calibration),
+        coverage_plot=plots.image_coverage(calibration, evidence),
+        direction_plot=plots.viewing_directions(calibration, evidence),
+        rotation_plot=plots.flange_rotations(calibration, evidence),
+        used_pictures=pictures.of_used(extremes, magnify) if pictures else [],
+        rejected_pictures=pictures.of_rejected(calibration.views) if pictures else [],
+        magnify=magnify,
+        versions=content.dependency_versions(),
+        version=__version__,
+        python=platform.python_version(),
+    )
+
+
+def _magnification(calibration: Calibration, shown: Sequence[ViewEvidence]) -> int:
+    """One factor for all pictures, so that they can be compared."""
+    if calibration.camera is None:
+        return 1
+    return magnification(shown, calibration.camera.camera.resolution[0])
+
+
+def _extremes(
+    calibration: Calibration, seen: Mapping[int, ViewEvidence]
+) -> list[tuple[str, ViewResult]]:
+    """The used views with the smallest and the largest reprojection error, and words for them."""
+    drawn = [
+        (view.rms_px, view)
+        for view in calibration.views
+        if view.used
+        and view.rms_px is not None
+        and view.view in seen
+        and seen[view.view].corners is not None
+    ]
+    ranked = sorted(drawn, key=lambda it: it[0])
+    picked = [ranked[0], ranked[-1]] if len(ranked) > 1 else ranked
+    return [
+        (f"{which} used view: {view.view}, {rms_px:.2g} px rms", view)
+        for which, (rms_px, view) in zip(("Best", "Worst"), picked, strict=False)
+    ]
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Takes pictures of views out of the session's images."""
+
+    session: Session
+    seen: Mapping[int, ViewEvidence]
+
+    def of_used(self, captioned: Sequence[tuple[str, ViewResult]], magnify: int) -> list[Thumbnail]:
+        """Pictures with what was detected and predicted over them."""
+        found = [
+            self._of(view, caption, self.seen.get(view.view), magnify)
+            for caption, view in captioned
+        ]
+        return [it for it in found if it is not None]
+
+    def of_rejected(self, views: Sequence[ViewResult]) -> list[Thumbnail]:
+        """The first few of the views that were not used, with their reasons."""
+        found = (
+            self._of(view, f"View {view.view}: {view.reason}", None, 1)
+            for view in views
+            if not view.used
+        )
+        return list(islice((it for it in found if it is not None), _MAX_REJECTED_PICTURES))
+
+    def _of(
+        self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
+    ) -> Thumbnail | None:
+        """A view's picture; None where it has no image, which the table of views says anyway."""
+        paths = [it.image for it in self.session.views if it.number == view.view and it.image]
+        if not paths or not self.session.images.exists(paths[0]):
+            return None
+        data = self.session.images.read(paths[0])
+        return thumbnail(data, evidence, caption, view.view, magnify)

@@ -1,0 +1,8 @@
+"""Sessions: what was recorded of a cell, as a folder of session.toml, views.csv and images."""
+
+from visioncal.session.document import Declaration
+from visioncal.session.images import FolderImages, ImageStore, MemoryImages
+from visioncal.session.session import Session
+from visioncal.session.table import View
+
+__all__ = ["Declaration", "FolderImages", "ImageStore", "MemoryImages", "Session", "View"]

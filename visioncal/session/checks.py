@@ -1,0 +1,60 @@
+"""What a session's parts say about each other: contradictions, and what looks like a mistake."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.session import columns as known
+from visioncal.session.document import Declaration
+from visioncal.session.table import View
+
+# No arm reaches this far [m], and no joint of one turns this far [rad].
+_FAR_M, _WIDE_RAD = 20.0, 7.0
+
+
+def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) -> None:
+    """An image says nothing without the target that it shows and the camera that took it."""
+    with_image = [view.number for view in views if view.image]
+    for field, value, example in (
+        ("target", declaration.target, 'target = "charuco_9x6_30mm"'),
+        ("camera", declaration.camera, "[camera]"),
+    ):
+        if with_image and value is None:
+            raise DataError(
+                f"session.toml: {field} is missing, but view {with_image[0]} has an image.",
+                culprits=[f"session.toml: {field}"],
+                next_step=f"Add {example}.",
+            )
+
+
+def view_warnings(views: Sequence[View]) -> Iterator[str]:
+    """Words what looks like another unit, or like a row that was copied."""
+    for names in (known.POSITION, known.MEASURED_CAM_POSE[:3]):
+        norms = [
+            float(np.linalg.norm([view.numbers[name] for name in names]))
+            for view in views
+            if names[0] in view.numbers
+        ]
+        if norms and float(np.median(norms)) > _FAR_M:
+            yield (
+                f"views.csv: the median length of ({', '.join(names)}) is {np.median(norms):.4g} "
+                "m. It looks like millimetres: multiply these columns by 0.001."
+            )
+    angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]
+    if angles and float(np.median(angles)) > _WIDE_RAD:
+        yield (
+            f"views.csv: the largest joint angle of a row is {np.median(angles):.4g} rad in the "
+            "median. It looks like degrees: multiply q1_rad ... by pi / 180."
+        )
+    first: dict[str, int] = {}
+    for view in views:
+        if view.image and first.setdefault(view.image, view.number) != view.number:
+            yield f"views.csv: views {first[view.image]} and {view.number} share {view.image}."
+
+
+def stream_warnings(folder: Path) -> Iterator[str]:
+    """Words what of a session's folder is left alone."""
+    for path in sorted(folder.glob("streams/*.csv")):
+        yield f"streams/{path.name} is not read by this version, nor copied with the session."

@@ -1,0 +1,100 @@
+"""The columns of views.csv: which are known, and which belong together."""
+
+import re
+from collections.abc import Iterator, Sequence
+
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean
+
+POSITION = ("x_m", "y_m", "z_m")
+QUATERNION = ("qx", "qy", "qz", "qw")
+POSE = POSITION + QUATERNION
+MEASURED_CAM_POSE = tuple(f"cft_{name}" for name in POSE)
+INSTRUMENT_POSITION = tuple(f"meas_{name}" for name in POSITION)
+INSTRUMENT_QUATERNION = tuple(f"meas_{name}" for name in QUATERNION)
+
+# Columns of which a row fills all or none.
+WHOLE_GROUPS = (POSE, MEASURED_CAM_POSE, INSTRUMENT_POSITION, INSTRUMENT_QUATERNION)
+QUATERNION_GROUPS = (QUATERNION, MEASURED_CAM_POSE[3:], INSTRUMENT_QUATERNION)
+
+_PLAIN_NUMBERS = frozenset(
+    {
+        "stamp_s",
+        "ambient_c",
+        "payload_kg",
+        *(f"payload_{axis}_m" for axis in "xyz"),
+        *(f"force_{axis}_n" for axis in "xyz"),
+        *POSE,
+        *MEASURED_CAM_POSE,
+        *INSTRUMENT_POSITION,
+        *INSTRUMENT_QUATERNION,
+    }
+)
+_NUMBERED = re.compile(r"(q[1-9]\d*_rad|tau[1-9]\d*_nm|current[1-9]\d*_a|temp[1-9]\d*_c)", re.ASCII)
+_JOINT = re.compile(r"q([1-9][0-9]*)_rad")
+_TEXTS = frozenset(
+    {"view", "stop", "role", "image", "point", "group", "approach"}
+    | {"camera", "robot", "target", "instrument"}
+)
+# Columns that name one of several cameras, robots, targets or instruments.
+SELECTORS = ("camera", "robot", "target", "instrument")
+
+
+def is_number(column: str) -> bool:
+    """Tells whether a column is known and holds numbers."""
+    return column in _PLAIN_NUMBERS or _NUMBERED.fullmatch(column) is not None
+
+
+def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:
+    """Lists the columns of joint angles that are there, q1_rad first."""
+    numbers = sorted(int(match[1]) for name in columns if (match := _JOINT.fullmatch(name)))
+    return tuple(f"q{number}_rad" for number in numbers)
+
+
+def check_header(columns: Sequence[str], where: str) -> None:
+    """Checks the header row of a views.csv; `where` names it in messages.
+
+    Raises:
+        DataError: A name is empty or there twice, `view` is missing, the joints have gaps, or a
+            pose lacks some of its columns.
+    """
+    problems = list(_header_problems(columns))
+    if not problems:
+        return
+    semicolons = len(columns) == 1 and ";" in columns[0]
+    raise DataError(
+        f"{where}: {'; '.join(problems)}.",
+        culprits=[where],
+        next_step="Separate the columns by commas, not semicolons." if semicolons else "",
+    )
+
+
+def _header_problems(columns: Sequence[str]) -> Iterator[str]:
+    for place, name in enumerate(columns, start=1):
+        if not name:
+            yield f"column {place} has no name"
+        elif name in columns[: place - 1]:
+            yield f"column {name} is there twice (columns {columns.index(name) + 1} and {place})"
+    if "view" not in columns:
+        yield "the column view, a whole number that names each row, is missing"
+    joints = joint_columns(columns)
+    wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
+    gaps = [name for name in wanted if name not in joints]
+    if gaps:
+        yield f"the joint columns {', '.join(joints)} lack {', '.join(gaps)}"
+    for group in WHOLE_GROUPS:
+        missing = [name for name in group if name not in columns]
+        if 0 < len(missing) < len(group):
+            yield (
+                f"the columns {', '.join(name for name in group if name in columns)} "
+                f"lack {', '.join(missing)}"
+            )
+
+
+def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
+    """Words a hint for every unknown column that looks like a known one misspelt."""
+    known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
+    for name in columns:
+        hint = did_you_mean(name, known) if name not in known and not is_number(name) else ""
+        if hint:
+            yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

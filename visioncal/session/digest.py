@@ -1,0 +1,69 @@
+"""The digest of a session's facts, free of how they are stored."""
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import date, time
+
+from visioncal.files import sha256
+from visioncal.session.images import ImageStore
+from visioncal.session.table import View
+
+
+def digest_facts(
+    document: Mapping[str, object],
+    target_document: Mapping[str, object] | None,
+    robot_document: Mapping[str, object] | None,
+    columns: Sequence[str],
+    views: Sequence[View],
+    images: ImageStore,
+) -> str:
+    """Computes the SHA-256 digest of a session's canonical content.
+
+    It is equal for every storage of the same facts: folders, their formatting, the spelling of
+    numbers and the names of a target's or a robot's file do not enter, their contents do.
+    """
+    paths = sorted({view.image for view in views if view.image and images.exists(view.image)})
+    facts = {
+        "document": _without_paths(document),
+        "target": target_document,
+        "robot": robot_document,
+        "columns": columns,
+        "rows": [[_fact(view, column) for column in columns] for view in views],
+        "images": {path: sha256(images.read(path)) for path in paths},
+    }
+    return sha256(json.dumps(_canonical(facts), sort_keys=True).encode())
+
+
+def is_file(name: object) -> bool:
+    """Tells a path from a name that comes with visioncal."""
+    return isinstance(name, str) and name.lower().endswith((".toml", ".urdf"))
+
+
+def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
+    """Leaves out where the target's and the robot's files lie; what they hold counts instead."""
+    kept = dict(document)
+    if is_file(kept.get("target")):
+        del kept["target"]
+    robot = kept.get("robot")
+    if isinstance(robot, Mapping) and is_file(robot.get("model")):
+        kept["robot"] = {key: value for key, value in robot.items() if key != "model"}
+    return kept
+
+
+def _fact(view: View, column: str) -> float | str:
+    """A cell's value, free of its spelling."""
+    return view.numbers[column] if column in view.numbers else view.cell(column)
+
+
+def _canonical(value: object) -> object:
+    """Writes equal facts equally: 1 and 1.0, lists and tuples, -0.0 and 0.0; dates as text."""
+    if isinstance(value, Mapping):
+        return {str(key): _canonical(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(entry) for entry in value]
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int | float):
+        # Adding zero turns -0.0 into 0.0; integers beyond a double's range keep their digits.
+        return float(value) + 0.0 if abs(value) < 1e300 else str(value)
+    return value.isoformat() if isinstance(value, date | time) else str(value)

@@ -1,0 +1,300 @@
+"""views.csv: one row an observation."""
+
+import csv
+import io
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from visioncal.errors import DataError
+from visioncal.session import columns as known
+from visioncal.session.images import inside_path
+from visioncal.types import FloatArray
+
+# Rounding to four digits leaves a unit quaternion's norm within this of 1.
+_NORM_TOLERANCE = 1e-3
+_SHOWN_PROBLEMS = 10
+# Stricter than float(), which also takes 1_000, nan, and the digits of other scripts.
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One row of views.csv, with its numbers as they were read.
+
+    Attributes:
+        number: The view's number, unique in its session.
+        image: Path of its image, with forward slashes; empty where it has none.
+        holdout: Whether no fit may use it.
+        stop: The robot stop that it shares with other rows, if it names one.
+        numbers: The known numeric columns that are filled in this row, in their columns' units.
+        text: The other columns that are filled in this row.
+    """
+
+    number: int
+    image: str = ""
+    holdout: bool = False
+    stop: int | None = None
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    text: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def stamp_s(self) -> float | None:
+        """The time of the observation [s], if it was recorded."""
+        return self.numbers.get("stamp_s")
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(n,) joint angles [rad], if they were recorded."""
+        names = known.joint_columns(tuple(self.numbers))
+        return np.array([self.numbers[name] for name in names]) if names else None
+
+    def base_from_flange(self) -> RigidTransform | None:
+        """The pose that the controller reported, if it was recorded."""
+        return self._transform(known.POSE)
+
+    def cam_from_target(self) -> RigidTransform | None:
+        """The target's pose that was already measured (cft_*), if there is one."""
+        return self._transform(known.MEASURED_CAM_POSE)
+
+    def _transform(self, names: Sequence[str]) -> RigidTransform | None:
+        if names[0] not in self.numbers:
+            return None
+        values = [self.numbers[name] for name in names]
+        return RigidTransform.from_components(values[:3], Rotation.from_quat(values[3:]))
+
+    def cell(self, column: str) -> str:
+        """Writes the row's value of a column as views.csv has it; empty where it is not filled.
+
+        Numbers are written so that reading them gives the same number again.
+        """
+        if column == "view":
+            return str(self.number)
+        if column == "stop":
+            return "" if self.stop is None else str(self.stop)
+        if column == "image":
+            return self.image
+        if column in self.numbers:
+            return repr(float(self.numbers[column]))
+        return self.text.get(column, "")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of text cells, and the words that place it in messages (`views.csv, line 3`)."""
+
+    where: str
+    cells: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    place: str
+    words: str
+
+
+def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
+    """Splits a views.csv into its column names and its rows; blank lines are skipped.
+
+    Raises:
+        DataError: It is empty, has no rows, or its quotes do not close.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: list[Row] = []
+    line = 1
+    try:
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                rows.append(Row(f"{label}, line {line}", tuple(cells)))
+            line = reader.line_num + 1
+    except csv.Error as error:
+        raise DataError(
+            f"{label}, line {line}: {error}.",
+            culprits=[f"{label}, line {line}"],
+            next_step='A field that holds a comma or a "quote" is put in quotes, "" inside.',
+        ) from error
+    if not rows:
+        raise DataError(
+            f"{label} is empty; a header row (view,image,...) and a row for each view are needed.",
+            culprits=[label],
+        )
+    if len(rows) == 1:
+        raise DataError(
+            f"{label} has a header row and no views.",
+            culprits=[label],
+            next_step="Add one row for each view.",
+        )
+    return tuple(name.strip() for name in rows[0].cells), tuple(rows[1:])
+
+
+def write_csv(columns: Sequence[str], views: Sequence[View]) -> str:
+    """Writes views as the text of a views.csv, the columns in the order that is given."""
+    rows = [columns, *([view.cell(column) for column in columns] for view in views)]
+    return "".join(",".join(map(_quoted, row)) + "\n" for row in rows)
+
+
+def _quoted(cell: str) -> str:
+    """Quotes a cell where it needs it; csv.writer leaves a lone carriage return bare."""
+    needs_quotes = any(character in cell for character in ',"\r\n')
+    return '"' + cell.replace('"', '""') + '"' if needs_quotes else cell
+
+
+def read_views(columns: Sequence[str], rows: Sequence[Row], label: str) -> tuple[View, ...]:
+    """Reads and checks views.
+
+    Args:
+        columns: The column names.
+        rows: The rows' cells, as text.
+        label: The file's name, for messages.
+
+    Raises:
+        DataError: Naming up to ten rows and columns that are wrong, the values that they hold and
+            those that are needed.
+    """
+    known.check_header(columns, f"{label}, header")
+    views: list[View] = []
+    problems: list[_Problem] = []
+    first_seen: dict[int, str] = {}
+    for row in rows:
+        reader = _RowReader(row, columns, [])
+        view = reader.view()
+        if view is not None:
+            views.append(view)
+            earlier = first_seen.setdefault(view.number, row.where)
+            if earlier != row.where:
+                reader.report("view", f"{view.number} is already the view of {earlier}")
+        problems += reader.problems
+    problems += _several_of_a_kind(views, label)
+    if problems:
+        raise _report(problems)
+    return tuple(views)
+
+
+def _report(problems: Sequence[_Problem]) -> DataError:
+    shown = problems[:_SHOWN_PROBLEMS]
+    more = len(problems) - len(shown)
+    lines = [f"{problem.place}: {problem.words}." for problem in shown]
+    if more:
+        lines.append(f"And {more} more of the kind.")
+    return DataError("\n".join(lines), culprits=[problem.place for problem in shown])
+
+
+def _several_of_a_kind(views: Sequence[View], label: str) -> Iterator[_Problem]:
+    for column in known.SELECTORS:
+        names = sorted({view.text[column] for view in views if column in view.text})
+        if len(names) > 1:
+            yield _Problem(
+                f"{label}, column {column}",
+                f"it names {', '.join(names)}; this version reads one {column} a session, so "
+                "split the session",
+            )
+
+
+@dataclass(frozen=True)
+class _RowReader:
+    """Reads one row and collects what is wrong with it in `problems`."""
+
+    row: Row
+    columns: Sequence[str]
+    problems: list[_Problem]
+
+    def report(self, column: str, words: str) -> None:
+        place = f"{self.row.where}, column {column}" if column else self.row.where
+        self.problems.append(_Problem(place, words))
+
+    def view(self) -> View | None:
+        """Reads the row; None where it is so wrong that its problems are all there is."""
+        if len(self.row.cells) != len(self.columns):
+            self.report(
+                "",
+                f"it has {len(self.row.cells)} fields, but the header has {len(self.columns)} "
+                "columns",
+            )
+            return None
+        cells = dict(zip(self.columns, self.row.cells, strict=True))
+        if not cells["view"].strip():
+            self.report("view", "it is empty; a whole number is needed")
+        number = self._take(cells, "view", _integer)
+        stop = self._take(cells, "stop", _integer)
+        image = self._take(cells, "image", inside_path)
+        role = self._take(cells, "role", _role, keep=True)
+        numbers = self._numbers(cells)
+        text = {name: cell for name, cell in cells.items() if cell}
+        self._check_groups(numbers)
+        observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text
+        if not image and not observed and not self.problems:
+            self.report("image", "it is empty, and the row has neither cft_* nor meas_* nor point")
+        if number is None:
+            return None
+        return View(number, image or "", role == "holdout", stop, numbers, text)
+
+    def _take(
+        self, cells: dict[str, str], column: str, read: Callable[[str], _T], *, keep: bool = False
+    ) -> _T | None:
+        """Takes a column out of the cells and reads it; None where it is empty or wrong."""
+        cell = (cells.get(column, "") if keep else cells.pop(column, "")).strip()
+        if not cell:
+            return None
+        try:
+            return read(cell)
+        except DataError as error:
+            self.report(column, error.message.rstrip("."))
+            return None
+
+    def _numbers(self, cells: dict[str, str]) -> dict[str, float]:
+        numbers = {}
+        for column in self.columns:
+            if known.is_number(column):
+                value = self._take(cells, column, _number)
+                if value is not None:
+                    numbers[column] = value
+        return numbers
+
+    def _check_groups(self, numbers: Mapping[str, float]) -> None:
+        # A cell that was refused would be reported again as missing from its group.
+        groups = () if self.problems else (*known.WHOLE_GROUPS, known.joint_columns(self.columns))
+        for group in groups:
+            missing = [name for name in group if name not in numbers]
+            if 0 < len(missing) < len(group):
+                self.report(
+                    missing[0],
+                    f"it is empty while {group[0] if group[0] in numbers else group[-1]} is "
+                    f"filled; a row fills all of {group[0]} ... {group[-1]} or none",
+                )
+        for group in known.QUATERNION_GROUPS:
+            if all(name in numbers for name in group):
+                norm = math.hypot(*(numbers[name] for name in group))
+                if abs(norm - 1.0) > _NORM_TOLERANCE:
+                    self.report(
+                        f"{group[0]} ... {group[-1]}",
+                        f"the quaternion's norm is {norm:.6g}, but must be 1 to within "
+                        f"{_NORM_TOLERANCE:g}",
+                    )
+
+
+def _number(cell: str) -> float:
+    value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+    if not math.isfinite(value):
+        comma = " (the decimal sign is a point)" if "," in cell else ""
+        raise DataError(f"{cell!r} is no finite number{comma}")
+    return value
+
+
+def _integer(cell: str) -> int:
+    if not _INTEGER.fullmatch(cell) or len(cell) > 18:
+        raise DataError(f"{cell!r} is no whole number")
+    return int(cell)
+
+
+def _role(cell: str) -> str:
+    if cell not in ("fit", "holdout"):
+        raise DataError(f'{cell!r} is no role; "fit", "holdout" or nothing is needed')
+    return cell

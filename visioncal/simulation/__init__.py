@@ -1,0 +1,51 @@
+"""A synthetic robot cell with a forward model of its own: whatever it says is the truth.
+
+Nothing here uses the application's camera, robot, targets, solvers or estimator, so that a wrong
+projection or a wrong chain cannot hide by being wrong in both.
+"""
+
+from visioncal.simulation.arms import Arm, forward, ur_arm
+from visioncal.simulation.cell import Cell, simulate
+from visioncal.simulation.optics import fine_camera, fisheye_camera, project, rays, wide_camera
+from visioncal.simulation.options import (
+    CellOptions,
+    Motion,
+    charuco_target,
+    checkerboard_target,
+    exact,
+)
+from visioncal.simulation.records import (
+    Truth,
+    measured_poses,
+    read_truth,
+    truth_path,
+    write_session,
+)
+from visioncal.simulation.render import Scene, prepare_scene, render, render_view
+
+__all__ = [
+    "Arm",
+    "Cell",
+    "CellOptions",
+    "Motion",
+    "Scene",
+    "Truth",
+    "charuco_target",
+    "checkerboard_target",
+    "exact",
+    "fine_camera",
+    "fisheye_camera",
+    "forward",
+    "measured_poses",
+    "prepare_scene",
+    "project",
+    "rays",
+    "read_truth",
+    "render",
+    "render_view",
+    "simulate",
+    "truth_path",
+    "ur_arm",
+    "wide_camera",
+    "write_session",
+]

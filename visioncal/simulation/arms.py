@@ -1,0 +1,230 @@
+"""Simulated arms: Universal Robots' published geometry, forward and inverse kinematics.
+
+The chain is written out here in plain numpy and shares nothing with the robot model of the
+application, so that a wrong chain cannot hide by being wrong in both.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from visioncal.errors import DataError
+from visioncal.types import FloatArray
+
+_HALF_TURN = np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A serial arm of revolute joints in standard Denavit-Hartenberg form.
+
+    Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`. The last turn is
+    Hayati's (1983): where two axes are parallel, their lack of parallelism about y is not in the
+    reach of the other four. It is zero in every nominal arm.
+
+    Attributes:
+        name: Name of the model.
+        a: (n,) lengths along the links' x [m].
+        d: (n,) offsets along the joint axes [m].
+        alpha: (n,) twists about x [rad].
+        beta: (n,) Hayati's twists about y [rad].
+        offset: (n,) joint angles at which the encoders read zero [rad].
+    """
+
+    name: str
+    a: FloatArray
+    d: FloatArray
+    alpha: FloatArray
+    beta: FloatArray
+    offset: FloatArray
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """How a real arm departs from its data sheet, as standard deviations per parameter.
+
+    Attributes:
+        length_m: Of every a and d [m].
+        angle_rad: Of every alpha, beta and joint offset [rad].
+        offset_rad: Of the joint offsets, on top of `angle_rad` [rad].
+    """
+
+    length_m: float
+    angle_rad: float
+    offset_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Outcome of the inverse kinematics.
+
+    Attributes:
+        joints: (m, n) joint angles [rad], meaningful where `solved`.
+        solved: (m,) whether the pose was reached within the joints' limits.
+        dexterity: (m,) smallest singular value of the Jacobian with lengths in units of the
+            arm's reach; it vanishes in a singular posture.
+    """
+
+    joints: FloatArray
+    solved: npt.NDArray[np.bool_]
+    dexterity: FloatArray
+
+
+def ur_arm(name: str) -> Arm:
+    """Nominal arm of Universal Robots' e-Series by the values that the maker publishes.
+
+    Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics".
+
+    Args:
+        name: `ur3e`, `ur5e` or `ur10e`.
+
+    Returns:
+        The nominal arm, from the controller's base frame to the flange.
+
+    Raises:
+        DataError: Another name was given.
+    """
+    # d1, a2, a3, d4, d5, d6 [m]
+    published = {
+        "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
+        "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
+        "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
+    }
+    if name not in published:
+        raise DataError(
+            f"simulation: the arm {name!r} is not known, only {', '.join(sorted(published))} are."
+        )
+    d1, a2, a3, d4, d5, d6 = published[name]
+    quarter = 0.5 * np.pi
+    return Arm(
+        name=name,
+        a=np.array([0.0, a2, a3, 0.0, 0.0, 0.0]),
+        d=np.array([d1, 0.0, 0.0, d4, d5, d6]),
+        alpha=np.array([quarter, 0.0, 0.0, quarter, -quarter, 0.0]),
+        beta=np.zeros(6),
+        offset=np.zeros(6),
+    )
+
+
+def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
+    """Draws a real arm around a nominal one.
+
+    The same generator state gives the same directions of error whatever their size.
+    """
+    draws = rng.standard_normal((6, arm.a.size))
+    return replace(
+        arm,
+        a=arm.a + errors.length_m * draws[0],
+        d=arm.d + errors.length_m * draws[1],
+        alpha=arm.alpha + errors.angle_rad * draws[2],
+        beta=arm.beta + errors.angle_rad * draws[3],
+        offset=arm.offset + errors.angle_rad * draws[4] + errors.offset_rad * draws[5],
+    )
+
+
+def reach_m(arm: Arm) -> float:
+    """Length of the stretched upper and lower arm [m]."""
+    return float(np.abs(arm.a).sum())
+
+
+def link_frames(arm: Arm, joints: FloatArray) -> FloatArray:
+    """Frames of all links for a batch of postures.
+
+    Args:
+        arm: The arm, n joints.
+        joints: (m, n) joint angles [rad].
+
+    Returns:
+        (m, n + 1, 4, 4) `base_from_link`, the base itself first and the flange last.
+    """
+    frames = np.empty((len(joints), arm.a.size + 1, 4, 4))
+    frames[:, 0] = np.eye(4)
+    for i in range(arm.a.size):
+        frames[:, i + 1] = frames[:, i] @ _link(arm, i, joints[:, i])
+    return frames
+
+
+def forward(arm: Arm, joints: FloatArray) -> FloatArray:
+    """Forward kinematics: (m, n) joint angles [rad] to (m, 4, 4) `base_from_flange`."""
+    return link_frames(arm, joints)[:, -1]
+
+
+def inverse(arm: Arm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
+    """Inverse kinematics by damped least squares, from one starting posture for each pose.
+
+    Method: Wampler (1986); the damping follows the remaining error, so that the end of the
+    iteration is Newton's and reaches machine precision.
+
+    Args:
+        arm: The arm, n joints.
+        base_from_flange: (m, 4, 4) poses to reach.
+        seeds: (m, n) starting postures [rad].
+
+    Returns:
+        The postures, with the elbow within half a turn and every other joint within a turn.
+    """
+    joints = seeds.copy()
+    scale = np.repeat([1.0, 1.0 / reach_m(arm)], 3)
+    for _ in range(60):
+        jacobian, error = _linearise(arm, joints, base_from_flange, scale)
+        size = np.einsum("mi,mi->m", error, error)
+        if size.max() < 1e-26:
+            break
+        damping = np.minimum(0.02, size)[:, None, None] * np.eye(6)
+        gram = jacobian @ np.swapaxes(jacobian, 1, 2) + damping + 1e-14 * np.eye(6)
+        step = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(gram, error[..., None])
+        joints += np.clip(step[..., 0], -0.5, 0.5)
+    jacobian, error = _linearise(arm, joints, base_from_flange, scale)
+    joints = seeds + _wrap(joints - seeds)
+    limits = np.full(arm.a.size, 2.0 * _HALF_TURN)
+    limits[2] = _HALF_TURN
+    within = np.all(np.abs(joints) < limits, axis=1)
+    return Reach(
+        joints=joints,
+        solved=within & (np.linalg.norm(error, axis=1) < 1e-9),
+        dexterity=np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, -1], dtype=float),
+    )
+
+
+def _link(arm: Arm, i: int, angle: FloatArray) -> FloatArray:
+    """(m, 4, 4) `link_from_next` of joint i."""
+    cos_q, sin_q = np.cos(angle + arm.offset[i]), np.sin(angle + arm.offset[i])
+    cos_a, sin_a = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
+    matrices = np.zeros((angle.size, 4, 4))
+    matrices[:, 0, 0], matrices[:, 0, 1] = cos_q, -sin_q * cos_a
+    matrices[:, 0, 2], matrices[:, 0, 3] = sin_q * sin_a, arm.a[i] * cos_q
+    matrices[:, 1, 0], matrices[:, 1, 1] = sin_q, cos_q * cos_a
+    matrices[:, 1, 2], matrices[:, 1, 3] = -cos_q * sin_a, arm.a[i] * sin_q
+    matrices[:, 2, 1], matrices[:, 2, 2], matrices[:, 2, 3] = sin_a, cos_a, arm.d[i]
+    matrices[:, 3, 3] = 1.0
+    if arm.beta[i] == 0.0:
+        return matrices
+    cos_b, sin_b = np.cos(arm.beta[i]), np.sin(arm.beta[i])
+    turn = np.eye(4)
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = cos_b, sin_b, -sin_b, cos_b
+    return matrices @ turn
+
+
+def _linearise(
+    arm: Arm, joints: FloatArray, goal: FloatArray, scale: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Geometric Jacobian (m, 6, n) and pose error (m, 6), both in the base frame and scaled."""
+    frames = link_frames(arm, joints)
+    axes, origins = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
+    tip = frames[:, -1]
+    levers = np.cross(axes, tip[:, None, :3, 3] - origins)
+    jacobian = np.swapaxes(np.concatenate([axes, levers], axis=2), 1, 2)
+    # Half the sum of the cross products of the axes: zero only where the rotations agree, or
+    # where they differ by half a turn, which the caller's check of the error does not see.
+    turn = 0.5 * np.cross(tip[:, :3, :3], goal[:, :3, :3], axis=1).sum(axis=2)
+    opposed = np.einsum("mij,mij->m", tip[:, :3, :3], goal[:, :3, :3]) < 0.0
+    turn[opposed] *= 2.0 / np.maximum(np.linalg.norm(turn[opposed], axis=1), 1e-3)[:, None]
+    shift = goal[:, :3, 3] - tip[:, :3, 3]
+    error = np.concatenate([turn, shift], axis=1)
+    return jacobian * scale[:, None], error * scale
+
+
+def _wrap(angles: FloatArray) -> FloatArray:
+    """Brings angles [rad] into half a turn either way."""
+    return (angles + _HALF_TURN) % (2.0 * _HALF_TURN) - _HALF_TURN

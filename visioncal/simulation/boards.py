@@ -1,0 +1,95 @@
+"""Geometry of simulated targets: where the corners of a printed, scaled and bowed board lie."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.types import FloatArray, Target
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A target as it came out of the printer and lies on its plate.
+
+    Attributes:
+        target: What was meant to be printed.
+        scale: Printed size over stated size.
+        bow_m: How far the pattern's outer corners are bent into the board, away from a camera in
+            front of it, relative to its centre [m].
+    """
+
+    target: Target
+    scale: float
+    bow_m: float
+
+
+def pattern_box(target: Target) -> tuple[float, float, float, float]:
+    """Bounds of the print in the target frame: left, top, right, bottom [m], as stated."""
+    side = target.square_m
+    if target.kind == "marker":
+        return (-0.5 * side, -0.5 * side, 0.5 * side, 0.5 * side)
+    start = 0.0 if target.kind == "charuco" else -side
+    return (start, start, target.columns * side, target.rows * side)
+
+
+def corners_m(sheet: Sheet) -> FloatArray:
+    """Corners of the real sheet in the target frame.
+
+    Returns:
+        (n, 3) points [m]; the row number is the corner's id.
+    """
+    target = sheet.target
+    if target.kind == "marker":
+        half = 0.5 * target.square_m
+        flat = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    else:
+        first, less = (1, 1) if target.kind == "charuco" else (0, 0)
+        columns = np.arange(target.columns - less) + first
+        rows = np.arange(target.rows - less) + first
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        flat = target.square_m * grid.astype(float)
+    return lift(sheet, sheet.scale * flat)
+
+
+def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:
+    """Points around the real print.
+
+    Args:
+        sheet: The sheet.
+        margin_m: How far outside the print the outline runs [m].
+
+    Returns:
+        (64, 3) points in the target frame [m].
+    """
+    left, top, right, bottom = pattern_box(sheet.target)
+    along = np.linspace(0.0, 1.0, 16, endpoint=False)[:, None]
+    print_m = sheet.scale * np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+    knots = print_m + margin_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    sides = [
+        start + along * (end - start)
+        for start, end in zip(knots, np.roll(knots, -1, axis=0), strict=True)
+    ]
+    return lift(sheet, np.concatenate(sides))
+
+
+def centre_m(sheet: Sheet) -> FloatArray:
+    """Centre of the print in the target frame, (3,) [m]."""
+    left, top, right, bottom = pattern_box(sheet.target)
+    return sheet.scale * np.array([0.5 * (left + right), 0.5 * (top + bottom), 0.0])
+
+
+def lift(sheet: Sheet, flat: FloatArray) -> FloatArray:
+    """Puts (..., 2) points of the flat sheet onto the bowed surface, (..., 3) [m]."""
+    return np.concatenate([flat, bow_depth_m(sheet, flat)[..., None]], axis=-1)
+
+
+def bow_depth_m(sheet: Sheet, flat: FloatArray) -> FloatArray:
+    """Depth of the bowed surface under (..., 2) points of the sheet, (...) [m].
+
+    A paraboloid, four times as strong along x as along y, as paper curls on one axis. It touches
+    the plane z = 0 at the centre of the print.
+    """
+    left, top, right, bottom = pattern_box(sheet.target)
+    half = 0.5 * sheet.scale * np.array([right - left, bottom - top])
+    u, v = np.moveaxis((flat - centre_m(sheet)[:2]) / half, -1, 0)
+    return np.asarray(sheet.bow_m * (0.8 * u * u + 0.2 * v * v))

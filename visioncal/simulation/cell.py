@@ -1,0 +1,276 @@
+"""A simulated robot cell: an arm, a camera and a board, what really is and what is reported."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DataError
+from visioncal.simulation.arms import (
+    Arm,
+    ArmErrors,
+    disturb,
+    forward,
+    inverse,
+    link_frames,
+    reach_m,
+    ur_arm,
+)
+from visioncal.simulation.boards import Sheet, centre_m, corners_m
+from visioncal.simulation.optics import project, sees
+from visioncal.simulation.options import CellOptions
+from visioncal.simulation.poses import draw_views, mean_view
+from visioncal.transforms import compose, exp, invert
+from visioncal.types import Corners, FloatArray
+
+# Postures with a smaller dexterity are so near a singularity that no operator would choose them.
+_LEAST_DEXTERITY = 0.04
+# A corner nearer to the image's edge is not detected [px].
+_EDGE_PX = 2.0
+
+
+class Stream(IntEnum):
+    """Independent sources of randomness of one cell."""
+
+    MOUNTING = 0
+    POSES = 1
+    ARM = 2
+    ROBOT = 3
+    WRONG = 4
+    PIXELS = 5
+    IMAGES = 6
+    BACKDROP = 7
+    PAIRS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A simulated cell with m views, numbered from 0.
+
+    Attributes:
+        options: What was asked for.
+        arm: The nominal arm.
+        true_arm: The arm as it was built.
+        sheet: The board as it was printed.
+        transforms: True edges, each (4, 4): `flange_from_cam` and `base_from_target`
+            (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand).
+        joints: (m, n) joint angles as reported [rad].
+        base_from_flange: (m, 4, 4) poses as reported: the nominal arm at the reported joints.
+        true_base_from_flange: (m, 4, 4) where the flange really stood.
+        cam_from_target: (m, 4, 4) where the board really stood.
+        exact_corners: Where the corners really are in each image.
+        corners: The same as a detector with `pixel_sigma_px` would report them.
+        wrong_views: Views whose report is wrong, ascending.
+    """
+
+    options: CellOptions
+    arm: Arm
+    true_arm: Arm
+    sheet: Sheet
+    transforms: Mapping[str, FloatArray]
+    joints: FloatArray
+    base_from_flange: FloatArray
+    true_base_from_flange: FloatArray
+    cam_from_target: FloatArray
+    exact_corners: tuple[Corners, ...]
+    corners: tuple[Corners, ...]
+    wrong_views: tuple[int, ...]
+
+
+def simulate(options: CellOptions) -> Cell:
+    """Builds a cell, moves its robot and looks at the board.
+
+    Args:
+        options: What the cell is made of. The same options give the same cell.
+
+    Returns:
+        The truth and the reports.
+
+    Raises:
+        DataError: The arm is unknown, the camera's coefficients do not fit its model, or the
+            arm cannot reach enough poses from which the board is in the image.
+    """
+    arm = ur_arm(options.robot)
+    errors = ArmErrors(options.dh_sigma_m, options.dh_sigma_rad, options.offset_sigma_rad)
+    true_arm = disturb(arm, errors, stream(options, Stream.ARM))
+    sheet = Sheet(options.target, options.board_scale, options.board_bow_m)
+    transforms = _mountings(options, arm, sheet)
+    moved = _reachable_joints(options, arm, sheet, transforms)
+    sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
+    jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
+    true_base_from_flange = forward(true_arm, moved) @ exp(jitter)
+    joints, wrong_views = _misreport(options, arm, moved)
+    cam_from_target = _cam_from_target(transforms, true_base_from_flange)
+    exact_corners = _see(options, sheet, cam_from_target)
+    return Cell(
+        options=options,
+        arm=arm,
+        true_arm=true_arm,
+        sheet=sheet,
+        transforms=transforms,
+        joints=joints,
+        base_from_flange=forward(arm, joints),
+        true_base_from_flange=true_base_from_flange,
+        cam_from_target=cam_from_target,
+        exact_corners=exact_corners,
+        corners=_detect(options, exact_corners),
+        wrong_views=wrong_views,
+    )
+
+
+def stream(options: CellOptions, purpose: Stream, *index: int) -> np.random.Generator:
+    """The generator of one source of randomness; `index` tells views apart."""
+    return np.random.default_rng([options.seed, int(purpose), *index])
+
+
+def _mountings(options: CellOptions, arm: Arm, sheet: Sheet) -> dict[str, FloatArray]:
+    """The two constant edges of the cell, plausible for the arm's size."""
+    rng = stream(options, Stream.MOUNTING)
+    front, spin = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4)
+    radius = 0.6 * reach_m(arm)
+    skewed = Rotation.from_rotvec(rng.normal(0.0, 0.05, 3))
+    if options.mount == "eye-in-hand":
+        aside = rng.uniform([0.05, -0.02, 0.03], [0.09, 0.02, 0.07])
+        camera = Rotation.from_euler("z", 0.5 * np.pi) * skewed
+        flange_from_cam = compose(camera.as_matrix(), aside)
+        # The target's z points into the table.
+        board = Rotation.from_euler("ZX", [front + spin, np.pi]).as_matrix()
+        # A table so low that the arm has the board in view from a comfortable height.
+        table = min(0.0, 0.4 * reach_m(arm) - float(mean_view(options, sheet)[2, 3]))
+        centre = np.array([radius * np.cos(front), radius * np.sin(front), table])
+        base_from_target = compose(board, centre - board @ centre_m(sheet))
+        return {"flange_from_cam": flange_from_cam, "base_from_target": base_from_target}
+    board = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
+    held = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
+    flange_from_target = compose(board, held - board @ centre_m(sheet))
+    work = np.array([radius * np.cos(front), radius * np.sin(front), 0.6 * reach_m(arm)])
+    away = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
+    base_from_cam = _looking_at(work, away / np.linalg.norm(away), mean_view(options, sheet))
+    return {"base_from_cam": base_from_cam, "flange_from_target": flange_from_target}
+
+
+def _looking_at(point: FloatArray, away: FloatArray, view: FloatArray) -> FloatArray:
+    """`base_from_cam` (4, 4) of an upright camera that looks at a point along -`away`."""
+    right = np.cross(-away, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(-away, right), -away], axis=1)
+    return compose(rotation, point + np.linalg.norm(view[:3, 3]) * away)
+
+
+def _flange(transforms: Mapping[str, FloatArray], cam_from_target: FloatArray) -> FloatArray:
+    """(m, 4, 4) `base_from_flange` at which the camera sees the board so."""
+    if "flange_from_cam" in transforms:
+        base_from_cam = transforms["base_from_target"] @ invert(cam_from_target)
+        return base_from_cam @ invert(transforms["flange_from_cam"])
+    base_from_target = transforms["base_from_cam"] @ cam_from_target
+    return base_from_target @ invert(transforms["flange_from_target"])
+
+
+def _cam_from_target(
+    transforms: Mapping[str, FloatArray], base_from_flange: FloatArray
+) -> FloatArray:
+    """(m, 4, 4) poses of the board before the camera at these poses of the flange."""
+    if "flange_from_cam" in transforms:
+        base_from_cam = base_from_flange @ transforms["flange_from_cam"]
+        return invert(base_from_cam) @ transforms["base_from_target"]
+    base_from_target = base_from_flange @ transforms["flange_from_target"]
+    return invert(transforms["base_from_cam"]) @ base_from_target
+
+
+def _reachable_joints(
+    options: CellOptions, arm: Arm, sheet: Sheet, transforms: Mapping[str, FloatArray]
+) -> FloatArray:
+    """(m, n) postures of the nominal arm that bring the board into the image."""
+    rng = stream(options, Stream.POSES)
+    # Nothing of the arm may sink into the table under the board, or under the robot.
+    floor = min(0.0, transforms.get("base_from_target", np.eye(4))[2, 3]) + 0.05
+    home = _home(options, arm, _flange(transforms, mean_view(options, sheet)[None]), rng)
+    kept: list[FloatArray] = []
+    for _ in range(50):
+        views = draw_views(options, sheet, 4 * options.views, rng)
+        if not len(views):
+            continue
+        reach = inverse(arm, _flange(transforms, views), np.tile(home, (len(views), 1)))
+        good = reach.solved & (reach.dexterity > _LEAST_DEXTERITY)
+        good &= _lowest_m(arm, reach.joints) > floor
+        kept.extend(reach.joints[good])
+        if len(kept) >= options.views:
+            return np.array(kept[: options.views])
+    raise DataError(
+        f"simulation: {len(kept)} of {options.views} views found in which the {arm.name} reaches "
+        "its pose and the camera sees the board.",
+        next_step="Take another working distance, board, tilt or robot.",
+    )
+
+
+def _home(
+    options: CellOptions, arm: Arm, base_from_flange: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """(n,) the most dexterous posture at one pose (1, 4, 4); all views start from it."""
+    starts = rng.uniform(-np.pi, np.pi, size=(64, arm.a.size))
+    reach = inverse(arm, np.tile(base_from_flange, (64, 1, 1)), starts)
+    elbow_up = link_frames(arm, reach.joints)[:, 2, 2, 3] > arm.d[0]
+    merit = np.where(reach.solved & elbow_up, reach.dexterity, 0.0)
+    if not merit.any():
+        raise DataError(
+            f"simulation: the {arm.name} cannot reach the middle of the {options.mount} views.",
+            next_step="Take another working distance, board or robot.",
+        )
+    best = reach.joints[np.argmax(merit)]
+    # All joints within half a turn: the middle of their range.
+    return np.asarray((best + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def _lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:
+    """(m,) height over the base of the lowest of elbow, wrists and flange [m]."""
+    return np.asarray(link_frames(arm, joints)[:, 2:, 2, 3].min(axis=1))
+
+
+def _misreport(
+    options: CellOptions, arm: Arm, moved: FloatArray
+) -> tuple[FloatArray, tuple[int, ...]]:
+    """Joints as reported: those moved to, but for views whose report belongs elsewhere."""
+    rng = stream(options, Stream.WRONG)
+    chosen = np.sort(rng.permutation(options.views)[: options.wrong_views])
+    joints = moved.copy()
+    for view in chosen:
+        for _ in range(20):
+            turn, shift = rng.normal(size=(2, 3))
+            turn *= np.deg2rad(rng.uniform(1.0, 5.0)) / np.linalg.norm(turn)
+            shift *= rng.uniform(0.005, 0.030) / np.linalg.norm(shift)
+            error = compose(Rotation.from_rotvec(turn).as_matrix(), shift)
+            reach = inverse(arm, forward(arm, moved[view, None]) @ error, moved[view, None])
+            if reach.solved[0]:
+                joints[view] = reach.joints[0]
+                break
+        else:
+            raise DataError(f"simulation: no wrong report is in the arm's reach in view {view}.")
+    return joints, tuple(int(view) for view in chosen)
+
+
+def _see(options: CellOptions, sheet: Sheet, cam_from_target: FloatArray) -> tuple[Corners, ...]:
+    """Where the corners are in each image, without the ones outside it."""
+    points = corners_m(sheet)
+    seen = []
+    for view, pose in enumerate(cam_from_target):
+        points_cam = points @ pose[:3, :3].T + pose[:3, 3]
+        ids = np.flatnonzero(sees(options.camera, points_cam, _EDGE_PX))
+        px = project(options.camera, points_cam[ids])
+        seen.append(Corners(view, ids.astype(np.int64), px, options.blur_px))
+    return tuple(seen)
+
+
+def _detect(options: CellOptions, exact_corners: tuple[Corners, ...]) -> tuple[Corners, ...]:
+    """The corners with the noise of their detection."""
+    noise = stream(options, Stream.PIXELS)
+    return tuple(
+        Corners(
+            each.view,
+            each.ids,
+            each.px + options.pixel_sigma_px * noise.standard_normal(each.px.shape),
+            each.blur_px,
+        )
+        for each in exact_corners
+    )

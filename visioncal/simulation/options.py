@@ -1,0 +1,133 @@
+"""What a simulated cell is made of, and how good or bad it is."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+from visioncal.errors import DataError
+from visioncal.simulation.optics import wide_camera
+from visioncal.types import Camera, Mount, Target
+
+Motion: TypeAlias = Literal["free", "one_axis", "translation"]
+
+
+def charuco_target() -> Target:
+    """A ChArUco board of 9x6 squares of 30 mm."""
+    return Target(
+        name="charuco_9x6_30mm",
+        kind="charuco",
+        columns=9,
+        rows=6,
+        square_m=0.030,
+        square_sigma_m=3e-5,
+        marker_m=0.022,
+        dictionary="DICT_5X5_100",
+    )
+
+
+def checkerboard_target() -> Target:
+    """A checkerboard with 9x6 inner corners of 25 mm, whose corner 0 the colours tell."""
+    return Target(
+        name="checkerboard_9x6_25mm",
+        kind="checkerboard",
+        columns=9,
+        rows=6,
+        square_m=0.025,
+        square_sigma_m=2.5e-5,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CellOptions:
+    """A simulated cell. The defaults are a well-kept one; `exact` has no error at all.
+
+    Attributes:
+        robot: `ur3e`, `ur5e` or `ur10e`.
+        mount: Where the camera is.
+        views: Number of views.
+        target: The board as its file states it.
+        camera: The true camera.
+        state_intrinsics: Whether the session states the camera's intrinsics.
+        distance_m: Least and greatest distance of the camera from the board's centre [m]; None
+            takes a range in which the board fills the image well, for a camera beside the robot
+            within 0.7 to 1.2 m.
+        tilt_rad: Least and greatest angle between the view and the board's normal [rad].
+        roll_rad: Greatest turn about the optical axis, either way [rad].
+        motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
+            `translation` alone.
+        cut_views: Share of the views in which the image's edge may cut a ChArUco board.
+        pixel_sigma_px: Noise of the simulated detections `Cell.corners`, per axis [px].
+        blur_px: Defocus of rendered images, as a Gaussian's sigma [px].
+        image_noise: Noise of rendered images [grey levels].
+        vignetting: Loss of light in the image's corners, as a share.
+        jpeg_quality: 1 to 100; None writes lossless PNG.
+        robot_sigma_m: Repeatability: where the flange really stood, per axis [m].
+        robot_sigma_rad: The same for its rotation [rad].
+        dh_sigma_m: Departure of the real arm's lengths from the nominal ones [m].
+        dh_sigma_rad: Departure of its angles, joint offsets included [rad].
+        offset_sigma_rad: Departure of its joint offsets alone [rad].
+        wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
+        board_scale: Printed size over stated size.
+        board_bow_m: How far the board's corners are bent away from the camera [m].
+        seed: Of everything random. Each source of randomness has a stream of its own, so that a
+            change of one option leaves the others' draws as they were.
+    """
+
+    robot: str = "ur10e"
+    mount: Mount = "eye-in-hand"
+    views: int = 20
+    target: Target = field(default_factory=charuco_target)
+    camera: Camera = field(default_factory=wide_camera)
+    state_intrinsics: bool = True
+    distance_m: tuple[float, float] | None = None
+    tilt_rad: tuple[float, float] = (0.1, 0.75)
+    roll_rad: float = 1.3
+    motion: Motion = "free"
+    cut_views: float = 0.1
+    pixel_sigma_px: float = 0.05
+    blur_px: float = 0.7
+    image_noise: float = 2.0
+    vignetting: float = 0.2
+    jpeg_quality: int | None = None
+    robot_sigma_m: float = 3e-5
+    robot_sigma_rad: float = 5e-5
+    dh_sigma_m: float = 0.0
+    dh_sigma_rad: float = 0.0
+    offset_sigma_rad: float = 0.0
+    wrong_views: int = 0
+    board_scale: float = 1.0
+    board_bow_m: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.views < 1:
+            raise DataError(f"simulation: views is {self.views}, at least 1 is needed.")
+        if not 0 <= self.wrong_views <= self.views:
+            raise DataError(
+                f"simulation: wrong_views is {self.wrong_views}, 0 to {self.views} are possible."
+            )
+        if not 0.0 <= self.tilt_rad[0] <= self.tilt_rad[1] < 1.5:
+            raise DataError(
+                f"simulation: tilt_rad is {self.tilt_rad}, an ascending range in 0 to 1.5 is "
+                "needed: beyond it the camera looks at the board's edge."
+            )
+
+
+def exact(options: CellOptions | None = None) -> CellOptions:
+    """A cell, the default one if none is given, without noise or error of any kind.
+
+    Its reports, its detections and its board are the truth; its images are only rounded to grey
+    levels.
+    """
+    return replace(
+        options or CellOptions(),
+        pixel_sigma_px=0.0,
+        image_noise=0.0,
+        robot_sigma_m=0.0,
+        robot_sigma_rad=0.0,
+        dh_sigma_m=0.0,
+        dh_sigma_rad=0.0,
+        offset_sigma_rad=0.0,
+        wrong_views=0,
+        board_scale=1.0,
+        board_bow_m=0.0,
+    )

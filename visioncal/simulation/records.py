@@ -1,0 +1,274 @@
+"""Simulated cells on disk: the session that calibration reads, and the truth beside it."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DataError
+from visioncal.files import decode_text, read_bytes, write_atomically
+from visioncal.session import MemoryImages, Session, View
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.cell import Cell, Stream, stream
+from visioncal.simulation.optics import project
+from visioncal.simulation.options import charuco_target, checkerboard_target
+from visioncal.simulation.render import encode, prepare_scene, render
+from visioncal.transforms import exp
+from visioncal.types import Camera, FloatArray, Target
+
+_POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+# An operator's pace: a stop every so many seconds [s].
+_PACE_S = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulated session should yield.
+
+    Attributes:
+        transforms: True edges by their contract names, each (4, 4).
+        camera: The true intrinsics.
+        base_from_flange: (m, 4, 4) where the flange really stood.
+        cam_from_target: (m, 4, 4) where the board really stood.
+        wrong_views: Views whose reported pose is wrong.
+        arm: The arm as it was built, Denavit-Hartenberg tables by their names; a, d [m],
+            alpha, beta, offset [rad], each (n,).
+        options: The cell's options as plain numbers and words, noise levels among them.
+    """
+
+    transforms: Mapping[str, FloatArray]
+    camera: Camera
+    base_from_flange: FloatArray
+    cam_from_target: FloatArray
+    wrong_views: tuple[int, ...]
+    arm: Mapping[str, FloatArray]
+    options: Mapping[str, Any]
+
+
+def write_session(
+    cell: Cell,
+    folder: Path | str,
+    progress: Callable[[float], None] | None = None,
+    *,
+    images: bool = True,
+) -> Path:
+    """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
+
+    Args:
+        cell: The cell.
+        folder: The session's folder; it must not hold anything yet.
+        progress: Called with the share that is done, 0 to 1, after each view.
+        images: Whether to render images. Without them the session holds pose pairs: cam_from_target
+            as a PnP with `pixel_sigma_px` of noise would measure it, and neither camera nor target.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: The folder cannot be written, or the target cannot be drawn.
+    """
+    folder = Path(folder)
+    session = _image_session(cell, folder.name, progress) if images else _pairs(cell, folder.name)
+    session.save(folder)
+    write_atomically(truth_path(folder), _truth_text(cell))
+    if progress is not None:
+        progress(1.0)
+    return folder
+
+
+def truth_path(folder: Path | str) -> Path:
+    """Where the truth of a simulated session lies: beside its folder, never inside."""
+    folder = Path(folder)
+    return folder.with_name(f"{folder.name}.truth.json")
+
+
+def read_truth(path: Path | str) -> Truth:
+    """Reads the truth of a simulated session.
+
+    Args:
+        path: The session's folder, or its `.truth.json`.
+
+    Raises:
+        DataError: The file is missing or is not such a truth.
+    """
+    path = Path(path)
+    if path.suffix != ".json":
+        path = truth_path(path)
+    text = decode_text(read_bytes(path), str(path))
+    try:
+        content = json.loads(text)
+        camera = content["camera"]
+        width, height = camera["resolution"]
+        return Truth(
+            transforms={key: np.array(value) for key, value in content["transforms"].items()},
+            camera=Camera(
+                "fisheye" if camera["model"] == "fisheye" else "brown",
+                (int(width), int(height)),
+                np.array(camera["matrix"], dtype=float),
+                np.array(camera["distortion"], dtype=float),
+            ),
+            base_from_flange=np.array(content["base_from_flange"]),
+            cam_from_target=np.array(content["cam_from_target"]),
+            wrong_views=tuple(content["wrong_views"]),
+            arm={key: np.array(value) for key, value in content["arm"].items()},
+            options=content["options"],
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} is not the truth of a simulated session: {error!r}.", culprits=[str(path)]
+        ) from error
+
+
+def measured_poses(cell: Cell) -> FloatArray:
+    """(m, 4, 4) `cam_from_target` as a PnP on the noisy corners of each view would give it.
+
+    The error is drawn from the covariance of a least-squares fit of the pose to the corners that
+    are seen, `pixel_sigma_px` squared times the inverse of their Gram matrix.
+
+    Raises:
+        DataError: A view shows too few corners for a pose.
+    """
+    rng = stream(cell.options, Stream.PAIRS)
+    draws = rng.standard_normal((cell.options.views, 6))
+    points = corners_m(cell.sheet)
+    measured = cell.cam_from_target.copy()
+    for view, pose in enumerate(cell.cam_from_target):
+        ids = cell.exact_corners[view].ids
+        if ids.size < 4:
+            raise DataError(f"simulation: view {view} shows {ids.size} corners, a pose needs 4.")
+        jacobian = _pose_jacobian(cell.options.camera, pose, points[ids])
+        # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
+        factor = np.linalg.qr(jacobian, mode="r")
+        twist = cell.options.pixel_sigma_px * np.linalg.solve(factor, draws[view])
+        measured[view] = pose @ exp(twist)
+    return measured
+
+
+def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
+    """(2n, 6) derivative of the pixels by the pose's right perturbation, by differences."""
+    step = 1e-6
+    columns = []
+    for twist in step * np.eye(6):
+        ahead, behind = cam_from_target @ exp(twist), cam_from_target @ exp(-twist)
+        pixels = [
+            project(camera, points @ pose[:3, :3].T + pose[:3, 3]) for pose in (ahead, behind)
+        ]
+        columns.append((pixels[0] - pixels[1]).ravel() / (2.0 * step))
+    return np.stack(columns, axis=1)
+
+
+def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | None) -> Session:
+    suffix = "png" if cell.options.jpeg_quality is None else "jpg"
+    scene = prepare_scene(cell)
+    files = {}
+    for view in range(cell.options.views):
+        picture = encode(render(scene, view), cell.options.jpeg_quality)
+        files[f"images/{view:03d}.{suffix}"] = picture
+        if progress is not None:
+            progress((view + 1.0) / (cell.options.views + 1.0))
+    target = cell.options.target
+    shipped = target in (charuco_target(), checkerboard_target())
+    document = {
+        **_document(cell, name),
+        "target": target.name if shipped else "target.toml",
+        "camera": _camera_table(cell),
+    }
+    numbers = list(_report_rows(cell))
+    return Session(
+        document=document,
+        columns=("view", "image", *numbers[0]),
+        views=tuple(
+            View(view, image=path, numbers=numbers[view]) for view, path in enumerate(files)
+        ),
+        target=target,
+        target_document=_target_document(target),
+        images=MemoryImages(files),
+        warnings=(),
+    )
+
+
+def _pairs(cell: Cell, name: str) -> Session:
+    numbers = [
+        {**row, **{f"cft_{key}": value for key, value in _pose_row(pose).items()}}
+        for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
+    ]
+    return Session(
+        document=_document(cell, name),
+        columns=("view", *numbers[0]),
+        views=tuple(View(view, numbers=row) for view, row in enumerate(numbers)),
+        target=None,
+        target_document=None,
+        images=MemoryImages({}),
+        warnings=(),
+    )
+
+
+def _document(cell: Cell, name: str) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "name": name,
+        "mount": cell.options.mount,
+        "robot": {"model": cell.arm.name, "tip": "flange"},
+    }
+
+
+def _camera_table(cell: Cell) -> dict[str, Any]:
+    camera = cell.options.camera
+    table: dict[str, Any] = {
+        "name": "simulated",
+        "resolution": list(camera.resolution),
+        "model": camera.model,
+    }
+    if cell.options.state_intrinsics:
+        table["matrix"] = camera.matrix.tolist()
+        table["distortion"] = camera.distortion.tolist()
+    return table
+
+
+def _target_document(target: Target) -> dict[str, Any]:
+    document: dict[str, Any] = {"kind": target.kind}
+    if target.kind == "marker":
+        document |= {"id": target.marker_id, "size_m": target.square_m}
+    else:
+        document |= {"columns": target.columns, "rows": target.rows, "square_m": target.square_m}
+    document["square_sigma_m"] = target.square_sigma_m
+    if target.kind == "charuco":
+        document |= {"marker_m": target.marker_m, "legacy": target.legacy}
+    if target.kind != "checkerboard":
+        document["dictionary"] = target.dictionary
+    return document
+
+
+def _report_rows(cell: Cell) -> Iterator[dict[str, float]]:
+    """The numeric columns of each view: when, with which joints, at which reported pose."""
+    for view in range(cell.options.views):
+        joints = {f"q{i + 1}_rad": float(q) for i, q in enumerate(cell.joints[view])}
+        yield {"stamp_s": _PACE_S * view} | _pose_row(cell.base_from_flange[view]) | joints
+
+
+def _pose_row(pose: FloatArray) -> dict[str, float]:
+    """Seven columns of a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return dict(zip(_POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
+
+
+def _truth_text(cell: Cell) -> str:
+    options = asdict(cell.options)
+    camera = options.pop("camera")
+    arm = asdict(cell.true_arm)
+    del arm["name"]
+    content = {
+        "schema": 1,
+        "transforms": cell.transforms,
+        "camera": camera,
+        "wrong_views": cell.wrong_views,
+        "options": options,
+        "arm": arm,
+        "base_from_flange": cell.true_base_from_flange,
+        "cam_from_target": cell.cam_from_target,
+    }
+    return json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n"

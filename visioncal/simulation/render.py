@@ -1,0 +1,277 @@
+"""Pictures of a simulated board: a ray for each sub-pixel, through the lens, onto the sheet."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from visioncal.errors import DataError
+from visioncal.simulation.boards import bow_depth_m, outline_m
+from visioncal.simulation.cell import Cell, Stream, stream
+from visioncal.simulation.optics import project, sees
+from visioncal.simulation.rasters import Float32Array, Patch, between, trace
+from visioncal.simulation.silhouettes import draw_arm
+from visioncal.simulation.textures import (
+    SheetTexture,
+    draw_sheet,
+    draw_table,
+    draw_wall,
+    margin_m,
+)
+from visioncal.transforms import compose, invert
+from visioncal.types import FloatArray, Image
+
+# Sub-pixels along a pixel's side.
+_SAMPLES = 3
+# Rows of pixels that are worked on at a time, so that they stay in the processor's cache.
+_BAND_PX = 48
+_BLACK_LEVEL, _FLOOR = 4.0, 118.0
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """A plane behind the board, with a texture that repeats, under a lamp.
+
+    Attributes:
+        texture: Its picture.
+        texel_m: Side of a texel [m].
+        depth_m: How far the plane lies below the board (a table), or before the camera (a wall).
+        lamp_m: Radius of the brighter spot [m].
+        moves: Whether it moves with the board, as a table does, and not with the camera.
+    """
+
+    texture: Image
+    texel_m: float
+    depth_m: float
+    lamp_m: float
+    moves: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What all pictures of one cell share.
+
+    Attributes:
+        cell: The cell.
+        sheet: The board's texture.
+        backdrop: What is behind the board.
+    """
+
+    cell: Cell
+    sheet: SheetTexture
+    backdrop: Backdrop
+
+
+def prepare_scene(cell: Cell) -> Scene:
+    """Draws the textures of a cell, which takes longer than one of its pictures.
+
+    Raises:
+        DataError: OpenCV does not have the target's dictionary.
+    """
+    target, camera = cell.options.target, cell.options.camera
+    nearest = float(np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1).min())
+    samples = _SAMPLES * float(camera.matrix[0]) * target.square_m / max(nearest, 0.05)
+    texels = 2 ** int(np.clip(np.round(np.log2(samples)), 4, 10))
+    # A board of many squares stays within some 30 million texels.
+    while target.columns * target.rows * texels**2 > 3e7:
+        texels //= 2
+    rng = stream(cell.options, Stream.BACKDROP)
+    if cell.options.mount == "eye-in-hand":
+        backdrop = Backdrop(draw_table(rng, 1024), 0.0008, 0.006, 0.45, True)
+    else:
+        backdrop = Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, False)
+    return Scene(cell, draw_sheet(target, texels), backdrop)
+
+
+def render_view(cell: Cell, index: int) -> Image:
+    """Takes the picture of one view; for many views, `prepare_scene` once and `render`.
+
+    Args:
+        cell: The cell.
+        index: Number of the view.
+
+    Returns:
+        (height, width) grey image.
+    """
+    return render(prepare_scene(cell), index)
+
+
+def render(scene: Scene, index: int) -> Image:
+    """Takes the picture of one view.
+
+    Args:
+        scene: The prepared cell.
+        index: Number of the view.
+
+    Returns:
+        (height, width) grey image with the cell's blur, vignetting and noise.
+
+    Raises:
+        DataError: There is no such view.
+    """
+    options = scene.cell.options
+    if not 0 <= index < options.views:
+        raise DataError(f"simulation: there is no view {index} among {options.views}.")
+    # Several BLAS threads on a busy machine wait for one another ten times as long as they work.
+    with threadpool_limits(1, user_api="blas"):
+        light = _unlit(scene, index)
+    if options.blur_px > 0.0:
+        light = np.asarray(
+            cv2.GaussianBlur(light, (0, 0), options.blur_px, borderType=cv2.BORDER_REPLICATE),
+            np.float32,
+        )
+    light += np.float32(_BLACK_LEVEL)
+    if options.image_noise > 0.0:
+        noise = stream(options, Stream.IMAGES, index)
+        grain = noise.standard_normal(light.shape, dtype=np.float32)
+        light += np.float32(options.image_noise) * grain
+    return np.asarray(np.clip(np.rint(light), 0.0, 255.0), np.uint8)
+
+
+def encode(image: Image, jpeg_quality: int | None) -> bytes:
+    """Encodes a picture as JPEG, or as PNG where no quality is given.
+
+    Raises:
+        DataError: OpenCV cannot encode it.
+    """
+    if jpeg_quality is None:
+        done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 2])
+    else:
+        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
+    if not done:
+        raise DataError(f"simulation: an image of shape {image.shape} cannot be encoded.")
+    return data.tobytes()
+
+
+def _unlit(scene: Scene, index: int) -> Float32Array:
+    """(height, width) light on the sensor before defocus and noise [grey levels]."""
+    cell = scene.cell
+    camera = cell.options.camera
+    cam_from_target = cell.cam_from_target[index]
+    whole = trace(camera, Patch(0, 0, *camera.resolution), 1)
+    plane_from_cam = _plane_from_cam(scene.backdrop, cam_from_target)
+    places = _strike(plane_from_cam, whole.directions, 0.0)
+    behind = np.asarray(
+        cv2.remap(
+            scene.backdrop.texture,
+            between(whole, places[..., 0] / scene.backdrop.texel_m),
+            between(whole, places[..., 1] / scene.backdrop.texel_m),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_WRAP,
+        ),
+        np.uint8,
+    )
+    if not scene.backdrop.moves:
+        cam_from_base = invert(cell.transforms["base_from_cam"])
+        draw_arm(behind, camera, cell.arm, cell.joints[index], cam_from_base)
+    offset = (places - scene.backdrop.lamp_m * np.array([-0.3, -0.2])) / scene.backdrop.lamp_m
+    distance2 = (offset**2).sum(axis=-1)
+    light = behind.astype(np.float32)
+    if scene.backdrop.moves:
+        # Far away, towards the horizon, the table ends in an even floor.
+        light -= np.float32(_FLOOR)
+        light *= between(whole, np.exp(-((distance2 / 8.0) ** 2)))
+        light += np.float32(_FLOOR)
+    _cover(light, scene, cam_from_target, _facing(scene, cam_from_target))
+    middle = 0.5 * np.array(camera.resolution) - 0.5
+    edge = ((whole.px - middle) ** 2).sum(axis=-1) / (middle**2).sum()
+    lamp = 0.78 + 0.30 / (1.0 + distance2)
+    light *= between(whole, lamp * (1.0 - cell.options.vignetting * edge))
+    return light
+
+
+def _plane_from_cam(backdrop: Backdrop, cam_from_target: FloatArray) -> FloatArray:
+    """(4, 4) pose of the camera before the backdrop, whose plane is z = 0."""
+    if not backdrop.moves:
+        return compose(np.eye(3), np.array([0.4, 0.3, -backdrop.depth_m]))
+    lower = compose(np.eye(3), np.array([0.0, 0.0, -backdrop.depth_m]))
+    return lower @ invert(cam_from_target)
+
+
+def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
+    """Brightness of the board: where a robot turns it, it catches more or less of the light."""
+    if scene.backdrop.moves:
+        return 1.0
+    # From behind the camera, above and a little from the left; the board's z points away from it.
+    light_from_cam = np.array([0.3, 0.6, 0.74])
+    return 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_from_cam), 0.0)
+
+
+def _cover(
+    light: Float32Array, scene: Scene, cam_from_target: FloatArray, brightness: float
+) -> None:
+    """Lays the sheet over what is behind it, in place."""
+    cell, sheet = scene.cell, scene.sheet
+    patch = _board_patch(cell, cam_from_target)
+    raster = trace(cell.options.camera, patch, _SAMPLES)
+    flat = _strike_sheet(cell, raster.directions, cam_from_target)
+    # The texel that fits the sub-pixels best, over the whole board.
+    spacing = _spacing_m(flat, raster.px) / _SAMPLES
+    level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
+    # Texel centres are half a texel from the texture's outer corner.
+    texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
+    width, height = patch.size
+    for top in range(0, height, _BAND_PX):
+        rows = min(_BAND_PX, height - top)
+        band = slice(top * _SAMPLES, (top + rows) * _SAMPLES)
+        seen = cv2.remap(
+            sheet.levels[level],
+            between(raster, texels[..., 0], band),
+            between(raster, texels[..., 1], band),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(0, 0),
+        ).astype(np.float32)
+        # Exactly _SAMPLES squared sub-pixels lie around each pixel's centre.
+        pixels = cv2.resize(seen, (width, rows), interpolation=cv2.INTER_AREA)
+        window = light[patch.top + top : patch.top + top + rows, patch.left : patch.right]
+        window *= 1.0 - pixels[..., 1] / np.float32(255.0)
+        window += np.float32(brightness) * pixels[..., 0]
+
+
+def _board_patch(cell: Cell, cam_from_target: FloatArray) -> Patch:
+    """Bounds of the sheet and its shadow in the image."""
+    camera = cell.options.camera
+    points = outline_m(cell.sheet, margin_m(cell.options.target))
+    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    width, height = camera.resolution
+    # A point so far outside that the lens model folds it back says nothing about the bounds.
+    if not sees(camera, points_cam, -np.inf).all():
+        return Patch(0, 0, width, height)
+    px = project(camera, points_cam)
+    left, top = np.maximum(np.floor(px.min(axis=0)).astype(int) - 2, 0)
+    right, bottom = np.minimum(np.ceil(px.max(axis=0)).astype(int) + 3, [width, height])
+    return Patch(int(left), int(top), int(right), int(bottom))
+
+
+def _strike_sheet(cell: Cell, directions: FloatArray, cam_from_target: FloatArray) -> FloatArray:
+    """Where rays hit the bowed sheet, (..., 2) in the flat target frame as stated [m]."""
+    target_from_cam = invert(cam_from_target)
+    flat = _strike(target_from_cam, directions, 0.0)
+    if cell.sheet.bow_m != 0.0:
+        for _ in range(6):
+            # The bow is shallow: each turn gains the slope of the sheet over that of the ray.
+            depth = np.clip(bow_depth_m(cell.sheet, flat), -0.05, 0.05)
+            flat = _strike(target_from_cam, directions, depth)
+    return flat / cell.sheet.scale
+
+
+def _strike(
+    plane_from_cam: FloatArray, directions: FloatArray, depth_m: FloatArray | float
+) -> FloatArray:
+    """(..., 2) points where rays of the camera reach z = `depth_m` of a frame [m]."""
+    aim = directions @ plane_from_cam[:3, :3].T
+    start = plane_from_cam[:3, 3]
+    # Rays near the horizon and above it are bent down; what they show is far from the board.
+    fall = np.maximum(aim[..., 2], 0.06)
+    return np.asarray(start[:2] + aim[..., :2] * ((depth_m - start[2]) / fall)[..., None])
+
+
+def _spacing_m(flat: FloatArray, px: FloatArray) -> float:
+    """Typical distance on the sheet of neighbouring pixels, the root of an area [m]."""
+    right = np.diff(flat, axis=1)[:-1]
+    down = np.diff(flat, axis=0)[:, :-1]
+    area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
+    knot_px2 = float(np.prod(px[1, 1] - px[0, 0]))
+    return float(np.sqrt(np.median(area) / knot_px2))

@@ -1,0 +1,217 @@
+"""What a simulated camera looks at: the printed sheet on its plate, and a table-top."""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from visioncal.errors import DataError
+from visioncal.simulation.boards import pattern_box
+from visioncal.types import FloatArray, Image, Target
+
+_Canvas: TypeAlias = npt.NDArray[np.float32]
+
+_INK, _PAPER, _PLATE = 30, 222, 152
+# Margins around the print in sides of a square: white paper, its plate, the plate's shadow.
+_PAPER_MARGIN, _PLATE_MARGIN, _SHADOW_MARGIN = 0.55, 0.85, 1.35
+_SHADOW_STRENGTH = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class SheetTexture:
+    """The sheet, seen straight, at halving resolutions.
+
+    Attributes:
+        origin_m: (2,) outer corner of texel (0, 0) in the flat, unscaled target frame [m].
+        texel_m: Side of a texel at each level [m], ascending.
+        levels: (h, w, 2) images at each level: brightness times coverage, and coverage. Where the
+            coverage is partial, what lies behind shines through.
+    """
+
+    origin_m: FloatArray
+    texel_m: tuple[float, ...]
+    levels: tuple[Image, ...]
+
+
+def draw_sheet(target: Target, texels: int) -> SheetTexture:
+    """Draws a target on its plate.
+
+    Args:
+        target: The target.
+        texels: Texels along a square at the finest level, a power of two.
+
+    Raises:
+        DataError: OpenCV does not have the target's dictionary.
+    """
+    left, top, right, bottom = pattern_box(target)
+    columns, rows = (round((b - a) / target.square_m) for a, b in ((left, right), (top, bottom)))
+    margin = 2 * int(np.ceil(0.5 * _SHADOW_MARGIN * texels))
+    grey = np.full((rows * texels + 2 * margin, columns * texels + 2 * margin), _PLATE, np.uint8)
+    paper = margin - round(_PAPER_MARGIN * texels)
+    grey[paper:-paper, paper:-paper] = _PAPER
+    grey[margin:-margin, margin:-margin] = _print(target, columns, rows, texels)
+    _draw_label(grey[-margin:-paper, margin:-margin], target, texels)
+    plate = margin - round(_PLATE_MARGIN * texels)
+    coverage = _shadow(grey.shape, plate, texels)
+    grey[coverage < 255] = 0
+    levels = [np.stack([grey, coverage], axis=-1)]
+    while levels[-1].shape[0] > 128:
+        height, width = levels[-1].shape[:2]
+        # Odd rows and columns at the shadow's far end are dropped, so that halves stay halves.
+        even = levels[-1][: height // 2 * 2, : width // 2 * 2]
+        levels.append(
+            np.asarray(
+                cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8
+            )
+        )
+    finest = target.square_m / texels
+    return SheetTexture(
+        origin_m=np.array([left, top]) - margin * finest,
+        texel_m=tuple(finest * 2.0**level for level in range(len(levels))),
+        levels=tuple(levels),
+    )
+
+
+def margin_m(target: Target) -> float:
+    """How far the drawn sheet, its shadow included, reaches beyond the print [m]."""
+    return _SHADOW_MARGIN * target.square_m
+
+
+def draw_table(rng: np.random.Generator, size: int) -> Image:
+    """Draws a piece of a used table-top that can be repeated in both directions.
+
+    Args:
+        rng: Source of randomness.
+        size: Side of the image [texels].
+
+    Returns:
+        (size, size) image: brushed grain, stains, scratches and a few small parts, all of low
+        contrast.
+    """
+    grain = _smooth_noise(rng, size, 60.0, 0.7)
+    mottling = _smooth_noise(rng, size, 40.0, 40.0)
+    canvas = np.asarray(134.0 + 4.0 * grain + 6.0 * mottling, np.float32)
+    for _ in range(14):
+        _draw_scratch(canvas, rng)
+    for _ in range(9):
+        _draw_part(canvas, rng)
+    return np.asarray(np.clip(canvas, 0.0, 255.0), np.uint8)
+
+
+def draw_wall(rng: np.random.Generator, size: int) -> Image:
+    """Draws a wall far out of focus, with cabinets and doors, that can be repeated."""
+    canvas = np.asarray(118.0 + 7.0 * _smooth_noise(rng, size, 80.0, 80.0), np.float32)
+    for _ in range(16):
+        x, y = rng.uniform(0.04, 0.9, 2) * size
+        wide, high = rng.uniform(0.03, 0.2, 2) * size
+        corner = (int(min(x + wide, 0.96 * size)), int(min(y + high, 0.96 * size)))
+        cv2.rectangle(canvas, (int(x), int(y)), corner, float(rng.uniform(70.0, 165.0)), -1)
+    return np.asarray(cv2.GaussianBlur(canvas, (0, 0), 0.008 * size), np.uint8)
+
+
+def _draw_label(strip: Image, target: Target, texels: int) -> None:
+    """Writes what was printed under the print, small and grey, into the free strip there."""
+    square_mm = f"{1000.0 * target.square_m:g} mm"
+    words = f"{target.kind} {target.columns}x{target.rows}, {square_mm} {target.dictionary}"
+    scale = texels / 160.0
+    at = (int(0.1 * texels), int(0.42 * texels))
+    thickness = max(round(1.2 * scale), 1)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(strip, words, at, font, 0.8 * scale, 110.0, thickness, cv2.LINE_AA)
+
+
+def _print(target: Target, columns: int, rows: int, texels: int) -> Image:
+    """The print itself, (rows * texels, columns * texels)."""
+    if target.kind == "marker":
+        return _marker(target, target.marker_id, texels)
+    row, column = np.mgrid[:rows, :columns]
+    # Boards from before OpenCV 4.6 start with a white square where the number of rows is even.
+    shift = int(target.kind == "charuco" and target.legacy and rows % 2 == 0)
+    white = (row + column + shift) % 2 == 1
+    image = np.kron(np.where(white, _PAPER, _INK), np.ones((texels, texels))).astype(np.uint8)
+    if target.kind == "checkerboard":
+        return image
+    # An even inset keeps the marker in the middle of its square.
+    inset = round(0.5 * (1.0 - target.marker_m / target.square_m) * texels)
+    for number, (row_at, column_at) in enumerate(np.argwhere(white)):
+        y, x = row_at * texels + inset, column_at * texels + inset
+        side = texels - 2 * inset
+        image[y : y + side, x : x + side] = _marker(target, number, side)
+    return image
+
+
+def _marker(target: Target, number: int, side: int) -> Image:
+    if not hasattr(cv2.aruco, target.dictionary):
+        raise DataError(f"simulation: OpenCV has no dictionary {target.dictionary!r}.")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    modules = dictionary.generateImageMarker(number, dictionary.markerSize + 2)
+    # Edges between modules are rounded to texels; the corners of a target are not among them.
+    bits = cv2.resize(modules, (side, side), interpolation=cv2.INTER_NEAREST)
+    return np.where(bits > 0, _PAPER, _INK).astype(np.uint8)
+
+
+def _shadow(shape: tuple[int, ...], plate: int, texels: int) -> Image:
+    """Coverage: 255 on the plate, fading in the shadow around it."""
+    # Small, because it is smooth, and then enlarged.
+    factor = max(texels // 16, 1)
+    small = np.zeros((-(-shape[0] // factor), -(-shape[1] // factor)), np.float32)
+    inner = plate // factor
+    small[inner:-inner, inner:-inner] = 255.0 * _SHADOW_STRENGTH
+    soft = cv2.GaussianBlur(small, (0, 0), 0.16 * texels / factor)
+    coverage = np.asarray(cv2.resize(soft, (shape[1], shape[0])), np.uint8)
+    coverage[plate:-plate, plate:-plate] = 255
+    return coverage
+
+
+def _smooth_noise(
+    rng: np.random.Generator, size: int, sigma_x: float, sigma_y: float
+) -> FloatArray:
+    """Unit-variance noise, smoothed by a Gaussian [texels], periodic in both directions."""
+    frequency = 2.0 * np.pi * np.fft.rfftfreq(size)
+    frequency_y = 2.0 * np.pi * np.fft.fftfreq(size)
+    damping = np.exp(
+        -0.5 * ((sigma_x * frequency)[None, :] ** 2 + (sigma_y * frequency_y)[:, None] ** 2)
+    )
+    damping[0, 0] = 0.0
+    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * damping, (size, size))
+    return np.asarray(noise / noise.std())
+
+
+def _draw_scratch(canvas: _Canvas, rng: np.random.Generator) -> None:
+    size = canvas.shape[0]
+    start = rng.uniform(0.1, 0.9, 2) * size
+    end = np.clip(start + rng.normal(0.0, 0.12, 2) * size, 0.03 * size, 0.97 * size)
+    layer = np.zeros_like(canvas)
+    cv2.line(layer, _point(start), _point(end), float(rng.uniform(-9.0, 12.0)), 1)
+    canvas += cv2.GaussianBlur(layer, (0, 0), 0.8)
+
+
+def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
+    """A washer, a bar or a cable, with a soft shadow beside it."""
+    size = canvas.shape[0]
+    centre = rng.uniform(0.15, 0.85, 2) * size
+    shape = np.zeros_like(canvas)
+    kind = rng.integers(3)
+    if kind == 0:
+        radius = int(rng.uniform(0.008, 0.018) * size)
+        cv2.circle(shape, _point(centre), radius, 1.0, -1)
+        cv2.circle(shape, _point(centre), radius // 2, 0.0, -1)
+    elif kind == 1:
+        half = rng.uniform(0.01, 0.05, 2) * size
+        box = cv2.boxPoints((centre.tolist(), (2.0 * half).tolist(), float(rng.uniform(0, 180))))
+        cv2.fillPoly(shape, [np.round(box).astype(np.int32)], 1.0)
+    else:
+        steps = np.cumsum(rng.normal(0.0, 0.025, (8, 2)), axis=0) * size
+        path = cv2.GaussianBlur(centre + steps, (1, 5), 1.5)
+        curve = np.clip(path, 0.03 * size, 0.97 * size).round().astype(np.int32)
+        cv2.polylines(shape, [curve], False, 1.0, max(size // 180, 1))
+    shape = np.asarray(cv2.GaussianBlur(shape, (0, 0), 0.6), np.float32)
+    shadow = cv2.GaussianBlur(np.roll(shape, size // 160, (0, 1)), (0, 0), 0.006 * size)
+    canvas *= 1.0 - 0.3 * shadow
+    canvas += shape * (float(rng.uniform(70.0, 150.0)) - canvas) * 0.8
+
+
+def _point(place: FloatArray) -> tuple[int, int]:
+    return int(place[0]), int(place[1])

@@ -1,0 +1,1 @@
+"""The stages of a calibration, one file each: options, a result, and the function between."""

@@ -1,0 +1,213 @@
+"""Stage 1: finds the target in every image, on threads, with a reason where it cannot be used."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.finders import NotFound, find_target, fitting_layouts
+from visioncal.finders.imaging import blur_at_corners, decode_grey, sharpest_edges
+from visioncal.session import Session, View
+from visioncal.targets import corner_positions
+from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
+
+# Images looked at to tell which layout was printed.
+_LAYOUT_SAMPLE = 3
+
+
+@dataclass(frozen=True)
+class DetectOptions:
+    """What a view needs in order to be used.
+
+    Attributes:
+        min_corners: Fewest corners of a board; a homography needs 4, the rest are its check.
+        max_blur_px: Widest edges, as a Gaussian's sigma [px]. Defocus of this size still gives
+            corners to 0.1 px; motion of this size is a pose that changed during the exposure.
+        threads: How many images are worked on at a time; 0 for one a core.
+    """
+
+    min_corners: int = 6
+    max_blur_px: float = 4.0
+    threads: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """The corners by view, in the session's order, and the views without."""
+
+    corners: Mapping[int, Corners]
+    rejections: tuple[Rejection, ...]
+    resolution: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What one image gave."""
+
+    found: Corners | Rejection
+    resolution: tuple[int, int] | None
+    misfit: bool = False
+
+
+def detect(
+    session: Session, options: DetectOptions | None = None, progress: Progress | None = None
+) -> Detections:
+    """Finds the session's target in all its images.
+
+    Args:
+        session: A session with a target; its views without images are passed over.
+        options: What a view needs.
+        progress: Told after each image.
+
+    Returns:
+        The corners and the rejected views.
+
+    Raises:
+        DataError: No view shows the target, an image has another size than the camera, or the
+            board that was printed has another layout than the one declared.
+    """
+    options = options or DetectOptions()
+    target = session.target
+    if target is None:
+        raise DataError("session: images need a target.", next_step="Name one in session.toml.")
+    views = [view for view in session.views if view.image]
+    looks: list[_Look] = []
+    with (
+        _single_threaded_opencv(),
+        ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
+    ):
+        for look in pool.map(lambda view: _look(session, view, target, options), views):
+            looks.append(look)
+            if progress is not None:
+                progress("detect", len(looks), len(views))
+    resolution = _common_resolution(session, views, looks)
+    _check_layout(session, target, views, looks)
+    found = [look.found for look in looks]
+    return Detections(
+        {it.view: it for it in found if isinstance(it, Corners)},
+        tuple(it for it in found if isinstance(it, Rejection)),
+        resolution,
+    )
+
+
+@contextmanager
+def _single_threaded_opencv() -> Iterator[None]:
+    """Keeps OpenCV from starting threads inside ours, which slows both down."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _look(session: Session, view: View, target: Target, options: DetectOptions) -> _Look:
+    if not session.images.exists(view.image):
+        return _Look(Rejection(view.number, f"{view.image} is missing"), None)
+    image = decode_grey(session.images.read(view.image))
+    if isinstance(image, str):
+        return _Look(Rejection(view.number, f"{view.image} is {image}"), None)
+    resolution = (image.shape[1], image.shape[0])
+    seen = find_target(image, target)
+    if isinstance(seen, NotFound):
+        blur = sharpest_edges(image)
+        blurred = f"; the image is blurred, its sharpest edges are {blur:.0f} px wide"
+        reason = seen.reason + (blurred if blur > options.max_blur_px else "")
+        return _Look(Rejection(view.number, reason), resolution, seen.misfit)
+    blur = blur_at_corners(image, seen.px)
+    trouble = _trouble(target, seen.ids, blur, options)
+    if trouble:
+        return _Look(Rejection(view.number, trouble), resolution)
+    return _Look(Corners(view.number, seen.ids, seen.px, blur), resolution)
+
+
+def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
+    needed = 4 if target.kind == "marker" else options.min_corners
+    if len(ids) < needed:
+        return f"too few corners: {len(ids)} of {len(corner_positions(target))}, needs {needed}"
+    if _on_one_line(corner_positions(target)[ids]):
+        return f"corners on one line: all {len(ids)} lie in one row of the board"
+    if blur_px > options.max_blur_px:
+        return f"blurred: edges are {blur_px:.1f} px wide (limit {options.max_blur_px:.1f})"
+    return ""
+
+
+def _on_one_line(positions: FloatArray) -> bool:
+    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(spread[1] < 1e-6 * spread[0])
+
+
+def _common_resolution(
+    session: Session, views: Sequence[View], looks: Sequence[_Look]
+) -> tuple[int, int]:
+    """Checks that all images have the camera's size, or at least one size between them."""
+    sizes = [look.resolution for look in looks if look.resolution is not None]
+    if not sizes:
+        reasons = [f"view {it.view}: {it.reason}" for it in _rejections(looks)]
+        raise DataError(
+            f"session {session.name!r}: none of its {len(views)} images can be read.",
+            culprits=reasons,
+            next_step=f"First: {reasons[0]}." if reasons else "Give the views images.",
+        )
+    wanted = session.resolution or max(set(sizes), key=sizes.count)
+    line_of = {view.number: line for line, view in enumerate(session.views, start=2)}
+    culprits = [
+        f"views.csv line {line_of[view.number]}, column image: {view.image} is "
+        f"{look.resolution[0]} x {look.resolution[1]} px"
+        for view, look in zip(views, looks, strict=True)
+        if look.resolution is not None and look.resolution != wanted
+    ]
+    if culprits:
+        source = "the camera's resolution" if session.resolution else "most other images"
+        raise DataError(
+            f"{culprits[0]}, but {source} is {wanted[0]} x {wanted[1]} px"
+            + (f" ({len(culprits)} images in all)." if len(culprits) > 1 else "."),
+            culprits=culprits,
+            next_step="Correct [camera] resolution in session.toml, or take out these views.",
+        )
+    return wanted
+
+
+def _rejections(looks: Sequence[_Look]) -> list[Rejection]:
+    return [look.found for look in looks if isinstance(look.found, Rejection)]
+
+
+def _check_layout(
+    session: Session, target: Target, views: Sequence[View], looks: Sequence[_Look]
+) -> None:
+    """Refuses a board whose markers lie otherwise than declared in most views that show it."""
+    misfits = [view for view, look in zip(views, looks, strict=True) if look.misfit]
+    shown = sum(isinstance(look.found, Corners) for look in looks)
+    if not misfits or len(misfits) <= shown:
+        return
+    images = [decode_grey(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
+    fitting = [fitting_layouts(it, target) for it in images if not isinstance(it, str)]
+    common = [it for it in fitting[0] if all(it in others for others in fitting)]
+    seen = (
+        f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views the markers do "
+        f"not lie as on a ChArUco board of {target.columns} x {target.rows} squares with "
+        f"legacy = {str(target.legacy).lower()}"
+    )
+    culprits = [f"view {it.number}" for it in misfits]
+    if not common:
+        raise DataError(
+            f"{seen}, nor with columns and rows exchanged or in the other layout.",
+            culprits=culprits,
+            next_step="Count the squares on the print and check the dictionary.",
+        )
+    best = common[0]
+    changes = [
+        f"{name} = {str(value).lower()}"
+        for name, value in (("columns", best.columns), ("rows", best.rows), ("legacy", best.legacy))
+        if value != getattr(target, name)
+    ]
+    raise DataError(
+        f"{seen}; they fit {', '.join(changes)}.",
+        culprits=culprits,
+        next_step=f"Set {', '.join(changes)} in the target's .toml.",
+    )

@@ -1,0 +1,107 @@
+"""Where the robot says that its flange was: poses as reported, or joints through the model."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.estimator.closure import deviations
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.transforms import invert
+from visioncal.types import FloatArray, Rejection
+
+# Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
+# another convention is off by far more.
+_AGREE_M, _AGREE_RAD = 1e-3, 2e-3
+# Arms have at most seven joints in the models that ship; messages list no more columns than that.
+_LISTED_COLUMNS = 7
+
+
+@dataclass(frozen=True, eq=False)
+class Reported:
+    """The robot's side of the session.
+
+    Attributes:
+        base_from_flange: (4, 4) by view.
+        rejections: Views without a pose.
+        warnings: What does not fit together, in words.
+    """
+
+    base_from_flange: Mapping[int, FloatArray]
+    rejections: tuple[Rejection, ...]
+    warnings: tuple[str, ...]
+
+
+def reported_poses(session: Session, robot: Robot | None) -> Reported:
+    """Collects `base_from_flange` of each view.
+
+    A reported pose comes first; where a view has joints only, the robot's model gives the pose.
+
+    Args:
+        session: The session.
+        robot: Its nominal robot, where it names a known one.
+
+    Returns:
+        The poses, and whether joints and poses disagree.
+
+    Raises:
+        DataError: The joints are not as many as the robot's.
+    """
+    poses: dict[int, FloatArray] = {}
+    rejections = []
+    for view in session.views:
+        pose, joints = view.base_from_flange(), view.joints_rad
+        if pose is not None:
+            poses[view.number] = np.asarray(pose.as_matrix())
+        elif joints is not None and robot is not None:
+            poses[view.number] = _forward(robot, joints)
+        elif joints is not None:
+            reason = (
+                "no pose of the robot: it has joint angles, but the session names no known robot"
+            )
+            rejections.append(Rejection(view.number, reason))
+        else:
+            rejections.append(Rejection(view.number, "no pose of the robot: x_m to qw are empty"))
+    return Reported(poses, tuple(rejections), tuple(_disagreement(session, robot)))
+
+
+def _forward(robot: Robot, joints: FloatArray) -> FloatArray:
+    if len(joints) != robot.joint_count:
+        columns = ", ".join(f"q{at + 1}_rad" for at in range(min(len(joints), _LISTED_COLUMNS)))
+        raise DataError(
+            f"views.csv: {len(joints)} joint angles ({columns}), but {robot.name} has "
+            f"{robot.joint_count} joints.",
+            next_step="Correct [robot] model in session.toml, or the columns.",
+        )
+    return np.asarray(robot.base_from_flange(joints[None])[0])
+
+
+def _disagreement(session: Session, robot: Robot | None) -> Iterator[str]:
+    """Compares reported poses with the model's, up to one constant base and one constant tool."""
+    if robot is None:
+        return
+    both = [
+        (np.asarray(pose.as_matrix()), _forward(robot, joints))
+        for view in session.views
+        if (pose := view.base_from_flange()) is not None and (joints := view.joints_rad) is not None
+    ]
+    if not both:
+        return
+    reported, modelled = (np.array(it) for it in zip(*both, strict=True))
+    away_m, away_rad = deviations(invert(modelled) @ reported)
+    tool = (invert(modelled) @ reported)[0]
+    offset_m = float(np.linalg.norm(tool[:3, 3]))
+    if away_m.max() > _AGREE_M or away_rad.max() > _AGREE_RAD:
+        yield (
+            f"Poses and joint angles disagree: through the model of {robot.name} the joints give "
+            f"poses that differ by up to {1e3 * away_m.max():.2g} mm and "
+            f"{np.rad2deg(away_rad.max()):.2g} deg. The hand-eye result uses the poses. Check "
+            "[robot] model and tip, and whether the base frame is the controller's."
+        )
+    elif offset_m > _AGREE_M:
+        yield (
+            f"Reported poses and the model's flange differ by a constant {1e3 * offset_m:.1f} mm: "
+            "the poses are of a tool frame. The camera's transform is then to that frame."
+        )

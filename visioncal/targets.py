@@ -1,0 +1,218 @@
+"""Printed targets: their files, their corners and their symmetries.
+
+The target's frame: for a ChArUco board the origin is the outer corner of square 0, for a
+checkerboard inner corner 0, for a single marker its centre; x runs along columns, y along rows
+(down the printed page), and z into the board.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from visioncal import transforms
+from visioncal.errors import DataError
+from visioncal.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.types import FloatArray, IntArray, Target
+
+# An undeclared square is known as well as office printers keep their scale: to 0.1 %.
+DEFAULT_RELATIVE_SIGMA = 1e-3
+
+# Fewer do not determine a pose robustly; more do not fit a printable board.
+_MIN_SQUARES, _MAX_SQUARES = 3, 100
+
+
+def _shipped() -> dict[str, Path]:
+    """The boards that come with visioncal, by name."""
+    package = Path(__file__).resolve().parent
+    # A wheel carries the boards inside the package; a source tree keeps them beside it.
+    for folder in (package / "_targets", package.parent / "targets"):
+        if folder.is_dir():
+            return {path.stem: path for path in folder.glob("*.toml")}
+    return {}
+
+
+def target_names() -> tuple[str, ...]:
+    """Lists the names of the boards that come with visioncal."""
+    return tuple(sorted(_shipped()))
+
+
+def load_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
+    """Loads a target's description.
+
+    Args:
+        name_or_path: A name among `target_names()`, or the path of a `.toml`.
+        folder: Relative paths start here; the working directory where None.
+
+    Returns:
+        The target, and the content of its file as it was read.
+
+    Raises:
+        DataError: There is no such target, or its description is wrong.
+    """
+    path = find_described(
+        name_or_path, what="target", shipped=_shipped(), suffixes=(".toml",), folder=folder
+    )
+    document = parse_toml(read_text(path), path.name)
+    return target_from_document(document, path.stem), document
+
+
+def target_from_document(document: Mapping[str, Any], name: str) -> Target:
+    """Builds a target from the content of its `.toml`.
+
+    `square_sigma_m` left out becomes 0.1 % of the side, which is how well office printers keep
+    their scale.
+
+    Args:
+        document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for
+            a single marker kind, id, size_m, dictionary.
+        name: The name that the target gets.
+
+    Raises:
+        DataError: A field is missing, of another type, or out of range.
+    """
+    table = Table(document, f"target {name}")
+    kind = table.choice("kind", ("charuco", "checkerboard", "marker"))
+    if kind == "marker":
+        return _marker(table, name)
+    columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
+    rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    square_m = table.number("square_m", positive=True)
+    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * square_m, positive=True)
+    if kind == "checkerboard":
+        return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
+    marker_m = table.number("marker_m", positive=True)
+    if marker_m >= square_m:
+        raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
+    dictionary = table.text("dictionary")
+    markers, needed = _dictionary_size(table, dictionary), columns * rows // 2
+    if markers < needed:
+        raise DataError(
+            f"{table.label}: dictionary {dictionary} has {markers} markers; a board of "
+            f"{columns} x {rows} squares needs {needed}.",
+            culprits=[f"{table.label}: dictionary"],
+        )
+    legacy = table.flag("legacy", default=False)
+    return Target(name, "charuco", columns, rows, square_m, sigma_m, marker_m, dictionary, legacy)
+
+
+def _marker(table: Table, name: str) -> Target:
+    size_m = table.number("size_m", positive=True)
+    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
+    dictionary = table.text("dictionary")
+    marker_id = table.integer("id", 0, _dictionary_size(table, dictionary) - 1)
+    return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=marker_id)
+
+
+def _dictionary_size(table: Table, name: str) -> int:
+    """Counts the markers of one of OpenCV's dictionaries."""
+    known = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
+    if name not in known:
+        raise DataError(
+            f"{table.label}: dictionary is {name!r}, which OpenCV does not have.",
+            culprits=[f"{table.label}: dictionary"],
+            next_step=did_you_mean(name.upper(), known)
+            or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
+        )
+    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+
+
+def target_document(target: Target) -> dict[str, Any]:
+    """Writes a target as the content of a `.toml`, which `target_from_document` reads back."""
+    if target.kind == "marker":
+        return {
+            "kind": "marker",
+            "id": target.marker_id,
+            "size_m": target.square_m,
+            "square_sigma_m": target.square_sigma_m,
+            "dictionary": target.dictionary,
+        }
+    document: dict[str, Any] = {
+        "kind": target.kind,
+        "columns": target.columns,
+        "rows": target.rows,
+        "square_m": target.square_m,
+        "square_sigma_m": target.square_sigma_m,
+    }
+    if target.kind == "charuco":
+        document |= {
+            "marker_m": target.marker_m,
+            "dictionary": target.dictionary,
+            "legacy": target.legacy,
+        }
+    return document
+
+
+def corner_positions(target: Target) -> FloatArray:
+    """Computes where the target's corners are.
+
+    Returns:
+        (n, 3) positions in the target's frame [m], in the order of the corners' numbers. A
+        marker's four corners come in OpenCV's order, clockwise from its top left.
+    """
+    side = target.square_m
+    if target.kind == "marker":
+        return 0.5 * side * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    inset = 1 if target.kind == "charuco" else 0
+    rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
+    flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
+    return np.asarray(side * flat, dtype=float)
+
+
+def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
+    """Builds OpenCV's board for a ChArUco target.
+
+    Raises:
+        DataError: The target is of another kind.
+    """
+    if target.kind != "charuco":
+        raise DataError(f"target {target.name} is a {target.kind}; a charuco board is needed.")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    board = cv2.aruco.CharucoBoard(
+        (target.columns, target.rows), target.square_m, target.marker_m, dictionary
+    )
+    board.setLegacyPattern(target.legacy)
+    return board
+
+
+def rotation_transforms(target: Target) -> FloatArray:
+    """Lists the rotations in the plane that leave the printed pattern as it is.
+
+    Markers break every symmetry. The squares of a checkerboard of c x r inner corners have the
+    colour of (column + row) mod 2 over c + 1 columns and r + 1 rows. A half turn takes square
+    (i, j) to (c - i, r - j) and keeps the colours where c + r is even; a quarter turn takes it to
+    (c - j, i) and needs c = r, even.
+
+    Returns:
+        (k, 4, 4) `target_from_turned`, the identity first: the pattern, carried along by any of
+        them, covers itself.
+    """
+    identity = np.eye(4)
+    if target.kind != "checkerboard" or (target.columns + target.rows) % 2:
+        return identity[None]
+    width_m = target.square_m * (target.columns - 1)
+    height_m = target.square_m * (target.rows - 1)
+    half = transforms.compose(np.diag([-1.0, -1.0, 1.0]), np.array([width_m, height_m, 0.0]))
+    if target.columns != target.rows or target.columns % 2:
+        return np.stack([identity, half])
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    quarter = transforms.compose(turn, np.array([width_m, 0.0, 0.0]))
+    return np.stack([identity, quarter, half, transforms.invert(quarter)])
+
+
+def rotations(target: Target) -> tuple[IntArray, ...]:
+    """Lists the corner numberings that the printed pattern itself cannot tell apart.
+
+    Returns:
+        Permutations p, the identity first, one for each of `rotation_transforms`: turned by that
+        transform, corner i lies where corner p[i] was.
+    """
+    positions = corner_positions(target)
+    permutations = []
+    for turn in rotation_transforms(target):
+        turned = positions @ turn[:3, :3].T + turn[:3, 3]
+        distance = np.linalg.norm(turned[:, None] - positions[None], axis=-1)
+        permutations.append(np.asarray(distance.argmin(axis=1), dtype=np.int64))
+    return tuple(permutations)

@@ -1,0 +1,90 @@
+"""Plain frozen data that travels between the layers; it carries no behaviour of its own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+Image: TypeAlias = npt.NDArray[np.uint8]
+
+Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
+CameraKind: TypeAlias = Literal["brown", "fisheye"]
+TargetKind: TypeAlias = Literal["charuco", "checkerboard", "marker"]
+
+# Called with a stage's name, its steps done, and its steps in all.
+Progress: TypeAlias = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A printed target, as its `.toml` declares it. Its frame is defined in the README.
+
+    Attributes:
+        name: The name under which a session asks for it.
+        kind: What is printed.
+        columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
+        rows: The same along y.
+        square_m: Side of a square; of the marker itself for a single marker [m].
+        square_sigma_m: How well that side is known, as a standard deviation [m].
+        marker_m: Side of the markers inside a ChArUco board [m]; 0 elsewhere.
+        dictionary: ArUco dictionary by OpenCV's name, as `DICT_5X5_100`; empty without markers.
+        legacy: Whether a ChArUco board has the layout that OpenCV printed before 4.6.
+        marker_id: The id of a single marker; -1 elsewhere.
+    """
+
+    name: str
+    kind: TargetKind
+    columns: int
+    rows: int
+    square_m: float
+    square_sigma_m: float
+    marker_m: float = 0.0
+    dictionary: str = ""
+    legacy: bool = False
+    marker_id: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera's intrinsics.
+
+    Attributes:
+        model: `brown` (OpenCV's 5 or 8 coefficients) or `fisheye` (4 coefficients).
+        resolution: (width, height) [px].
+        matrix: (4,) fx, fy, cx, cy [px].
+        distortion: (5,), (8,) or (4,) coefficients in OpenCV's order.
+    """
+
+    model: CameraKind
+    resolution: tuple[int, int]
+    matrix: FloatArray
+    distortion: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """What was found of the target in one image.
+
+    Attributes:
+        view: The view's number.
+        ids: (n,) corner numbers, ascending, in the target's numbering.
+        px: (n, 2) corner positions [px], pixel centres at integers.
+        blur_px: Width of the edges that were seen, as a Gaussian's sigma [px].
+    """
+
+    view: int
+    ids: IntArray
+    px: FloatArray
+    blur_px: float
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A view that is not used, and why, in words for the user."""
+
+    view: int
+    reason: str
