@@ -16,6 +16,7 @@ from visioncal.errors import DataError
 from visioncal.report import write_report
 from visioncal.report.numbers import matched, significant
 from visioncal.report.page import render
+from visioncal.report.thumbnails import thumbnail
 from visioncal.session import MemoryImages
 
 
@@ -171,6 +172,20 @@ def test_spoilt_images_do_not_spoil_the_report(sample: Sample) -> None:
     html = render(sample.calibration, session, sample.evidence)
     assert "data:image/jpeg" not in html
     assert REJECTED[3] in Page(html).words
+
+
+def test_pictures_lie_as_their_pixels_are_stored() -> None:
+    jpeg = cv2.imencode(".jpg", np.zeros((40, 64), np.uint8))[1].tobytes()
+    # Exif, big-endian: one entry, the orientation (0x0112), which says "turned by 90 degrees".
+    entry = bytes.fromhex("0112 0003 00000001 0006 0000")
+    exif = b"Exif\0\0MM\0*" + bytes.fromhex("00000008 0001") + entry + bytes(4)
+    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    shown = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    assert shown.shape[:2] == (64, 40), "the tag is not read: this test tests nothing"
+    picture = thumbnail(turned, None, "", 0, 1)
+    assert picture is not None
+    assert (picture.width, picture.height) == (64, 40)
 
 
 def test_one_used_view_and_no_residuals_still_give_a_report(sample: Sample) -> None:

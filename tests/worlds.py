@@ -78,6 +78,8 @@ NOISY_WORLDS = {
     "8 views": replace(COARSE, views=8),
     "60 views": replace(COARSE, views=60),
     "eye-to-hand": replace(COARSE, mount="eye-to-hand"),
+    "eye-to-hand, precise": replace(PRECISE, mount="eye-to-hand"),
+    "eye-to-hand, corners": replace(COARSE, mount="eye-to-hand", corner_px=0.2),
 }
 
 

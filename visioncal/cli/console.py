@@ -17,6 +17,7 @@ from visioncal.types import Progress as Told
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 _LISTED_CULPRITS = 10
+_SHORT = 12  # culprits of fewer letters share a line
 
 
 def messages() -> Console:
@@ -58,12 +59,13 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         return
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
-    for culprit in error.culprits[:_LISTED_CULPRITS]:
-        if culprit not in error.message:
-            console.print(f"  - {escape(culprit)}")
-    more = len(error.culprits) - _LISTED_CULPRITS
-    if more > 0:
-        console.print(f"  - and {more} more")
+    unsaid = [it for it in error.culprits if it not in error.message]
+    if all(len(it) < _SHORT for it in unsaid):
+        unsaid = [", ".join(unsaid)] if unsaid else []
+    for culprit in unsaid[:_LISTED_CULPRITS]:
+        console.print(f"  - {escape(culprit)}")
+    if len(unsaid) > _LISTED_CULPRITS:
+        console.print(f"  - and {len(unsaid) - _LISTED_CULPRITS} more")
     if error.next_step:
         console.print(escape(error.next_step))
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
 from visioncal.estimator.closure import Closure, Noise, closure_information
-from visioncal.estimator.linalg import covariance, spectrum
+from visioncal.estimator.linalg import Spectrum, covariance, spectrum
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, Mount
 
@@ -18,6 +18,8 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, np.deg2rad(0.5)
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 _FEWEST_VIEWS = 3
+# A null direction moves a part of an edge if it moves it by this much, of a length of one.
+_PART_OF_NULL = 0.05
 
 
 @dataclass(frozen=True)
@@ -75,19 +77,16 @@ def check_observability(
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
     if len(data) < _FEWEST_VIEWS:
-        raise DegenerateError(
-            f"hand-eye: {len(data)} usable views; at least {_FEWEST_VIEWS} are needed, because two "
-            f"share one axis of rotation and leave {_along(mount)} that axis open.",
-            next_step=_advice(mount),
-        )
+        raise _too_few(data, mount)
     information = closure_information(data, x, z, noise)
     spread = spectrum(information)
     total = covariance(information) + (0.0 if common is None else common)
     worst = _worst_directions(total, x, z, mount)
     if spread.ratio < _NULL_RATIO:
-        culprit = _null_direction(spread.vectors[:, 0], x, z, mount)
+        culprit = _null_direction(spread, x, z, mount)
+        verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
-            f"hand-eye: {culprit} is not determined at all (information ratio "
+            f"hand-eye: {culprit} {verb} not determined at all (information ratio "
             f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data, mount)}.",
             culprits=[culprit],
             next_step=_advice(mount),
@@ -118,23 +117,62 @@ def _worst_directions(
     return tuple(found)
 
 
-def _null_direction(vector: FloatArray, x: FloatArray, z: FloatArray, mount: Mount) -> str:
-    """Names the part of a null direction that moves most; a radian counts as a metre."""
-    parts = [vector[3:6], vector[:3], vector[9:], vector[6:9]]
-    # The camera's own edge comes first: it is what the user asked for.
-    sizes = np.linalg.norm(parts, axis=1) * [1.01, 1.0, 0.99, 0.98]
-    at = int(np.argmax(sizes))
-    edge, is_rotation = divmod(at, 2)
-    part = parts[at] / np.linalg.norm(parts[at])
-    return _words(edge, (x, z)[edge][:3, :3] @ part, mount, bool(is_rotation))
+def _too_few(data: Closure, mount: Mount) -> DegenerateError:
+    culprit = f"the camera's offset from the {_frame(mount)}"
+    cause = "it takes two different axes of rotation between views to determine it"
+    if len(data) == 2:
+        culprit += f" along the {_frame(mount)}'s {_axis(_main_axis(_turns(data)))}"
+        cause = f"two views share that axis of rotation, and {cause}"
+    return DegenerateError(
+        f"hand-eye: {len(data)} usable views, at least {_FEWEST_VIEWS} are needed; {culprit} is "
+        f"not determined: {cause}.",
+        culprits=[culprit],
+        next_step=_advice(mount),
+    )
+
+
+def _null_direction(spread: Spectrum, x: FloatArray, z: FloatArray, mount: Mount) -> str:
+    """Names what the null directions leave open: of the camera's edge, or else the target's."""
+    null = spread.vectors[:, spread.values < _NULL_RATIO * spread.values[-1]]
+    for edge, transform in enumerate((x, z)):
+        rotation, translation = (
+            transform[:3, :3] @ null[6 * edge + at : 6 * edge + at + 3] for at in (0, 3)
+        )
+        parts = [
+            _open_part(edge, directions, mount, is_rotation)
+            for directions, is_rotation in ((translation, False), (rotation, True))
+        ]
+        named = [part for part in parts if part]
+        if named:
+            return " and ".join(named)
+    return "a combination of both edges"
+
+
+def _open_part(edge: int, directions: FloatArray, mount: Mount, is_rotation: bool) -> str:
+    """Names what (3, k) null directions leave open of a rotation or an offset, if anything."""
+    vectors, sizes, _ = np.linalg.svd(directions)
+    # Null vectors have unit length over all twelve unknowns, a radian counting as a metre.
+    rank = int(np.sum(sizes > _PART_OF_NULL))
+    if rank == 1:
+        return _words(edge, vectors[:, 0], mount, is_rotation)
+    if rank == 0:
+        return ""
+    thing, frame = _names(edge, mount)
+    return f"the {thing}'s {'rotation' if is_rotation else 'offset from the ' + frame}"
 
 
 def _words(edge: int, direction: FloatArray, mount: Mount, is_rotation: bool) -> str:
     """Says which component of which edge a direction in the edge's parent frame is."""
-    thing = "camera" if edge == 0 else "target"
-    frame = _frame(mount) if edge == 0 else _other_frame(mount)
+    thing, frame = _names(edge, mount)
     quantity = "rotation about" if is_rotation else "offset along"
     return f"the {thing}'s {quantity} the {frame}'s {_axis(direction)}"
+
+
+def _names(edge: int, mount: Mount) -> tuple[str, str]:
+    """What an edge places, and the frame that it hangs on."""
+    if edge == 0:
+        return "camera", _frame(mount)
+    return "target", "base" if mount == "eye-in-hand" else "tool"
 
 
 def _axis(direction: FloatArray) -> str:
@@ -150,32 +188,37 @@ def _frame(mount: Mount) -> str:
     return "tool" if mount == "eye-in-hand" else "base"
 
 
-def _other_frame(mount: Mount) -> str:
-    return "base" if mount == "eye-in-hand" else "tool"
+def _turns(data: Closure) -> FloatArray:
+    """Rotation vectors (p, 3) of the relative motions between all pairs of views [rad]."""
+    i, j = np.triu_indices(len(data), 1)
+    relative = invert(data.robot[j]) @ data.robot[i]
+    return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
 
 
-def _along(mount: Mount) -> str:
-    return f"the camera's offset from the {_frame(mount)} along"
+def _main_axis(turns: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(turns, full_matrices=False)[2][0])
 
 
 def _motion(data: Closure, mount: Mount) -> str:
     """Says what is wrong with the motion."""
-    i, j = np.triu_indices(len(data), 1)
-    relative = invert(data.robot[j]) @ data.robot[i]
-    turns = Rotation.from_matrix(relative[:, :3, :3]).as_rotvec()
+    turns, count = _turns(data), len(data)
     largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
-    count = len(data)
+    # The flange's own positions: the robot's part is inverted where the camera stands still.
+    flange = data.robot if mount == "eye-in-hand" else invert(data.robot)
+    spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
+    if largest < 0.5 and spread_mm < 1.0:
+        return f"the {count} used views are all from one pose of the robot"
     if largest < 0.5:
         return (
             f"the {count} used views differ in position only (largest rotation between two of "
-            f"them: {largest:.2g} deg)"
+            f"them: {largest:.1g} deg)"
         )
-    main = np.linalg.svd(turns, full_matrices=False)[2][0]
+    main = _main_axis(turns)
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
     if aside < 0.1 * largest:
         return (
             f"all {count} used views turn about the {_frame(mount)}'s {_axis(main)} to within "
-            f"{aside:.2g} deg"
+            f"{max(aside, 0.01):.2g} deg"
         )
     return (
         f"the {count} used views turn by at most {largest:.2g} deg, and by {aside:.2g} deg "

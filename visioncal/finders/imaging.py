@@ -10,6 +10,8 @@ from visioncal.types import FloatArray, Image
 _REACH_PX = (4, 12)
 # Corners measured in an image: the median of these is stable to a few percent.
 _SAMPLE = 24
+# Under this many grey levels a picture shows nothing that a detector could use.
+_LEAST_CONTRAST = 12
 
 
 def decode_grey(data: bytes) -> Image | str:
@@ -81,9 +83,15 @@ def blur_at_corners(image: Image, px: FloatArray) -> float:
     return float(np.median(_edge_sigma(image[rows[:, :, None], columns[:, None, :]])))
 
 
-def sharpest_edges(image: Image) -> float:
-    """Measures the width of the sharpest edges anywhere in an image, as a sigma [px]."""
-    return float(_edge_sigma(image[None])[0])
+def why_hard_to_see(image: Image, max_blur_px: float) -> str:
+    """Says what about an image hides a target: too little contrast, or blur; empty if neither."""
+    low, high = np.percentile(image[::4, ::4], [2, 98])
+    if high - low < _LEAST_CONTRAST:
+        return f"the image is almost uniform, with {high - low:.0f} grey levels of contrast"
+    blur = float(_edge_sigma(image[None])[0])
+    if blur > max_blur_px:
+        return f"the image is blurred, its sharpest edges are {blur:.0f} px wide"
+    return ""
 
 
 def _edge_sigma(patches: Image) -> FloatArray:

@@ -4,6 +4,7 @@ A stage is one file in `visioncal.stages`. Its adapter here hands it what it nee
 and adds what it gives.
 """
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -76,13 +77,22 @@ def _pnp(known: Known) -> Known:
         known = replace(known, pixel_px=result.sigma_px).noting(result.rejections)
         poses = poses | seen
     elif not poses:
-        lines = [f"view {view}: {reason}" for view, reason in known.reasons.items()]
-        raise DataError(
-            f"session {known.session.name!r}: no view shows the target.",
-            culprits=lines,
-            next_step=f"First: {lines[0]}." if lines else "Give the views images or cft_ columns.",
-        )
+        raise _nothing_seen(known)
     return replace(known, poses=poses)
+
+
+def _nothing_seen(known: Known) -> DataError:
+    """Groups the views by their reason, most frequent first."""
+    views = defaultdict(list)
+    for view, reason in known.reasons.items():
+        views[reason].append(view)
+    grouped = sorted(views.items(), key=lambda item: -len(item[1]))
+    return DataError(
+        f"session {known.session.name!r}: no view shows the target.",
+        culprits=[f"views {', '.join(map(str, it))}: {reason}" for reason, it in grouped],
+        next_step="Look at an image: is the board in it, and is it the one that the session "
+        "declares?",
+    )
 
 
 def _choose(known: Known) -> Known:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 from rerun.blueprint import BlueprintLike
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from visioncal.calibration import Calibration, ViewEvidence, to_document
 from visioncal.errors import DataError
@@ -44,13 +47,32 @@ def write_recording(
     """
     with _whole_or_absent(path) as aside:
         stream = rr.RecordingStream(paths.APPLICATION)
-        stream.save(aside, default_blueprint=blueprint)
+        _open(stream, aside, blueprint)
         try:
             stream.send_recording_name(session.name)
             _log_all(stream, session, calibration, {it.view: it for it in evidence})
         finally:
-            # Writes the footer, without which readers scan the whole file.
+            # Writes the footer, which comes last.
             stream.disconnect()
+        _check_finished(aside)
+
+
+def _open(stream: rr.RecordingStream, path: Path, blueprint: BlueprintLike | None) -> None:
+    try:
+        stream.save(path, default_blueprint=blueprint)
+    except RuntimeError as error:
+        # This is how rerun reports a file that it cannot create.
+        raise OSError(str(error)) from error
+
+
+def _check_finished(path: Path) -> None:
+    """Rerun only prints that a disk is full; a file that lacks its footer is not whole."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RerunWarning)
+            RrdReader(path).store()
+    except (RuntimeError, ValueError) as error:
+        raise OSError("the end of the file is missing; the disk may be full") from error
 
 
 def _log_all(
@@ -116,8 +138,7 @@ def _whole_or_absent(path: Path) -> Iterator[Path]:
         finally:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
-    # Rerun reports a file that it cannot create as a RuntimeError.
-    except (OSError, RuntimeError) as error:
+    except OSError as error:
         raise DataError(
             f"{path} cannot be written: {error}.",
             culprits=[str(path)],

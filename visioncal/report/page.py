@@ -9,6 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from visioncal.calibration import Calibration, ViewEvidence, ViewResult
+from visioncal.errors import DataError
 from visioncal.files import write_atomically
 from visioncal.recording.measures import magnification
 from visioncal.report import content, plots
@@ -134,5 +135,8 @@ class _Pictures:
         paths = [it.image for it in self.session.views if it.number == view.view and it.image]
         if not paths or not self.session.images.exists(paths[0]):
             return None
-        data = self.session.images.read(paths[0])
+        try:
+            data = self.session.images.read(paths[0])
+        except DataError:
+            return None
         return thumbnail(data, evidence, caption, view.view, magnify)

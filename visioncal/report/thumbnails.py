@@ -72,12 +72,9 @@ def thumbnail(
     Returns:
         The picture, or None where the bytes are no image that can be shown.
     """
-    if not image_bytes:
+    pixels = _decode(image_bytes)
+    if pixels is None:
         return None
-    image = cv2.imdecode(np.frombuffer(image_bytes, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        return None
-    pixels = np.asarray(image, dtype=np.uint8)
     corners = None if evidence is None else evidence.corners
     if evidence is None or corners is None or len(corners.px) == 0:
         height, width = pixels.shape[:2]
@@ -94,6 +91,16 @@ def thumbnail(
         tuple((float(x), float(y)) for x, y in corners.px.round(2)),
         _residuals(corners.px, evidence.predicted_px, magnify),
     )
+
+
+def _decode(data: bytes) -> Image | None:
+    # Corners are found in the pixels as they are stored, whatever way up the camera was.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image, dtype=np.uint8)
 
 
 def _residuals(

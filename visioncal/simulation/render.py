@@ -194,8 +194,8 @@ def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
     if scene.backdrop.moves:
         return 1.0
     # From behind the camera, above and a little from the left; the board's z points away from it.
-    light_from_cam = np.array([0.3, 0.6, 0.74])
-    return 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_from_cam), 0.0)
+    light_cam = np.array([0.3, 0.6, 0.74])
+    return 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
 
 
 def _cover(

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.solvers.handeye import HandEye, checked
 from visioncal.solvers.kronecker import least_scatter, rotations, turn_maps
-from visioncal.solvers.translation import complete, halfway_point
+from visioncal.solvers.translation import complete, mean_camera
 from visioncal.types import FloatArray
 
 
@@ -17,8 +17,8 @@ def andreff(robot: FloatArray, camera: FloatArray) -> HandEye:
 
     A pair says (I - kron(A_R, B_R)) vec(R_X) = 0 and
     kron(I, t_B^T) vec(R_X) + (I - A_R) t_X = t_A (eq. 10). Summed over all pairs both are the
-    scatter of what the views say about Z, so the pairs need not be formed; see
-    `visioncal.solvers.translation` for this and for the point at which the second is taken.
+    scatter of what the views say about Z, so the pairs need not be formed: the second is that of
+    the places of one target point, half-way to the camera; see `visioncal.solvers.translation`.
 
     The system is solved up to scale, with t_A times a free factor: solved as it stands it
     collapses to R_X = 0 where the flange turns on the spot. The translation is solved for again
@@ -37,7 +37,7 @@ def andreff(robot: FloatArray, camera: FloatArray) -> HandEye:
     """
     robot, camera = checked(robot, camera)
     m = len(robot)
-    seen = camera[:, :3, :3] @ halfway_point(camera) + camera[:, :3, 3]
+    seen = camera[:, :3, :3] @ (0.5 * mean_camera(camera)) + camera[:, :3, 3]
     rows = np.empty((m, 3, 13))
     rows[:, :, :4] = robot[:, :3, :]
     rows[:, :, 4:] = (robot[:, :3, :3, None] * seen[:, None, None, :]).reshape(m, 3, 9)

@@ -17,7 +17,7 @@ from visioncal.types import FloatArray
 def _squares() -> FloatArray:
     """The (36, 16) map from sums of w w^T to sums of S^T S, with w = (a - b, a + b).
 
-    S = [a - b, skew(a + b)] is linear in w, hence S^T S in w w^T.
+    S = [[0, -(a - b)^T], [a - b, skew(a + b)]] is linear in w, hence S^T S in w w^T.
     """
     rows = np.zeros((6, 4, 4))
     rows[:3, 0, 1:] = -np.eye(3)
@@ -37,9 +37,10 @@ def daniilidis(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's dual quaternion in the null space of the screws' equations.
 
     With a, b the vector parts of a pair's quaternions and a', b' those of their dual parts, X's
-    dual quaternion (q, q') is in the null space of the rows [S, 0] and [S', S],
-    S = [a - b, skew(a + b)] (eq. 31); the two smallest singular vectors span it. Within that
-    plane q . q' = 0 and |q| = 1 (eqs. 34, 35) choose the point.
+    dual quaternion (q, q') is in the null space of the rows [S, 0] and [S', S], where
+    S q = a q - q b (eq. 31); the two smallest singular vectors span it. Within that plane
+    q . q' = 0 and |q| = 1 (eqs. 34, 35) choose the point. The paper leaves the scalar row of
+    a q - q b out as redundant; with it the outcome does not hang on the choice of axes.
 
     The rotation is that point's. Its q' would give the translation, too, but carries the noise
     of both screws' moments: the translation is solved for again with the rotation known.

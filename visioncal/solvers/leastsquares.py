@@ -10,12 +10,12 @@ def smallest_solution(normal: FloatArray, right: FloatArray, noise: float) -> Fl
 
     Args:
         normal: (n, n) symmetric and positive semidefinite.
-        right: (n,) right-hand side.
+        right: (n,) or (n, k) right-hand sides.
         noise: An eigenvalue up to this one says nothing.
 
     Returns:
-        (n,) x, without any component along which the eigenvalue is within noise.
+        x of the shape of `right`, without any component along which the eigenvalue is within noise.
     """
     values, vectors = np.linalg.eigh(normal)
     seen = vectors[:, values > noise]
-    return np.asarray(seen @ ((right @ seen) / values[values > noise]))
+    return np.asarray((seen / values[values > noise]) @ (seen.T @ right))

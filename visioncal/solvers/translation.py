@@ -7,7 +7,7 @@ times the scatter of m places about their mean: linear in the number of views.
 
 Noise makes the choice of that point matter. At the target's origin the robot's rotation noise has
 the lever from target to flange; at the camera's centre, to which t_B amounts, the camera's has
-the same lever. Half-way, neither has more than half.
+the same lever. Of the points between both, the one is taken that the views place most repeatably.
 """
 
 import numpy as np
@@ -22,11 +22,11 @@ from visioncal.types import FloatArray
 _SMALLEST_TURN_RAD = 2e-3
 
 
-def halfway_point(camera: FloatArray) -> FloatArray:
-    """The (3,) point half-way from the target's origin to the mean camera, target frame [m]."""
+def mean_camera(camera: FloatArray) -> FloatArray:
+    """The (3,) mean of the camera's centres in the target frame [m] of (m, 4, 4) poses."""
     m = len(camera)
     rotation, translation = camera[:, :3, :3], camera[:, :3, 3]
-    return np.asarray(translation.reshape(3 * m) @ rotation.reshape(3 * m, 3) / (-2.0 * m))
+    return np.asarray(translation.reshape(3 * m) @ rotation.reshape(3 * m, 3) / -m)
 
 
 def complete(
@@ -47,17 +47,34 @@ def complete(
         X and Z. Components of X's translation that the motion does not show are zero.
     """
     m = len(robot)
-    turns, stations = robot[:, :3, :3], robot[:, :3, 3]
-    point = halfway_point(camera)
-    seen = (camera[:, :3, :3] @ point + camera[:, :3, 3]) @ rotation_x.T
-    reached = (turns @ seen[..., None])[..., 0] + stations
+    turns = robot[:, :3, :3]
+    towards = mean_camera(camera)
+    # Column 0 is for the target's origin; column 1 is what a step from it to the camera adds.
+    seen = np.empty((m, 3, 2))
+    seen[:, :, 0] = camera[:, :3, 3]
+    seen[:, :, 1] = camera[:, :3, :3] @ towards
+    places = turns @ (rotation_x @ seen)
+    places[:, :, 0] += robot[:, :3, 3]
 
-    mean_turn, mean_reached = turns.sum(axis=0) / m, reached.sum(axis=0) / m
+    mean_turn, mean_place = turns.sum(axis=0) / m, places.sum(axis=0) / m
     spread = (turns - mean_turn).reshape(3 * m, 3)
-    misses = (mean_reached - reached).reshape(3 * m)
-    translation_x = smallest_solution(spread.T @ spread, misses @ spread, m * _SMALLEST_TURN_RAD**2)
+    scatter = (places - mean_place).reshape(3 * m, 2)
+    cut = m * _SMALLEST_TURN_RAD**2
+    shifts = -smallest_solution(spread.T @ spread, spread.T @ scatter, cut)
+    step = _steadiest_step(scatter + spread @ shifts)
 
+    translation_x = shifts[:, 0] + step * shifts[:, 1]
     if rotation_z is None:
         rotation_z = nearest_rotation((turns @ rotation_x @ camera[:, :3, :3]).sum(axis=0))
-    translation_z = mean_reached + mean_turn @ translation_x - rotation_z @ point
+    place = mean_place[:, 0] + step * mean_place[:, 1] + mean_turn @ translation_x
+    translation_z = place - rotation_z @ (step * towards)
     return HandEye(compose(rotation_x, translation_x), compose(rotation_z, translation_z))
+
+
+def _steadiest_step(scatter: FloatArray) -> float:
+    """The step from 0 to 1 that makes column 0 + step * column 1 of (n, 2) residuals shortest."""
+    square = float(scatter[:, 1] @ scatter[:, 1])
+    if square == 0.0:
+        return 0.5
+    step = -float(scatter[:, 0] @ scatter[:, 1]) / square
+    return min(max(step, 0.0), 1.0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, find_target, fitting_layouts
-from visioncal.finders.imaging import blur_at_corners, decode_grey, sharpest_edges
+from visioncal.finders.imaging import blur_at_corners, decode_grey, why_hard_to_see
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
@@ -115,9 +115,8 @@ def _look(session: Session, view: View, target: Target, options: DetectOptions) 
     resolution = (image.shape[1], image.shape[0])
     seen = find_target(image, target)
     if isinstance(seen, NotFound):
-        blur = sharpest_edges(image)
-        blurred = f"; the image is blurred, its sharpest edges are {blur:.0f} px wide"
-        reason = seen.reason + (blurred if blur > options.max_blur_px else "")
+        cause = why_hard_to_see(image, options.max_blur_px)
+        reason = f"{seen.reason}; {cause}" if cause else seen.reason
         return _Look(Rejection(view.number, reason), resolution, seen.misfit)
     blur = blur_at_corners(image, seen.px)
     trouble = _trouble(target, seen.ids, blur, options)

@@ -111,13 +111,10 @@ def solve_hand_eye(
             check_observability(data, np.eye(4), np.eye(4), Noise(1.0, 1.0), mount)
         closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
         start = closed[_START if solver == "joint" else solver]
-        rough = estimate_noise(data, start.x, start.z)
-        check_observability(data, start.x, start.z, rough, mount)
-        fit = (
-            fit_closure(data, start.x, start.z)
-            if solver == "joint"
-            else ClosureFit(start.x, start.z, rough)
-        )
+        if solver == "joint":
+            fit = fit_closure(data, start.x, start.z)
+        else:
+            fit = ClosureFit(start.x, start.z, estimate_noise(data, start.x, start.z))
         common = np.zeros((12, 12))
         if lens is not None:
             moved = moved_by(data, fit.x, fit.z, fit.noise, lens.camera_shift)
