@@ -14,7 +14,7 @@ from visioncal.types import FloatArray, Mount
 # Under this scaled eigenvalue ratio a direction is not determined by the motion at all.
 _NULL_RATIO = 1e-8
 # Over these predicted sigmas a result is of no use to anybody.
-SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, np.deg2rad(0.5)
+SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 _FEWEST_VIEWS = 3
@@ -78,10 +78,7 @@ def check_observability(
     """
     if len(data) < _FEWEST_VIEWS:
         raise _too_few(data, mount)
-    information = closure_information(data, x, z, noise)
-    spread = spectrum(information)
-    total = covariance(information) + (0.0 if common is None else common)
-    worst = _worst_directions(total, x, z, mount)
+    spread = spectrum(closure_information(data, x, z, noise))
     if spread.ratio < _NULL_RATIO:
         culprit = _null_direction(spread, x, z, mount)
         verb = "are" if " and " in culprit else "is"
@@ -91,7 +88,8 @@ def check_observability(
             culprits=[culprit],
             next_step=_advice(mount),
         )
-    beyond = [it for it in worst if it.sigma > it.limit]
+    blamed = _worst_directions(data, x, z, _plausible(noise), mount, common)
+    beyond = [it for it in blamed if it.sigma > it.limit]
     if beyond:
         raise DegenerateError(
             f"hand-eye: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
@@ -99,12 +97,32 @@ def check_observability(
             culprits=[it.words for it in beyond],
             next_step=_advice(mount),
         )
-    return worst
+    return _worst_directions(data, x, z, noise, mount, common)
+
+
+def _plausible(noise: Noise) -> Noise:
+    """The noise that a motion is judged by: views that disagree wildly are no fault of it.
+
+    Poses in other units, of other images or through a wrong lens leave residuals that no motion
+    could average out; they get an answer, and a verdict that says so.
+    """
+    return Noise(
+        min(noise.sigma_rad, SIGMA_LIMIT_RAD),
+        min(noise.sigma_m, SIGMA_LIMIT_M),
+    )
 
 
 def _worst_directions(
-    spread: FloatArray, x: FloatArray, z: FloatArray, mount: Mount
+    data: Closure,
+    x: FloatArray,
+    z: FloatArray,
+    noise: Noise,
+    mount: Mount,
+    common: FloatArray | None,
 ) -> tuple[Direction, ...]:
+    """The worst direction of each edge, first x's and then z's, offset before rotation."""
+    spread = covariance(closure_information(data, x, z, noise))
+    spread = spread + (0.0 if common is None else common)
     found = []
     for edge, transform in enumerate((x, z)):
         for is_rotation in (False, True):

@@ -1,0 +1,324 @@
+"""The whole way: a folder goes in, a result with its verdict comes out, or one clear message."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import visioncal
+from visioncal.calibration import Calibration, to_document
+from visioncal.errors import DataError, DegenerateError
+from visioncal.pipeline import run
+from visioncal.session import Session
+from visioncal.simulation import (
+    CellOptions,
+    checkerboard_target,
+    exact,
+    read_truth,
+    simulate,
+    write_session,
+)
+from visioncal.transforms import invert, rotation_angle
+
+CONTRACT_KEYS = {
+    "schema",
+    "visioncal",
+    "created",
+    "session",
+    "mount",
+    "transforms",
+    "joint_covariance",
+    "solvers",
+    "camera",
+    "robot",
+    "noise",
+    "views",
+    "rms",
+    "validation",
+    "verdict",
+}
+
+
+@pytest.fixture(scope="module")
+def result(rendered) -> Calibration:
+    return visioncal.calibrate(Session.load(rendered))
+
+
+def errors(calibration, truth):
+    """Distance [mm] and angle [deg] of the first edge from the truth."""
+    name = next(iter(calibration.edges))
+    away = invert(truth.transforms[name]) @ calibration.transforms[name].as_matrix()
+    return 1e3 * np.linalg.norm(away[:3, 3]), np.rad2deg(rotation_angle(away))
+
+
+def with_rows(folder, change):
+    """Rewrites views.csv through a function of its rows, the header not among them."""
+    path = folder / "views.csv"
+    header, *rows = path.read_text(encoding="utf-8").splitlines()
+    header, rows = change(header, rows)
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+
+
+@pytest.fixture
+def session_copy(rendered, tmp_path):
+    return shutil.copytree(rendered, tmp_path / "copy")
+
+
+def test_a_rendered_session_gives_the_truth_within_its_sigma(result, rendered):
+    away_mm, away_deg = errors(result, read_truth(rendered))
+    edge = result.edges["flange_from_cam"]
+    # The length of an error of three components exceeds three roots of its variance rarely.
+    assert away_mm < 3 * edge.sigma_mm
+    assert away_deg < 3 * edge.sigma_deg
+    # 12 sharp views of 1280 x 800 with an unknown lens reach some tenths of a millimetre.
+    assert edge.sigma_mm < 0.5
+    assert result.verdict.status == "good"
+    assert result.camera.estimated
+    truth = read_truth(rendered).camera
+    sigma = np.sqrt(np.diag(result.camera.covariance))[:4]
+    assert np.all(np.abs(result.camera.camera.matrix - truth.matrix) < 4 * sigma)
+
+
+def test_the_document_keeps_the_contract(result):
+    document = to_document(result)
+    assert set(document) == CONTRACT_KEYS
+    assert "null" not in json.dumps(document)
+    edge = document["transforms"]["flange_from_cam"]
+    assert set(edge) == {
+        "matrix",
+        "quaternion_xyzw",
+        "translation_m",
+        "covariance",
+        "sigma_mm",
+        "sigma_deg",
+    }
+    covariance = np.array(edge["covariance"])
+    assert edge["sigma_mm"] == pytest.approx(1e3 * np.sqrt(np.trace(covariance[3:, 3:])))
+    joint = np.array(document["joint_covariance"]["matrix"])
+    assert document["joint_covariance"]["order"] == ["flange_from_cam", "base_from_target"]
+    np.testing.assert_array_equal(joint[:6, :6], covariance)
+    assert np.all(np.linalg.eigvalsh(joint) > 0)
+    assert len(document["views"]) == 12
+    assert all(view["used"] and view["rms_px"] > 0 for view in document["views"])
+    assert len(document["camera"]["covariance"]) == 9
+
+
+def test_what_is_saved_is_loaded(result, tmp_path):
+    result.save(tmp_path / "calibration.json")
+    for path in (tmp_path, tmp_path / "calibration.json"):
+        loaded = Calibration.load(path)
+        assert loaded.verdict == result.verdict
+        assert loaded.views == result.views
+        assert loaded.validation == result.validation
+        for name in result.edges:
+            np.testing.assert_array_equal(loaded.covariance(name), result.covariance(name))
+            # scipy makes a matrix orthonormal again when it is read: the last digit may change.
+            np.testing.assert_allclose(
+                loaded.transforms[name].as_matrix(), result.transforms[name].as_matrix(), atol=1e-15
+            )
+        q = np.array([[0.1, -1.2, 1.3, -0.4, 1.5, 0.2]])
+        np.testing.assert_array_equal(
+            loaded.base_from_flange(q).as_matrix(), result.base_from_flange(q).as_matrix()
+        )
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"schema": 9}', '{"schema": 1}', "\xff\xfe"])
+def test_what_is_no_calibration_is_refused_by_name(tmp_path, text):
+    path = tmp_path / "calibration.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError, match=r"calibration\.json"):
+        Calibration.load(path)
+
+
+def test_an_unknown_edge_is_refused_with_those_there_are(result):
+    with pytest.raises(DataError, match="flange_from_cam, base_from_target"):
+        result.covariance("base_from_cam")
+
+
+def test_the_same_session_gives_the_same_numbers(rendered, result):
+    again = to_document(visioncal.calibrate(rendered))
+    assert {**again, "created": ""} == {**to_document(result), "created": ""}
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_exact_pose_pairs_give_the_exact_edges(mount, tmp_path):
+    folder = write_session(
+        simulate(exact(CellOptions(mount=mount, seed=4))), tmp_path / "pairs", images=False
+    )
+    calibration = visioncal.calibrate(folder)
+    away_mm, away_deg = errors(calibration, read_truth(folder))
+    # Numbers on disk keep all digits; the solvers are exact to 1e-9 m.
+    assert away_mm < 1e-6
+    assert away_deg < 1e-6
+    assert calibration.camera is None
+    assert "pixel_px" not in calibration.noise
+
+
+def test_a_checkerboard_and_a_fixed_camera(tmp_path):
+    options = CellOptions(
+        mount="eye-to-hand", views=12, target=checkerboard_target(), distance_m=(0.5, 0.8), seed=5
+    )
+    folder = write_session(simulate(options), tmp_path / "fixed")
+    calibration = visioncal.calibrate(folder)
+    assert list(calibration.edges) == ["base_from_cam", "flange_from_target"]
+    away_mm, away_deg = errors(calibration, read_truth(folder))
+    assert away_mm < 3 * calibration.edges["base_from_cam"].sigma_mm
+    assert away_deg < 3 * calibration.edges["base_from_cam"].sigma_deg
+
+
+def test_joints_stand_in_for_poses(session_copy, result):
+    pose = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+
+    def without_poses(header, rows):
+        columns = header.split(",")
+        keep = [at for at, name in enumerate(columns) if name not in pose]
+        cut = [",".join(np.array(row.split(","))[keep]) for row in rows]
+        return ",".join(np.array(columns)[keep]), cut
+
+    with_rows(session_copy, without_poses)
+    by_joints = visioncal.calibrate(session_copy)
+    np.testing.assert_allclose(
+        by_joints.transforms["flange_from_cam"].as_matrix(),
+        result.transforms["flange_from_cam"].as_matrix(),
+        atol=1e-9,  # the model's poses and the reported ones agree to rounding
+    )
+
+
+def test_poses_that_disagree_with_the_joints_are_reported(session_copy):
+    text = (session_copy / "session.toml").read_text(encoding="utf-8")
+    assert '"ur10e"' in text
+    (session_copy / "session.toml").write_text(text.replace('"ur10e"', '"ur5e"'), encoding="utf-8")
+    calibration = visioncal.calibrate(session_copy)
+    assert calibration.verdict.status == "check"
+    assert any("Poses and joint angles disagree" in it for it in calibration.verdict.reasons)
+
+
+def test_a_view_held_out_by_the_session_is_in_no_fit(session_copy):
+    def hold(header, rows, spoil):
+        columns = header.split(",")
+        x = columns.index("x_m")
+        out = []
+        for at, row in enumerate(rows):
+            cells = row.split(",")
+            if at == 3 and spoil:
+                cells[x] = repr(float(cells[x]) + 0.05)
+            out.append(",".join([*cells, "holdout" if at == 3 else ""]))
+        return header + ",role", out
+
+    with_rows(session_copy, lambda header, rows: hold(header, rows, spoil=False))
+    whole = visioncal.calibrate(session_copy)
+    assert not whole.views[3].used
+    assert "holdout" in whole.views[3].reason
+    assert whole.validation.holdout.mm < 1.0
+    with_rows(
+        session_copy,
+        lambda header, rows: (
+            header.removesuffix(",role"),
+            [row.rpartition(",")[0] for row in rows],
+        ),
+    )
+    with_rows(session_copy, lambda header, rows: hold(header, rows, spoil=True))
+    spoilt = visioncal.calibrate(session_copy)
+    np.testing.assert_array_equal(
+        spoilt.transforms["flange_from_cam"].as_matrix(),
+        whole.transforms["flange_from_cam"].as_matrix(),
+    )
+    # The spoilt pose is off by 50 mm, and shows as such.
+    assert spoilt.validation.holdout.mm == pytest.approx(50.0, abs=2.0)
+
+
+def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, result):
+    images = sorted((session_copy / "images").iterdir())
+    images[1].unlink()
+    images[4].write_bytes(images[4].read_bytes()[:4000])
+    images[7].write_bytes(b"")
+    calibration = visioncal.calibrate(session_copy)
+    unused = {view.view: view.reason for view in calibration.views if not view.used}
+    assert set(unused) == {1, 4, 7}
+    assert "missing" in unused[1]
+    assert "cut short" in unused[4]
+    assert "empty" in unused[7]
+    # Nothing shifts: the others keep their poses, and the answer stays where it was.
+    step = invert(result.transforms["flange_from_cam"].as_matrix()) @ (
+        calibration.transforms["flange_from_cam"].as_matrix()
+    )
+    assert 1e3 * np.linalg.norm(step[:3, 3]) < 3 * calibration.edges["flange_from_cam"].sigma_mm
+
+
+def test_two_views_and_no_board_are_refused(session_copy):
+    for path in sorted((session_copy / "images").iterdir())[2:]:
+        cv2.imwrite(str(path), np.full((800, 1280), 90, np.uint8))
+    with pytest.raises(DataError, match="intrinsics: 2 views show the target"):
+        visioncal.calibrate(session_copy)
+    for path in sorted((session_copy / "images").iterdir()):
+        path.write_bytes(cv2.imencode(".png", np.full((800, 1280), 90, np.uint8))[1].tobytes())
+    with pytest.raises(DataError, match="no view shows the target") as caught:
+        visioncal.calibrate(session_copy)
+    assert "almost uniform" in caught.value.culprits[0]
+
+
+@pytest.mark.parametrize("motion", ["one_axis", "translation"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_poor_motion_is_refused(motion, mount, tmp_path):
+    options = CellOptions(views=8, motion=motion, mount=mount, seed=2)
+    folder = write_session(simulate(options), tmp_path / "poor", images=False)
+    with pytest.raises(DegenerateError, match="camera's offset"):
+        visioncal.calibrate(folder)
+
+
+def test_a_wrong_view_spoils_the_verdict(tmp_path):
+    options = CellOptions(views=15, wrong_views=2, seed=6)
+    folder = write_session(simulate(options), tmp_path / "wrong", images=False)
+    verdict = visioncal.calibrate(folder).verdict
+    assert verdict.status != "good"
+    assert any("disagree with the others" in it for it in verdict.reasons)
+
+
+def test_a_wrong_lens_spoils_the_verdict(rendered, session_copy):
+    text = (session_copy / "session.toml").read_text(encoding="utf-8")
+    truth = read_truth(rendered).camera
+    # A matrix of the same camera at another resolution: the classical mistake.
+    lines = f"matrix = {(truth.matrix * 1.5).tolist()}\ndistortion = [0, 0, 0, 0, 0]\n"
+    wrong = text.replace("[camera]\n", "[camera]\n" + lines)
+    (session_copy / "session.toml").write_text(wrong, encoding="utf-8")
+    verdict = visioncal.calibrate(session_copy).verdict
+    assert verdict.status == "bad"
+
+
+def test_progress_tells_of_every_stage_and_image(rendered):
+    told = []
+    run(rendered, progress=lambda stage, done, total: told.append((stage, done, total)))
+    assert ("detect", 12, 12) in told
+    assert {"pnp", "hand-eye", "validate", "judge"} <= {stage for stage, *_ in told}
+
+
+def test_options_that_do_not_exist_are_refused(rendered):
+    with pytest.raises(DataError, match="solver 'best'"):
+        visioncal.calibrate(rendered, solver="best")
+    with pytest.raises(DataError, match="level 'seven'"):
+        visioncal.calibrate(rendered, level="seven")
+
+
+def test_numbers_do_not_depend_on_the_board_turned_round(tmp_path):
+    """A board whose two ends look alike gives the same camera, whichever end comes first."""
+    target = replace(checkerboard_target(), name="even", columns=9, rows=7, square_m=0.02)
+    cell = simulate(CellOptions(views=10, target=target, seed=8))
+    folder = write_session(cell, tmp_path / "even")
+    calibration = visioncal.calibrate(folder)
+    away_mm, away_deg = errors(calibration, read_truth(folder))
+    assert away_mm < 3 * calibration.edges["flange_from_cam"].sigma_mm
+    assert away_deg < 3 * calibration.edges["flange_from_cam"].sigma_deg
+
+
+def test_evidence_shows_what_was_seen_and_where_it_should_be(rendered):
+    done = run(rendered)
+    assert len(done.evidence) == 12
+    for seen, view in zip(done.evidence, done.calibration.views, strict=True):
+        away = seen.predicted_px - seen.corners.px
+        assert np.sqrt(np.mean(np.sum(away**2, axis=1))) == pytest.approx(view.rms_px)
+    angle = Rotation.from_matrix(done.evidence[0].cam_from_target[:3, :3]).magnitude()
+    assert 0 < angle < np.pi

@@ -1,0 +1,147 @@
+"""The commands as a user runs them: exit status, messages, and the files that appear."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
+
+
+def visioncal(*arguments, cwd=None):
+    # A wide terminal, so that messages are not folded.
+    return subprocess.run(
+        [sys.executable, "-m", "visioncal", *map(str, arguments)],
+        check=False,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        cwd=cwd,
+        env=os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
+    )
+
+
+@pytest.fixture(scope="module")
+def poor(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("poor") / "one axis"
+    options = CellOptions(views=6, motion="one_axis", seed=1)
+    return write_session(simulate(options), folder, images=False)
+
+
+def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path):
+    out = tmp_path / "out put, größer"
+    done = visioncal("calibrate", rendered, "-o", out, "-v")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in out.iterdir()} == {
+        "calibration.json",
+        "report.html",
+        "recording.rrd",
+    }
+    assert done.stdout == ""
+    assert done.stderr.startswith("good")
+    assert "flange_from_cam" in done.stderr
+    assert "daniilidis" in done.stderr
+
+
+def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):
+    done = visioncal("calibrate", rendered, "-o", tmp_path / "out", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == json.loads((tmp_path / "out/calibration.json").read_text())
+
+
+def test_calibrating_the_recording_gives_the_same_numbers(rendered, tmp_path):
+    assert visioncal("calibrate", rendered, "-o", tmp_path / "a").returncode == 0
+    again = visioncal("calibrate", tmp_path / "a/recording.rrd", "-o", tmp_path / "b")
+    assert again.returncode == 0, again.stderr
+    first, second = (
+        json.loads((tmp_path / name / "calibration.json").read_text()) for name in "ab"
+    )
+    assert first | {"created": ""} == second | {"created": ""}
+
+
+def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "calibration.json").write_text("an earlier result")
+    done = visioncal("calibrate", poor, "-o", out)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "the camera's offset along the tool's" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in out.iterdir()] == ["calibration.json"]
+    assert (out / "calibration.json").read_text() == "an earlier result"
+
+
+def test_an_error_as_json_has_its_parts(poor, tmp_path):
+    done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json")
+    assert done.returncode == 2
+    error = json.loads(done.stdout)["error"]
+    assert set(error) == {"class", "message", "culprits", "next"}
+    assert error["class"] == "DegenerateError"
+    assert error["culprits"]
+    assert "Add 3 or more views" in error["next"]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["calibrate", "nowhere"], "nowhere"),
+        (["calibrate", "nowhere.rrd"], "nowhere.rrd"),
+        (["calibrate"], "Missing argument"),
+        (["calibrate", "x", "--solver", "best"], "best"),
+        (["fly"], "No such command"),
+    ],
+)
+def test_mistakes_at_the_command_line_are_status_2(arguments, words, tmp_path):
+    done = visioncal(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_folder_that_cannot_be_written_is_named(rendered, tmp_path):
+    (tmp_path / "taken").write_text("a file where the folder should be")
+    done = visioncal("calibrate", rendered, "-o", tmp_path / "taken")
+    assert done.returncode == 2
+    assert "taken" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_simulate_writes_a_session_and_its_truth_beside_it(tmp_path):
+    folder = tmp_path / "cell"
+    done = visioncal("simulate", folder, "--views", 4, "--mount", "eye-to-hand", "--no-images")
+    assert done.returncode == 0, done.stderr
+    assert truth_path(folder).exists()
+    assert not any("truth" in path.name for path in folder.rglob("*"))
+    assert set(read_truth(folder).transforms) == {"base_from_cam", "flange_from_target"}
+    again = visioncal("simulate", folder, "--views", 4, "--no-images")
+    assert again.returncode == 2
+    assert "cell" in again.stderr
+
+
+def test_demo_compares_itself_with_the_truth(tmp_path):
+    for _ in range(2):  # a second run replaces the first
+        done = visioncal("demo", "--views", 8, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert "against the truth" in done.stderr
+    assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
+
+
+def test_help_and_version_name_the_program():
+    assert "calibrate" in visioncal("--help").stdout
+    assert visioncal("--version").stdout.strip().count(".") == 2
+
+
+def test_boards_and_robots_are_found_from_any_folder(tmp_path):
+    code = "from visioncal.targets import target_names; from visioncal.robot import robot_names;"
+    code += "print(*target_names(), *robot_names())"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert {"charuco_9x6_30mm", "checkerboard_9x6_25mm", "ur10e", "panda"} <= set(
+        done.stdout.split()
+    )

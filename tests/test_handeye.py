@@ -1,0 +1,249 @@
+"""Both unknown edges: the fit, its covariance, and the motions that are refused."""
+
+import numpy as np
+import pytest
+from cells import calibrated, error_of
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DataError, DegenerateError
+from visioncal.estimator.closure import (
+    Closure,
+    Noise,
+    closure_jacobian,
+    estimate_noise,
+    fit_closure,
+    solve_closure,
+)
+from visioncal.estimator.linalg import covariance, damped_step, spectrum
+from visioncal.simulation import CellOptions, exact, measured_poses, simulate
+from visioncal.stages.handeye import robot_part, solve_hand_eye
+from visioncal.transforms import adjoint, compose, exp, invert, log
+
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+NOISE = Noise(1e-3, 5e-4)
+
+
+def closure_of(cell, camera=None):
+    robot = robot_part(cell.base_from_flange, cell.options.mount)
+    return Closure(robot, cell.cam_from_target if camera is None else camera)
+
+
+def made_up(robot, x, z, noise=NOISE, seed=0):
+    """A closure whose residuals have just this noise."""
+    rng = np.random.default_rng(seed)
+    sigma = np.repeat([noise.sigma_rad, noise.sigma_m], 3)
+    errors = exp(rng.standard_normal((len(robot), 6)) * sigma)
+    return Closure(robot, invert(robot @ x) @ z @ errors)
+
+
+def some_edges(seed=0):
+    rng = np.random.default_rng(seed)
+    return [
+        compose(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.5, 0.5, 3)) for _ in range(2)
+    ]
+
+
+def some_motion(count, seed=0, tilt=0.5):
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.from_rotvec(rng.uniform(-tilt, tilt, (count, 3))).as_matrix()
+    return compose(rotation, rng.uniform(-0.3, 0.3, (count, 3)))
+
+
+def test_jacobian_agrees_with_central_differences():
+    x, z = some_edges()
+    data = made_up(some_motion(5), x, z, Noise(0.05, 0.02))
+    analytic, step = closure_jacobian(data, x, z), 1e-6
+    for axis in range(12):
+        shift = np.zeros(12)
+        shift[axis] = step
+        ahead, behind = (
+            log(invert(z @ exp(sign * shift[6:])) @ data.placed(x @ exp(sign * shift[:6])))
+            for sign in (1, -1)
+        )
+        # Truncation step^2, rounding 1e-16 / step = 1e-10, and the series' own cut of 1e-9.
+        np.testing.assert_allclose(analytic[:, :, axis], (ahead - behind) / (2 * step), atol=5e-9)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("solver", ["joint", "tsai", "li"])
+def test_exact_data_give_the_exact_edges(mount, solver):
+    cell = simulate(exact(CellOptions(mount=mount, seed=1)))
+    result = solve_hand_eye(closure_of(cell), mount, solver)
+    for found, true in zip((result.x, result.z), cell.transforms.values(), strict=True):
+        np.testing.assert_allclose(found, true, atol=1e-9)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_every_solver_is_shown_beside_the_answer(mount):
+    cell = simulate(CellOptions(mount=mount, seed=2))
+    result = solve_hand_eye(closure_of(cell, measured_poses(cell)), mount)
+    names = {"joint", "tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"}
+    assert set(result.solutions) == names
+    np.testing.assert_array_equal(result.solutions["joint"].x, result.x)
+    with pytest.raises(DataError, match="not one of joint, tsai"):
+        solve_hand_eye(closure_of(cell), mount, "newton")
+
+
+def test_noise_and_errors_are_as_stated():
+    x, z = some_edges(1)
+    robot = some_motion(20, 1)
+    surprises, sigmas = [], []
+    for seed in range(100):
+        data = made_up(robot, x, z, seed=seed)
+        fit = fit_closure(data, x, z)
+        sigmas.append([fit.noise.sigma_rad, fit.noise.sigma_m])
+        result = solve_hand_eye(data, "eye-in-hand")
+        error = np.concatenate([log(invert(x) @ result.x), log(invert(z) @ result.z)])
+        surprises.append(error @ np.linalg.solve(result.covariance, error) / 12)
+    # Variances, not deviations, are unbiased; 100 runs of 54 degrees of freedom: 2 %.
+    variances = np.mean(np.square(sigmas), axis=0)
+    np.testing.assert_allclose(variances, [NOISE.sigma_rad**2, NOISE.sigma_m**2], rtol=0.08)
+    # Mean of 100 chi-square of 12: 0.04; the estimated noise adds 1 / 27 to the expectation
+    # (F against chi-square).
+    assert np.mean(surprises) == pytest.approx(1.04, abs=0.15)
+
+
+def test_the_fit_is_the_least_squares_solution_from_far_starts_too():
+    x, z = some_edges(2)
+    data = made_up(some_motion(15, 2), x, z)
+    near = solve_closure(data, x, z, NOISE)
+    push = exp(np.array([0.15, -0.1, 0.1, 0.05, -0.03, 0.04]))
+    far = solve_closure(data, x @ push, z @ push, NOISE)
+    # The cost is settled to 1e-12 of itself, the edges to 1e-6 of their sigma of about 1e-4.
+    np.testing.assert_allclose(far[0], near[0], atol=1e-8)
+    np.testing.assert_allclose(far[1], near[1], atol=1e-8)
+    jacobian = closure_jacobian(data, *near)
+    residuals = log(invert(near[1]) @ data.placed(near[0]))
+    gradient = np.einsum("mij,i,mi->j", jacobian, NOISE.weights, residuals)
+    information = np.einsum("mij,i,mik->jk", jacobian, NOISE.weights, jacobian)
+    # In units of the edges' sigma the gradient of a settled fit is nothing.
+    assert np.abs(gradient * np.sqrt(np.diag(np.linalg.inv(information)))).max() < 1e-4
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_the_whole_chain_states_its_errors_honestly(mount, given):
+    surprises = []
+    for seed in range(16):
+        options = CellOptions(mount=mount, state_intrinsics=given, seed=seed, pixel_sigma_px=0.1)
+        cell = simulate(options)
+        known = calibrated(cell)
+        error = error_of(cell, known)[:6]
+        surprises.append(error @ np.linalg.solve(known.solved.covariance[:6, :6], error) / 6)
+    # 16 chi-square of 6: standard deviation 0.14; three of it, and the noise of the poses is not
+    # white in the target's frame, as the covariance takes it to be: up to a third of the square.
+    assert 0.4 < np.mean(surprises) < 1.75
+
+
+def one_axis(count, seed, wobble_rad):
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    turns = np.outer(rng.uniform(-1, 1, count), axis) + wobble_rad * rng.normal(size=(count, 3))
+    return compose(Rotation.from_rotvec(turns).as_matrix(), rng.uniform(-0.3, 0.3, (count, 3)))
+
+
+@pytest.mark.parametrize("wobble_rad", [0.0, 1e-5, 1e-4])
+def test_turns_about_one_axis_are_refused_with_that_axis(wobble_rad):
+    for seed in range(30):
+        x, z = some_edges(seed)
+        data = made_up(one_axis(12, seed, wobble_rad), x, z, seed=seed)
+        with pytest.raises(DegenerateError, match="camera's offset along the tool's"):
+            solve_hand_eye(data, "eye-in-hand")
+
+
+def test_the_axis_has_its_name():
+    x, z = some_edges()
+    turns = np.outer(np.linspace(-1, 1, 8), [0.0, 0.0, 1.0])
+    robot = compose(Rotation.from_rotvec(turns).as_matrix(), some_motion(8)[:, :3, 3])
+    with pytest.raises(DegenerateError, match=r"along the base's z .* turn about the base's z"):
+        solve_hand_eye(made_up(robot, x, z), "eye-to-hand")
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_translation_alone_is_refused(mount):
+    for seed in range(6):
+        x, z = some_edges(seed)
+        robot = compose(np.tile(np.eye(3), (10, 1, 1)), some_motion(10, seed)[:, :3, 3])
+        data = made_up(robot, x, z, seed=seed)
+        with pytest.raises(DegenerateError, match="differ in position only"):
+            solve_hand_eye(data, mount)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_fewer_than_three_views_are_refused(count):
+    x, z = some_edges()
+    with pytest.raises(DegenerateError, match=f"{count} usable views, at least 3"):
+        solve_hand_eye(made_up(some_motion(count), x, z), "eye-in-hand")
+
+
+def test_one_pose_again_and_again_is_refused():
+    x, z = some_edges()
+    data = made_up(np.repeat(some_motion(1), 12, axis=0), x, z)
+    with pytest.raises(DegenerateError, match="all from one pose of the robot"):
+        solve_hand_eye(data, "eye-in-hand")
+
+
+def test_healthy_motion_is_never_refused_small_tilts_included():
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        x, z = some_edges(seed)
+        tilt = np.deg2rad(rng.uniform(5, 40))
+        data = made_up(some_motion(int(rng.integers(8, 30)), seed, tilt), x, z, Noise(3e-4, 2e-4))
+        result = solve_hand_eye(data, "eye-in-hand")
+        sigma = np.sqrt(np.diag(result.covariance))
+        # Five sigma of six components over 150 sets: once in 2,000 runs of this test.
+        assert np.all(np.abs(log(invert(x) @ result.x)) < 5.5 * sigma[:6])
+
+
+def test_weak_motion_is_answered_and_its_direction_told():
+    x, z = some_edges(3)
+    # Turns mostly about one axis: the offset along it hangs on tilts of two degrees.
+    data = made_up(one_axis(15, 3, np.deg2rad(2.0)), x, z, Noise(3e-4, 2e-4))
+    result = solve_hand_eye(data, "eye-in-hand")
+    worst = result.worst[0]
+    assert worst.words.startswith("the camera's offset along the tool's")
+    assert 1e-3 < worst.sigma < worst.limit
+
+
+def test_views_of_a_moved_target_frame_give_the_same_camera():
+    cell = simulate(CellOptions(seed=5))
+    data = closure_of(cell, measured_poses(cell))
+    turned = compose(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.zeros(3))
+    moved = Closure(data.robot, data.camera @ turned)
+    # Turning the target's frame about its origin leaves lengths and angles of residuals alone.
+    first, second = (solve_hand_eye(it, "eye-in-hand") for it in (data, moved))
+    np.testing.assert_allclose(second.x, first.x, atol=1e-8)
+    np.testing.assert_allclose(second.z, first.z @ turned, atol=1e-8)
+
+
+def test_covariance_moves_with_its_frame():
+    """The information of z is that of x carried over by the adjoint of the mean chain."""
+    cell = simulate(exact(CellOptions(seed=6, views=4)))
+    data = closure_of(cell)
+    x, z = cell.transforms.values()
+    jacobian = closure_jacobian(data, x, z)
+    np.testing.assert_allclose(jacobian[:, :, :6], adjoint(invert(data.camera)), atol=1e-9)
+    np.testing.assert_allclose(jacobian[:, :, 6:], np.tile(-np.eye(6), (4, 1, 1)), atol=1e-9)
+
+
+def test_noise_of_exact_data_is_nil_and_nothing_divides_by_it():
+    cell = simulate(exact(CellOptions(seed=7)))
+    noise = estimate_noise(closure_of(cell), *cell.transforms.values())
+    assert noise.sigma_m < 1e-9
+    result = solve_hand_eye(closure_of(cell), "eye-in-hand")
+    assert np.all(np.isfinite(result.covariance))
+
+
+def test_linear_algebra_says_what_it_sees():
+    rng = np.random.default_rng(0)
+    tall = rng.normal(size=(30, 4)) * [1.0, 1e3, 1e-3, 1.0]
+    information = tall.T @ tall
+    np.testing.assert_allclose(covariance(information), np.linalg.inv(information), rtol=1e-8)
+    assert spectrum(information).ratio > 0.1  # the units of the columns do not matter
+    tall[:, 3] = tall[:, 0]
+    assert spectrum(tall.T @ tall).ratio < 1e-12
+    null = spectrum(tall.T @ tall).vectors[:, 0]
+    np.testing.assert_allclose(np.abs(null), [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
+    step = damped_step(information, information @ np.ones(4), 0.0)
+    np.testing.assert_allclose(step, -np.ones(4), rtol=1e-8)

@@ -1,0 +1,35 @@
+"""What a wheel carries: boards, robots and the report's template, found from any folder."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*build, "--wheel-dir", str(tmp_path), str(ROOT)], check=True)
+    (wheel,) = tmp_path.glob("visioncal-*.whl")
+    site = tmp_path / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+        names = archive.namelist()
+    assert not [name for name in names if name.startswith(("tests/", "targets/"))]
+    code = (
+        "import visioncal.targets as t, visioncal.robot as r, visioncal.report;"
+        "target, _ = t.load_target('charuco_9x6_30mm', None);"
+        "print(t.__file__, target.square_m, r.load_robot('ur10e').joint_count)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(site), "PATH": ""},
+    )
+    assert done.stdout.split() == [str(site / "visioncal/targets.py"), "0.03", "6"]
+    for data in ("report/report.html.j2", "report/report.css", "robots/ur10e.toml", "py.typed"):
+        assert f"visioncal/{data}" in names
