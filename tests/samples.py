@@ -14,10 +14,10 @@ from visioncal.calibration import (
     SolverResult,
     Validation,
     Verdict,
-    ViewEvidence,
     ViewResult,
 )
 from visioncal.camera import project
+from visioncal.evidence import ViewEvidence
 from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE

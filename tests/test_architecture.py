@@ -24,6 +24,7 @@ LAYERS = (
     ("solvers",),
     ("estimator",),
     ("session",),
+    ("evidence",),
     ("calibration",),
     ("recording",),
     ("simulation",),

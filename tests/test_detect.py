@@ -8,7 +8,7 @@ import pytest
 
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, Seen, find_target
-from visioncal.finders.imaging import blur_at_corners, decode_grey
+from visioncal.finders.imaging import blur_at_corners, decode_image
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import (
     CellOptions,
@@ -208,4 +208,4 @@ def test_a_viewers_hint_to_rotate_is_not_followed():
     tiff = b"MM\x00*\x00\x00\x00\x08\x00\x01" + entry + b"\x00\x00\x00\x00"
     body = b"Exif\x00\x00" + tiff
     segment = b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body
-    assert decode_grey(jpeg[:2] + segment + jpeg[2:]).shape == (6, 8)
+    assert decode_image(jpeg[:2] + segment + jpeg[2:]).shape == (6, 8)

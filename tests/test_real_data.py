@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 import visioncal
 from visioncal.session import MemoryImages, Session
-from visioncal.transforms import compose, from_pose
+from visioncal.transforms import compose
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
@@ -95,11 +95,3 @@ def test_twelve_pairs_of_a_panda(real_data):
     assert result.solvers["park"].rms_mm <= 3.43
     assert result.solvers["park"].rms_deg <= 0.725
     assert result.verdict.status != "good"
-
-
-def test_quaternions_read_from_disk_are_the_poses(real_data):
-    session = Session.load(real_data / "sessions/ric_charuco_eye_to_hand")
-    first = session.views[0]
-    numbers = np.array([first.numbers[name] for name in POSE])
-    expected = from_pose(numbers[:3], numbers[3:])
-    np.testing.assert_allclose(first.base_from_flange().as_matrix(), expected, atol=1e-12)

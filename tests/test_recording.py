@@ -13,10 +13,10 @@ import rerun as rr
 from rerun.chunk import RrdReader
 from samples import Sample, made_up
 
-from visioncal.calibration import ViewEvidence, to_document
+from visioncal.calibration import to_document
 from visioncal.errors import DataError
+from visioncal.evidence import ViewEvidence, magnification
 from visioncal.recording import notes, paths, read_session, write_recording
-from visioncal.recording.measures import magnification
 from visioncal.session import MemoryImages, Session
 from visioncal.types import Corners
 from visioncal.viewer import blueprint
@@ -172,6 +172,16 @@ def test_failed_write_leaves_the_old_file(sample: Sample, tmp_path: Path) -> Non
     shutil.rmtree(tmp_path)
     with pytest.raises(DataError, match="cannot be written"):
         write_session(path, sample.session)
+
+
+def test_full_disk_is_an_error(
+    sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))
+    with pytest.raises(DataError, match="cannot be written: 3 MB are free"):
+        write_session(tmp_path / "recording.rrd", sample.session)
+    assert list(tmp_path.iterdir()) == []
 
 
 def column(path: Path, entity: str, component: str) -> list[object]:

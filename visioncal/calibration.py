@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
 from visioncal.robot import Robot
-from visioncal.types import Camera, Corners, FloatArray, Mount
+from visioncal.types import Camera, FloatArray, Mount
 from visioncal.version import __version__
 
 SCHEMA = 1
@@ -126,25 +126,6 @@ class Verdict:
 
     status: VerdictStatus
     reasons: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class ViewEvidence:
-    """What was seen and computed of one view, for the report and the recording.
-
-    Attributes:
-        view: The view's number.
-        corners: The corners that were found, if any.
-        predicted_px: (n, 2) where the calibrated chain puts these corners [px].
-        base_from_flange: (4, 4) as the controller reported it.
-        cam_from_target: (4, 4) as this view alone shows it.
-    """
-
-    view: int
-    corners: Corners | None = None
-    predicted_px: FloatArray | None = None
-    base_from_flange: FloatArray | None = None
-    cam_from_target: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,7 @@ from pathlib import Path
 
 from visioncal.errors import DataError
 from visioncal.pipeline import Run
-from visioncal.recording import write_recording
-from visioncal.report import write_report
 from visioncal.session import Session
-from visioncal.viewer import blueprint
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 
@@ -30,6 +27,11 @@ def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
     Raises:
         DataError: The folder cannot be written.
     """
+    # Plots and the recording's codec take half a second to import, which help need not wait for.
+    from visioncal.recording import write_recording
+    from visioncal.report import write_report
+    from visioncal.viewer import blueprint
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:

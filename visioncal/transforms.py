@@ -5,10 +5,8 @@ estimator, batches are plain (m, 4, 4) arrays. Twists are (rotation [rad], trans
 perturbations act on the right, in the local frame: `T * exp(twist)`.
 """
 
-from collections.abc import Iterable
-
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from visioncal.types import FloatArray
 
@@ -141,12 +139,7 @@ def rotation_angle(matrices: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(sine, cosine))
 
 
-def from_pose(translation_m: FloatArray, quaternion_xyzw: FloatArray) -> FloatArray:
-    """Builds (..., 4, 4) transforms from translations [m] and x, y, z, w quaternions."""
-    rotation = Rotation.from_quat(quaternion_xyzw.reshape(-1, 4)).as_matrix()
-    return compose(rotation.reshape(*quaternion_xyzw.shape[:-1], 3, 3), translation_m)
-
-
-def as_matrices(transforms: Iterable[RigidTransform]) -> FloatArray:
-    """Stacks transforms into an (m, 4, 4) array."""
-    return np.array([transform.as_matrix() for transform in transforms]).reshape(-1, 4, 4)
+def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """Distance between the origins [mm] and angle [deg] of two (4, 4) poses in one frame."""
+    between = invert(a) @ b
+    return 1e3 * float(np.linalg.norm(between[:3, 3])), float(np.rad2deg(rotation_angle(between)))

@@ -9,11 +9,17 @@ import numpy.typing as npt
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
+Mask: TypeAlias = npt.NDArray[np.bool_]
 Image: TypeAlias = npt.NDArray[np.uint8]
 
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
 TargetKind: TypeAlias = Literal["charuco", "checkerboard", "marker"]
+
+# The joint fit, or one of the closed forms.
+SolverName: TypeAlias = Literal[
+    "joint", "tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"
+]
 
 # Called with a stage's name, its steps done, and its steps in all.
 Progress: TypeAlias = Callable[[str, int, int], None]

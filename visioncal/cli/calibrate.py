@@ -11,7 +11,7 @@ from visioncal.cli.console import messages, print_summary, shown_progress
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import run
 from visioncal.session import Session
-from visioncal.stages.handeye import SolverName
+from visioncal.types import SolverName
 
 
 def calibrate_command(

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from visioncal.calibration import Calibration
 from visioncal.errors import VisioncalError
-from visioncal.recording.measures import pose_difference
+from visioncal.transforms import pose_difference
 from visioncal.types import Progress as Told
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}

@@ -21,7 +21,7 @@ from visioncal.transforms import (
     mean_transform,
     rotation_angle,
 )
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mask
 
 UNKNOWNS = 12
 _ITERATIONS = 50
@@ -45,7 +45,7 @@ class Closure:
     def __len__(self) -> int:
         return len(self.robot)
 
-    def subset(self, chosen: FloatArray) -> "Closure":
+    def subset(self, chosen: Mask) -> "Closure":
         """Returns the views of an (m,) mask."""
         return Closure(self.robot[chosen], self.camera[chosen])
 

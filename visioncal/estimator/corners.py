@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.camera import project_with_jacobian
 from visioncal.transforms import skew
-from visioncal.types import Camera, Corners, FloatArray, IntArray
+from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class CornerStack:
             np.concatenate([it.px for it in corners.values()]),
         )
 
-    def keep(self, mask: FloatArray) -> "CornerStack":
+    def keep(self, mask: Mask) -> "CornerStack":
         """Returns the stack of the corners in an (n,) mask; views left without any vanish."""
         kept_views, view_of = np.unique(self.view_of[mask], return_inverse=True)
         return CornerStack(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.corners import CornerStack, mean_square_by_view
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mask
 
 # Views differ in noise by two or so, and eight sigma of all are four of the noisiest; a corner that
 # belongs elsewhere is off by a good part of a square.
@@ -25,7 +25,7 @@ _CORNER_SHARE, _FEWEST_CORNERS = 0.5, 4
 class Gate:
     """What passes: an (n,) mask of corners, and the reason for each view thrown out."""
 
-    mask: FloatArray
+    mask: Mask
     reasons: Mapping[int, str]
 
     @property

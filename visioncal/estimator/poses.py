@@ -10,7 +10,8 @@ from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray
 
 _ITERATIONS = 30
-_SETTLED = 1e-10  # step of a pose [rad or m] below which it no longer moves
+# A step [rad or m] so small that the next, by quadratic convergence, is rounding.
+_SETTLED = 1e-8
 _START_DAMPING = 1e-4
 
 

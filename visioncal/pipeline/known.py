@@ -11,11 +11,11 @@ from visioncal.errors import DataError
 from visioncal.estimator.closure import Closure
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.stages.handeye import HandEyeResult, SolverName, robot_part
+from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.validate import HeldOut
 from visioncal.targets import corner_positions
-from visioncal.types import Corners, FloatArray, Progress, Rejection
+from visioncal.types import Corners, FloatArray, Progress, Rejection, SolverName
 
 # A view's corners with their (n, 3) places on the target [m]; None where it has no image.
 Seen = tuple[Corners, FloatArray] | None

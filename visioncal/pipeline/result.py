@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.calibration import Calibration, Edge, SolverResult, Validation, ViewEvidence
+from visioncal.calibration import Calibration, Edge, SolverResult, Validation
 from visioncal.errors import DataError
 from visioncal.estimator.observability import edge_names
+from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES, rms_of
 from visioncal.pipeline.views import holdout_rms, view_evidence, view_results
 from visioncal.session import Session
-from visioncal.stages.handeye import SOLVER_NAMES, SolverName
-from visioncal.types import FloatArray, Progress
+from visioncal.stages.handeye import SOLVER_NAMES
+from visioncal.types import FloatArray, Progress, SolverName
 
 _LEVELS = ("auto", "hand-eye")
 

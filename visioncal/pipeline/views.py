@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration import Rms, ViewEvidence, ViewResult
+from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import distances
+from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import rms_of
 from visioncal.stages.validate import chain_rms_px, predict_corners

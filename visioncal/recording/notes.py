@@ -6,7 +6,7 @@ import rerun as rr
 
 from visioncal.calibration import Calibration, Edge, Rms, ViewResult
 from visioncal.recording import paths
-from visioncal.recording.measures import pose_difference
+from visioncal.transforms import pose_difference
 
 _USED_RGB = (70, 150, 250)
 _REJECTED_RGB = (230, 70, 60)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from visioncal.calibration import Calibration, ViewEvidence
+from visioncal.calibration import Calibration
+from visioncal.evidence import ViewEvidence, magnification
 from visioncal.recording import paths
-from visioncal.recording.measures import magnification
 from visioncal.session import Session
 
 _DETECTED_RGB = (50, 220, 110)

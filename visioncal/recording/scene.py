@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from visioncal.calibration import Calibration, ViewEvidence
+from visioncal.calibration import Calibration
 from visioncal.camera import matrix_3x3
+from visioncal.evidence import ViewEvidence
 from visioncal.recording import paths
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -16,13 +17,16 @@ from rerun.blueprint import BlueprintLike
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from visioncal.calibration import Calibration, ViewEvidence, to_document
+from visioncal.calibration import Calibration, to_document
 from visioncal.errors import DataError
+from visioncal.evidence import ViewEvidence
 from visioncal.recording import codec, notes, overlays, paths
 from visioncal.recording.scene import Scene
 from visioncal.session import Session
 
 _EVIDENCE = "visioncal.Evidence"
+# Room for one more view, however large its image, and for the end of the file.
+_ROOM_BYTES = 100_000_000
 
 
 def write_recording(
@@ -50,7 +54,7 @@ def write_recording(
         _open(stream, aside, blueprint)
         try:
             stream.send_recording_name(session.name)
-            _log_all(stream, session, calibration, {it.view: it for it in evidence})
+            _log_all(stream, session, calibration, {it.view: it for it in evidence}, path.parent)
         finally:
             # Writes the footer, which comes last.
             stream.disconnect()
@@ -65,14 +69,21 @@ def _open(stream: rr.RecordingStream, path: Path, blueprint: BlueprintLike | Non
         raise OSError(str(error)) from error
 
 
+def _check_room(folder: Path) -> None:
+    """Stops in time: on a full disk, rerun's own thread dies and whoever waits for it hangs."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < _ROOM_BYTES:
+        raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")
+
+
 def _check_finished(path: Path) -> None:
-    """Rerun only prints that a disk is full; a file that lacks its footer is not whole."""
+    """Rerun only prints that it could not write; a file that lacks its footer is not whole."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RerunWarning)
             RrdReader(path).store()
     except (RuntimeError, ValueError) as error:
-        raise OSError("the end of the file is missing; the disk may be full") from error
+        raise OSError("its end is missing; the disk may be full") from error
 
 
 def _log_all(
@@ -80,6 +91,7 @@ def _log_all(
     session: Session,
     calibration: Calibration | None,
     evidence: dict[int, ViewEvidence],
+    folder: Path,
 ) -> None:
     codec.log_header(stream, session)
     scene = Scene.of(session, calibration, evidence)
@@ -90,6 +102,7 @@ def _log_all(
         notes.log_static(stream, calibration)
     results = {} if calibration is None else {it.view: it for it in calibration.views}
     for index, view in enumerate(session.views):
+        _check_room(folder)
         stream.set_time(paths.TIMELINE, sequence=index)
         seen = evidence.get(view.number, ViewEvidence(view.number))
         codec.log_row(stream, session, view)
@@ -98,6 +111,8 @@ def _log_all(
         overlay.log_view(stream, seen)
         if view.number in results:
             notes.log_view(stream, results[view.number])
+        # Keeps one view in memory rather than all, and the room that is left up to date.
+        stream.flush()
 
 
 def _log_calibration(stream: rr.RecordingStream, calibration: Calibration) -> None:

@@ -7,8 +7,8 @@ from importlib import metadata
 import numpy as np
 
 from visioncal.calibration import Calibration, CameraResult, Edge, Rms, SolverResult, ViewResult
-from visioncal.recording.measures import pose_difference
 from visioncal.report.numbers import decimals_for, matched, significant
+from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray
 
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from visioncal.calibration import Calibration, ViewEvidence, ViewResult
+from visioncal.calibration import Calibration, ViewResult
 from visioncal.errors import DataError
+from visioncal.evidence import ViewEvidence, magnification
 from visioncal.files import write_atomically
-from visioncal.recording.measures import magnification
 from visioncal.report import content, plots
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.session import Session

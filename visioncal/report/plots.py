@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Calibration, ViewEvidence, ViewResult
+from visioncal.calibration import Calibration, ViewResult
+from visioncal.evidence import ViewEvidence
 from visioncal.report import svg
 from visioncal.report.numbers import significant
 from visioncal.transforms import nearest_rotation

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visioncal.calibration import ViewEvidence
+from visioncal.evidence import ViewEvidence
+from visioncal.finders.imaging import decode_image
 from visioncal.types import FloatArray, Image
 
 _WIDTH_PX = 720
@@ -72,8 +73,8 @@ def thumbnail(
     Returns:
         The picture, or None where the bytes are no image that can be shown.
     """
-    pixels = _decode(image_bytes)
-    if pixels is None:
+    pixels = decode_image(image_bytes, colour=True)
+    if isinstance(pixels, str):
         return None
     corners = None if evidence is None else evidence.corners
     if evidence is None or corners is None or len(corners.px) == 0:
@@ -91,16 +92,6 @@ def thumbnail(
         tuple((float(x), float(y)) for x, y in corners.px.round(2)),
         _residuals(corners.px, evidence.predicted_px, magnify),
     )
-
-
-def _decode(data: bytes) -> Image | None:
-    # Corners are found in the pixels as they are stored, whatever way up the camera was.
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        return None
-    return None if image is None else np.asarray(image, dtype=np.uint8)
 
 
 def _residuals(

@@ -12,7 +12,7 @@ from visioncal.solvers import SOLVERS
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import rotations
 from visioncal.transforms import invert, rotation_angle
-from visioncal.types import Corners, FloatArray, IntArray, Rejection, Target
+from visioncal.types import Corners, FloatArray, IntArray, Mask, Rejection, Target
 
 # Lever by which an angle counts as a distance when views are compared [m].
 _LEVER_M = 0.5
@@ -39,7 +39,7 @@ class _Candidates:
     """Padded (m, k, 4, 4) candidates and their (m, k) validity."""
 
     poses: FloatArray
-    valid: FloatArray
+    valid: Mask
 
 
 def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target | None) -> Choice:

@@ -11,7 +11,7 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, find_target, fitting_layouts
-from visioncal.finders.imaging import blur_at_corners, decode_grey, why_hard_to_see
+from visioncal.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
@@ -109,7 +109,7 @@ def _single_threaded_opencv() -> Iterator[None]:
 def _look(session: Session, view: View, target: Target, options: DetectOptions) -> _Look:
     if not session.images.exists(view.image):
         return _Look(Rejection(view.number, f"{view.image} is missing"), None)
-    image = decode_grey(session.images.read(view.image))
+    image = decode_image(session.images.read(view.image))
     if isinstance(image, str):
         return _Look(Rejection(view.number, f"{view.image} is {image}"), None)
     resolution = (image.shape[1], image.shape[0])
@@ -184,7 +184,7 @@ def _check_layout(
     shown = sum(isinstance(look.found, Corners) for look in looks)
     if not misfits or len(misfits) <= shown:
         return
-    images = [decode_grey(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
+    images = [decode_image(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
     fitting = [fitting_layouts(it, target) for it in images if not isinstance(it, str)]
     common = [it for it in fitting[0] if all(it in others for others in fitting)]
     seen = (

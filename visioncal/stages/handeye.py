@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -22,11 +22,8 @@ from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.observability import Direction, check_observability
 from visioncal.solvers import SOLVERS
 from visioncal.transforms import invert, mean_transform
-from visioncal.types import FloatArray, Mount
+from visioncal.types import FloatArray, Mount, SolverName
 
-SolverName: TypeAlias = Literal[
-    "joint", "tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"
-]
 SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
 # The closed form that starts the joint fit: the most accurate of them on noisy poses.

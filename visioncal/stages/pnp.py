@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.corners import CornerStack, mean_square_by_view
+from visioncal.estimator.corners import CornerStack, mean_square_by_view, reproject
 from visioncal.estimator.gating import gate
 from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.planar import planar_poses
@@ -14,13 +14,16 @@ from visioncal.estimator.poses import PoseFit, fit_poses
 from visioncal.session import Session
 from visioncal.targets import corner_positions, rotation_transforms
 from visioncal.transforms import adjoint, invert
-from visioncal.types import Camera, Corners, FloatArray, Rejection, Target
+from visioncal.types import Camera, Corners, FloatArray, Mask, Rejection, Target
 
 # The mirrored pose of a planar target stays a candidate while its rms is under this many times
 # the better one's: systematic errors of lens and board can change the order up to there.
 _RIVAL_RATIO = 2.0
 # ... or while the difference in squared error is no surprise: 6 sigma.
 _RIVAL_CHI2 = 36.0
+# The closed form's guess is worth refining while its rms [px] is under this many times the better
+# pose's, or about a pixel: the fit brings it down by two at most.
+_PROMISING_RATIO = 5.0
 _ROUNDS = 3
 
 
@@ -80,14 +83,17 @@ def estimate_poses(corners: Mapping[int, Corners], target: Target, camera: Camer
     stack = CornerStack.of(corners, corner_positions(target))
     reasons: dict[int, str] = {}
     with one_blas_thread():
-        best, other = _both_solutions(stack, camera)
+        starts = planar_poses(stack, camera)
+        fit = fit_poses(stack, camera, starts[0])
         for _ in range(_ROUNDS):
-            passed = gate(stack, best.residuals)
+            passed = gate(stack, fit.residuals)
             if passed.is_open:
                 break
             reasons |= passed.reasons
             stack = stack.keep(passed.mask)
-            best, other = _both_solutions(stack, camera)
+            starts = planar_poses(stack, camera)
+            fit = fit_poses(stack, camera, starts[0])
+        best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, starts[1]))
     sigma_px = pixel_noise(stack, best.residuals)
     mean_squares = [mean_square_by_view(stack, fit.residuals) for fit in (best, other)]
     turns = rotation_transforms(target)
@@ -137,9 +143,34 @@ def pixel_noise(stack: CornerStack, residuals: FloatArray, parameters: int = 0) 
     return float(np.sqrt(np.sum(residuals**2) / max(freedom, 1)))
 
 
-def _both_solutions(stack: CornerStack, camera: Camera) -> tuple[PoseFit, PoseFit]:
-    """Refines both planar solutions; of each view's, the first has the smaller residuals."""
-    first, second = (fit_poses(stack, camera, start) for start in planar_poses(stack, camera))
+def _mirrored(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArray) -> PoseFit:
+    """Refines the other planar solution in the views where it may be a rival.
+
+    Elsewhere it has no minimum of its own, and a fit from there would wander to the first one:
+    that one stands in for it.
+    """
+    raw = mean_square_by_view(stack, reproject(stack, camera, starts).residuals)
+    promising = raw < _PROMISING_RATIO**2 * mean_square_by_view(stack, fit.residuals) + 1.0
+    of_corner = promising[stack.view_of]
+    if not promising.any():
+        return fit
+    part = fit_poses(stack.keep(of_corner), camera, starts[promising])
+    return PoseFit(
+        _replaced(fit.cam_from_target, promising, part.cam_from_target),
+        _replaced(fit.information, promising, part.information),
+        _replaced(fit.by_intrinsics, promising, part.by_intrinsics),
+        _replaced(fit.residuals, of_corner, part.residuals),
+    )
+
+
+def _replaced(values: FloatArray, rows: Mask, new: FloatArray) -> FloatArray:
+    changed = values.copy()
+    changed[rows] = new
+    return changed
+
+
+def _sorted(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFit, PoseFit]:
+    """Exchanges the fits' views so that of each the first has the smaller residuals."""
     squares = [mean_square_by_view(stack, fit.residuals) for fit in (first, second)]
     swap = squares[1] < squares[0]
     of_corner = swap[stack.view_of]

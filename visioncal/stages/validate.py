@@ -8,8 +8,8 @@ import numpy as np
 from visioncal.camera import project
 from visioncal.estimator.closure import Closure, distances
 from visioncal.estimator.linalg import one_blas_thread
-from visioncal.stages.handeye import HandEyeResult, SolverName, refit
-from visioncal.types import Camera, Corners, FloatArray
+from visioncal.stages.handeye import HandEyeResult, refit
+from visioncal.types import Camera, Corners, FloatArray, SolverName
 
 # Up to here every view is left out by itself; beyond, ten groups tell the same.
 _MOST_FOLDS_OF_ONE = 30

@@ -1,16 +1,34 @@
-"""Figures that recording and report show alike."""
+"""What was seen and computed of each view, for the report and the recording."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration import ViewEvidence
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray
+from visioncal.types import Corners, FloatArray
 
 _STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 # Residuals of ordinary size are drawn about this share of the image's width long.
 _SHARE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class ViewEvidence:
+    """What was seen and computed of one view, for the report and the recording.
+
+    Attributes:
+        view: The view's number.
+        corners: The corners that were found, if any.
+        predicted_px: (n, 2) where the calibrated chain puts these corners [px].
+        base_from_flange: (4, 4) as the controller reported it.
+        cam_from_target: (4, 4) as this view alone shows it.
+    """
+
+    view: int
+    corners: Corners | None = None
+    predicted_px: FloatArray | None = None
+    base_from_flange: FloatArray | None = None
+    cam_from_target: FloatArray | None = None
 
 
 def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:
@@ -36,9 +54,3 @@ def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:
         return 1
     wanted = _SHARE * image_width / np.sqrt(squared_px2)
     return max((step for step in _STEPS if step <= wanted), default=1)
-
-
-def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
-    """Distance between the origins [mm] and angle [deg] of two (4, 4) poses in one frame."""
-    between = invert(a) @ b
-    return 1e3 * float(np.linalg.norm(between[:3, 3])), float(np.rad2deg(rotation_angle(between)))
