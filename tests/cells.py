@@ -53,5 +53,5 @@ def calibrated(cell: Cell, **changes) -> Known:
 def error_of(cell: Cell, known: Known) -> np.ndarray:
     """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
     x_true, z_true = cell.transforms.values()
-    result = known.solved
-    return np.concatenate([log(invert(x_true) @ result.x), log(invert(z_true) @ result.z)])
+    edges = known.solved.edges
+    return np.concatenate([log(invert(x_true) @ edges.x), log(invert(z_true) @ edges.z)])

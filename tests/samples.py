@@ -22,7 +22,7 @@ from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.targets import charuco_board, corner_positions, load_target
-from visioncal.transforms import invert
+from visioncal.transforms import exp, invert
 from visioncal.types import Camera, Corners, FloatArray, Target
 
 TARGET = "charuco_9x6_30mm"
@@ -158,19 +158,16 @@ def _calibration(
 ) -> Calibration:
     covariance = np.diag([2e-4, 2e-4, 1e-4, 1.2e-4, 1e-4, 3e-4]) ** 2
     edges = {
-        "flange_from_cam": Edge(FLANGE_FROM_CAM, covariance),
-        "base_from_target": Edge(RigidTransform.from_matrix(base_from_target), 4 * covariance),
+        "flange_from_cam": Edge(FLANGE_FROM_CAM.as_matrix(), covariance),
+        "base_from_target": Edge(base_from_target, 4 * covariance),
     }
     solvers = {
         solver: SolverResult(
-            {
-                edge: it.transform * RigidTransform.from_exp_coords(rng.normal(0, size, 6))
-                for edge, it in edges.items()
-            },
+            {edge: it.matrix @ exp(rng.normal(0, size, 6)) for edge, it in edges.items()},
             500 * size,
             20 * size,
         )
-        for solver, size in (("joint", 1e-9), ("park", 4e-4), ("tsai", 2e-3))
+        for solver, size in (("joint", 0.0), ("park", 4e-4), ("tsai", 2e-3))
     }
     views = tuple(_view(it, rng) for it in evidence)
     px = 0.23 if images else None

@@ -2,6 +2,7 @@
 
 import base64
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,15 +10,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from samples import REJECTED, Sample, made_up
+from samples import CAMERA, REJECTED, Sample, made_up
 
-from visioncal.calibration import Rms, Verdict, VerdictStatus
+from visioncal.calibration import Calibration, CameraResult, Rms, Verdict, VerdictStatus
 from visioncal.errors import DataError
+from visioncal.outputs import write_outputs
+from visioncal.pipeline import Run
+from visioncal.recording import write_recording
 from visioncal.report import write_report
+from visioncal.report.advice import listed, next_steps, suspects
 from visioncal.report.numbers import matched, significant
 from visioncal.report.page import render
 from visioncal.report.thumbnails import thumbnail
+from visioncal.report.trends import twist_of
+from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
+from visioncal.stored import load_stored
 
 
 class Page(HTMLParser):
@@ -97,12 +105,182 @@ def test_verdict_is_told_by_word_and_colour(
     assert word in Page(html).words
 
 
-def test_every_view_has_a_row(sample: Sample, html: str) -> None:
+def test_every_view_has_a_row_and_every_reason_too(sample: Sample, html: str) -> None:
     rows = [" ".join(row.split()) for row in Page(html).rows]
     for view in sample.calibration.views:
-        start = f"{view.view} {'yes' if view.used else 'no'} "
-        (row,) = [row for row in rows if row.startswith(start)]
-        assert view.reason in row
+        end = "yes" if view.used else "no"
+        assert sum(row.startswith(f"{view.view} ") and row.endswith(f" {end}") for row in rows) == 1
+        if not view.used:
+            assert f"view {view.view} not used {view.reason}" in rows
+
+
+def with_outliers(sample: Sample, status: VerdictStatus) -> Calibration:
+    """The sample's calibration with two used views far from the others."""
+    views = tuple(
+        replace(view, residual_mm=9.5) if view.view in (1, 4) else view
+        for view in sample.calibration.views
+    )
+    reason = (
+        "Views disagree by 2.6 mm (doubt begins at 2), rms. Possible causes: a board that moved.",
+        "Its z is weakly determined. Add views tilted by 20 degrees.",
+        "Its y is weakly determined. Add views tilted by 20 degrees.",
+    )
+    return replace(sample.calibration, views=views, verdict=Verdict(status, reason))
+
+
+def test_wrong_views_are_named_and_marked(sample: Sample) -> None:
+    html = render(with_outliers(sample, "bad"), sample.session, sample.evidence)
+    words, rows = Page(html).words, [" ".join(row.split()) for row in Page(html).rows]
+    steps = words[words.index("What to do next") : words.index("camera position, sigma")]
+    assert "Look at views 1 and 4:" in steps
+    assert steps.count("Add views tilted by 20 degrees.") == 1
+    for view in (1, 4):
+        assert any(row.startswith(f"view {view} used off by 9.5 mm") for row in rows)
+        assert any(row.startswith(f"{view} ") and row.endswith(" look") for row in rows)
+
+
+def test_good_results_have_no_doubtful_views_and_say_what_they_are_for(sample: Sample) -> None:
+    words = Page(render(with_outliers(sample, "good"), None, ())).words
+    assert "to look at" not in words
+    assert "Use flange_from_cam as it stands" in words
+
+
+def test_advice_without_outliers_points_at_what_views_share(sample: Sample) -> None:
+    calibration = replace(sample.calibration, verdict=with_outliers(sample, "check").verdict)
+    steps = next_steps(calibration, suspects(calibration))
+    assert steps[0] == (
+        "No view stands out, so look for what all of them share: a board that moved."
+    )
+    assert steps[1:] == ("Add views tilted by 20 degrees.",)
+
+
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [
+        ([3], "view 3"),
+        ([3, 6], "views 3 and 6"),
+        ([3, 6, 9], "views 3, 6 and 9"),
+    ],
+)
+def test_views_in_a_sentence(views: list[int], words: str) -> None:
+    assert listed(views) == words
+
+
+def test_views_that_share_a_reason_share_a_row(sample: Sample) -> None:
+    views = tuple(
+        replace(view, used=False, reason="blurred") if view.view in (0, 2, 5) else view
+        for view in sample.calibration.views
+    )
+    page = Page(render(replace(sample.calibration, views=views), None, ()))
+    assert "views 0, 2 and 5 not used blurred" in [" ".join(row.split()) for row in page.rows]
+    assert "Views not used" in page.words
+
+
+def test_joint_angles_get_a_plot_where_there_are_any(sample: Sample, html: str) -> None:
+    assert "q6 [deg]" in Page(html).text
+    views = tuple(
+        replace(view, numbers={name: it for name, it in view.numbers.items() if name[0] != "q"})
+        for view in sample.session.views
+    )
+    without = render(sample.calibration, replace(sample.session, views=views), sample.evidence)
+    assert "Residuals over joint angles" not in Page(without).words
+
+
+def test_an_error_of_one_joint_is_a_slope_in_its_column(sample: Sample) -> None:
+    # The joint's offset turns the arm's tip about the joint: the residual grows with the offset.
+    offset_rad = np.deg2rad(0.5)
+    q = np.array([view.joints_rad for view in sample.session.views])
+    wrong = load_robot("ur10e").base_from_flange(q + offset_rad * np.eye(6)[3])
+    residuals = [
+        twist_of(sample.calibration, replace(it, base_from_flange=pose))
+        for it, pose in zip(sample.evidence, wrong, strict=True)
+        if it.cam_from_target is not None
+    ]
+    # Without the error, rounding alone is left.
+    exact = [twist_of(sample.calibration, it) for it in sample.evidence if it.corners is not None]
+    np.testing.assert_allclose(exact, 0.0, atol=1e-9)
+    # Every residual turns by the joint's error, whatever the pose.
+    turned_rad = np.linalg.norm(np.array(residuals)[:, :3], axis=1)
+    np.testing.assert_allclose(turned_rad, offset_rad, rtol=1e-6)
+
+
+def test_the_lens_and_its_origin_are_told(sample: Sample, html: str) -> None:
+    words = Page(html).words
+    assert "Lens, estimated from this session" in words
+    assert f"fx 520.00 {chr(177)} 0.40 px" in words
+    given = CameraResult(CAMERA, estimated=False)
+    again = Page(render(replace(sample.calibration, camera=given), None, ())).words
+    assert "Lens, as given by the session" in again
+
+
+def test_the_solver_that_gave_the_result_is_named(sample: Sample, html: str) -> None:
+    assert "joint (result)" in Page(html).words
+    park = sample.calibration.solvers["park"].matrices
+    edges = {
+        name: replace(edge, matrix=park[name]) for name, edge in sample.calibration.edges.items()
+    }
+    words = Page(render(replace(sample.calibration, edges=edges), None, ())).words
+    assert "park (result)" in words
+    assert "solver park a closed form" in words
+
+
+def test_many_views_stand_in_three_columns() -> None:
+    many = made_up(40, images=False)
+    html = render(many.calibration, many.session, many.evidence)
+    table = html[html.index("All views") :]
+    assert table.count("<table>") == 3
+
+
+def test_a_note_is_shown_where_something_is_missing(sample: Sample, html: str) -> None:
+    assert 'class="note"' not in html
+    assert "Nothing <here>." in Page(render(sample.calibration, None, (), "Nothing <here>.")).words
+
+
+@pytest.fixture(scope="module")
+def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a calibration writes."""
+    folder = tmp_path_factory.mktemp("out put")
+    write_outputs(folder, sample.session, Run(sample.calibration, sample.evidence))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "calibration.json", "recording.rrd"])
+def test_report_made_again_is_the_same(outputs: Path, tmp_path: Path, name: str) -> None:
+    stored = load_stored(outputs / name)
+    write_report(
+        tmp_path / "again.html", stored.calibration, stored.session, stored.evidence, stored.note
+    )
+    assert (tmp_path / "again.html").read_bytes() == (outputs / "report.html").read_bytes()
+
+
+def test_report_without_its_recording_says_so(outputs: Path, tmp_path: Path) -> None:
+    shutil.copy(outputs / "calibration.json", tmp_path)
+    stored = load_stored(tmp_path)
+    assert "no recording.rrd" in stored.note
+    (tmp_path / "recording.rrd").write_bytes(b"damaged")
+    assert str(tmp_path / "recording.rrd") in load_stored(tmp_path).note
+    page = Page(render(stored.calibration, stored.session, stored.evidence, stored.note))
+    assert stored.note in page.words
+    assert "position [mm]" in page.text
+    assert "Pictures" not in page.words.replace(stored.note, "")
+
+
+def test_recording_of_another_result_is_not_mixed_in(
+    sample: Sample, outputs: Path, tmp_path: Path
+) -> None:
+    shutil.copy(outputs / "recording.rrd", tmp_path)
+    replace(sample.calibration, created="2026-11-21T00:00:00+00:00").save(
+        tmp_path / "calibration.json"
+    )
+    stored = load_stored(tmp_path)
+    assert "holds another one" in stored.note
+    assert stored.session is None
+
+
+def test_session_alone_has_no_report(sample: Sample, tmp_path: Path) -> None:
+    write_recording(tmp_path / "session.rrd", sample.session, None, (), None)
+    with pytest.raises(DataError, match="without a result"):
+        load_stored(tmp_path / "session.rrd")
 
 
 def test_names_and_reasons_are_text(sample: Sample, html: str) -> None:
@@ -151,7 +329,7 @@ def test_pictures_show_the_best_the_worst_and_the_rejected(sample: Sample, html:
 def test_figures_are_those_of_the_calibration(sample: Sample, html: str) -> None:
     words = Page(html).words
     edge = sample.calibration.edges["flange_from_cam"]
-    for value in edge.transform.as_matrix().ravel():
+    for value in edge.matrix.ravel():
         assert f"{value:.9f}" in words
     assert sample.calibration.session_sha256 in words
     assert f"{edge.sigma_mm:.2f} mm" in words
@@ -160,7 +338,7 @@ def test_figures_are_those_of_the_calibration(sample: Sample, html: str) -> None
 def test_pose_pairs_leave_out_what_does_not_apply() -> None:
     sample = made_up(images=False)
     page = Page(render(sample.calibration, sample.session, sample.evidence))
-    for absent in ("camera matrix", "reprojection", "image x [px]", "Pictures", "data:image"):
+    for absent in ("Lens", "reprojection", "image x [px]", "Pictures", "data:image"):
         assert absent not in page.text
     assert "position [mm]" in page.text
 

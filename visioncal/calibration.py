@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -25,12 +25,17 @@ class Edge:
     """An edge of the tree of frames that was estimated.
 
     Attributes:
-        transform: The edge, named `a_from_b` by its owner.
+        matrix: (4, 4) the edge, named `a_from_b` by its owner, exactly as it stands on disk.
         covariance: (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
     """
 
-    transform: RigidTransform
+    matrix: FloatArray
     covariance: FloatArray
+
+    @property
+    def transform(self) -> RigidTransform:
+        """The edge as a transform; scipy makes it orthonormal anew, to the last digit."""
+        return RigidTransform.from_matrix(self.matrix)
 
     @property
     def sigma_mm(self) -> float:
@@ -48,14 +53,19 @@ class SolverResult:
     """What one solver made of the used views.
 
     Attributes:
-        transforms: Both edges by name.
+        matrices: (4, 4) both edges by name.
         rms_mm: Scatter of the target's position over the used views [mm].
         rms_deg: Scatter of the target's orientation over the used views [deg].
     """
 
-    transforms: Mapping[str, RigidTransform]
+    matrices: Mapping[str, FloatArray]
     rms_mm: float
     rms_deg: float
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """Both edges by name."""
+        return {name: RigidTransform.from_matrix(it) for name, it in self.matrices.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +218,9 @@ class Calibration:
 
     def save(self, path: Path | str) -> None:
         """Writes calibration.json, whole or not at all."""
-        write_atomically(Path(path), json.dumps(to_document(self), indent=2) + "\n")
+        write_atomically(
+            Path(path), json.dumps(to_document(self), indent=2, allow_nan=False) + "\n"
+        )
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -219,13 +231,26 @@ class Calibration:
         """
         file = Path(path)
         file = file / "calibration.json" if file.is_dir() else file
+        return cls.from_json(read_bytes(file), str(file))
+
+    @classmethod
+    def from_json(cls, text: bytes | str, label: str) -> Self:
+        """Reads the content of a calibration.json.
+
+        Args:
+            text: The content.
+            label: What it came from, for messages.
+
+        Raises:
+            DataError: It is not a calibration of a known schema.
+        """
         try:
-            return cls(**_fields_from_document(json.loads(read_bytes(file))))
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise DataError(f"{file}: not JSON: {error}.") from error
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            return cls(**_fields_from_document(json.loads(text)))
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise DataError(f"{label}: not JSON: {error}.") from error
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
-                f"{file}: not a calibration that this version can read: {error!r}.",
+                f"{label}: not a calibration that this version can read: {error!r}.",
                 next_step="Calibrate the session again.",
             ) from error
 
@@ -267,16 +292,17 @@ def _present(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _pose_document(transform: RigidTransform) -> dict[str, Any]:
+def _pose_document(matrix: FloatArray) -> dict[str, Any]:
+    transform = RigidTransform.from_matrix(matrix)
     return {
-        "matrix": transform.as_matrix().tolist(),
+        "matrix": matrix.tolist(),
         "quaternion_xyzw": transform.rotation.as_quat().tolist(),
-        "translation_m": transform.translation.tolist(),
+        "translation_m": matrix[:3, 3].tolist(),
     }
 
 
 def _edge_document(edge: Edge) -> dict[str, Any]:
-    return _pose_document(edge.transform) | {
+    return _pose_document(edge.matrix) | {
         "covariance": edge.covariance.tolist(),
         "sigma_mm": edge.sigma_mm,
         "sigma_deg": edge.sigma_deg,
@@ -284,7 +310,7 @@ def _edge_document(edge: Edge) -> dict[str, Any]:
 
 
 def _solver_document(result: SolverResult) -> dict[str, Any]:
-    poses = {name: _pose_document(pose) for name, pose in result.transforms.items()}
+    poses = {name: _pose_document(pose) for name, pose in result.matrices.items()}
     return poses | {"rms_mm": result.rms_mm, "rms_deg": result.rms_deg}
 
 
@@ -321,6 +347,10 @@ _OWN_KEYS = frozenset(
 def _fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     if document["schema"] != SCHEMA:
         raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
+    if document["mount"] not in get_args(Mount):
+        raise ValueError(f"mount is {document['mount']!r}")
+    if document["verdict"]["status"] not in get_args(VerdictStatus):
+        raise ValueError(f"verdict.status is {document['verdict']['status']!r}")
     camera = document.get("camera")
     robot = document.get("robot")
     verdict = document["verdict"]
@@ -330,10 +360,10 @@ def _fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "created": document["created"],
         "mount": document["mount"],
         "edges": {
-            name: Edge(_pose(edge), np.asarray(edge["covariance"], dtype=float))
+            name: Edge(_pose(edge), _array(edge, "covariance", (6, 6)))
             for name, edge in document["transforms"].items()
         },
-        "joint_covariance": np.asarray(document["joint_covariance"]["matrix"], dtype=float),
+        "joint_covariance": _array(document["joint_covariance"], "matrix", (-1, -1)),
         "solvers": {name: _solver(it) for name, it in document["solvers"].items()},
         "noise": dict(document["noise"]),
         "views": tuple(ViewResult(**view) for view in document["views"]),
@@ -346,12 +376,23 @@ def _fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _pose(document: Mapping[str, Any]) -> RigidTransform:
-    matrix = np.asarray(document["matrix"], dtype=float)
+def _pose(document: Mapping[str, Any]) -> FloatArray:
+    matrix = _array(document, "matrix", (4, 4))
     rotation = matrix[:3, :3]
-    if matrix.shape != (4, 4) or not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9):
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
         raise ValueError("a matrix is not a rigid transform")
-    return RigidTransform.from_matrix(matrix)
+    return matrix
+
+
+def _array(document: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray:
+    """Reads an array of finite numbers; a dimension of -1 is any, but the same throughout."""
+    array = np.asarray(document[key], dtype=float)
+    size = array.shape[0] if array.ndim else 0
+    if array.shape != tuple(size if it < 0 else it for it in shape):
+        raise ValueError(f"{key} has the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{key} has entries that are no finite numbers")
+    return array
 
 
 def _solver(document: Mapping[str, Any]) -> SolverResult:
@@ -361,16 +402,15 @@ def _solver(document: Mapping[str, Any]) -> SolverResult:
 
 def _camera(document: Mapping[str, Any]) -> CameraResult:
     width, height = document["resolution"]
-    covariance = document.get("covariance")
     return CameraResult(
         Camera(
             document["model"],
             (int(width), int(height)),
-            np.asarray(document["matrix"], dtype=float),
-            np.asarray(document["distortion"], dtype=float),
+            _array(document, "matrix", (4,)),
+            _array(document, "distortion", (-1,)),
         ),
         document["estimated"],
-        None if covariance is None else np.asarray(covariance, dtype=float),
+        _array(document, "covariance", (-1, -1)) if "covariance" in document else None,
     )
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.errors import DataError
 from visioncal.types import Camera, FloatArray
 
 # Newton on a smooth distortion map doubles its digits each step; more steps mean that the
@@ -96,10 +95,7 @@ def normalise(camera: Camera, px: FloatArray) -> FloatArray:
         px: (n, 2) pixels.
 
     Returns:
-        (n, 2) coordinates x / z and y / z of the rays.
-
-    Raises:
-        DataError: A pixel lies where this distortion cannot be inverted.
+        (n, 2) coordinates x / z and y / z of the rays; NaN where the distortion cannot be inverted.
     """
     goal = (px - camera.matrix[2:]) / camera.matrix[:2]
     plane = _undistorted_fisheye(goal, camera) if camera.model == "fisheye" else goal.copy()
@@ -116,13 +112,7 @@ def normalise(camera: Camera, px: FloatArray) -> FloatArray:
     # Beyond the fold the map has other branches: turned over, or mirrored through the centre.
     own_branch = (np.linalg.det(by_plane) > 0) & (np.sum(plane * goal, axis=1) >= 0)
     settled = own_branch & np.all(np.abs(goal - distorted) < 1e-9, axis=1)
-    if np.all(settled):
-        return plane
-    culprit = px[np.argmin(settled)]
-    raise DataError(
-        f"camera: the distortion cannot be inverted at pixel ({culprit[0]:.1f}, {culprit[1]:.1f}).",
-        next_step="Check the distortion coefficients: their number, order and model.",
-    )
+    return np.where(settled[:, None], plane, np.nan)
 
 
 def _undistorted_fisheye(goal: FloatArray, camera: Camera) -> FloatArray:

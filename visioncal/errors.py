@@ -1,6 +1,7 @@
 """The errors of visioncal: one class for each way in which a caller can react."""
 
 from collections.abc import Sequence
+from typing import Self
 
 
 class VisioncalError(Exception):
@@ -17,6 +18,11 @@ class VisioncalError(Exception):
         self.message = message
         self.culprits = tuple(culprits)
         self.next_step = next_step
+
+    def with_culprits(self, more: Sequence[str]) -> Self:
+        """Returns the same error with more places to look at."""
+        culprits = (*self.culprits, *more)
+        return type(self)(self.message, culprits=culprits, next_step=self.next_step)
 
     def __str__(self) -> str:
         return f"{self.message} {self.next_step}".strip()

@@ -7,7 +7,11 @@ import typer
 
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.console import report_error
+from visioncal.cli.convert import convert_command
 from visioncal.cli.demo import demo_command
+from visioncal.cli.diff import diff_command
+from visioncal.cli.report import report_command
+from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
 from visioncal.errors import VisioncalError
 from visioncal.version import __version__
@@ -25,6 +29,10 @@ app = typer.Typer(
 )
 app.command("demo")(demo_command)
 app.command("calibrate")(calibrate_command)
+app.command("report")(report_command)
+app.command("diff")(diff_command)
+app.command("convert")(convert_command)
+app.command("review")(review_command)
 app.command("simulate")(simulate_command)
 
 

@@ -1,4 +1,4 @@
-"""The corners of all views in one stack, and the normal equations of their reprojection.
+"""The corners of all views in one stack, and their reprojection with its derivatives.
 
 The model: px = camera(cam_from_target * p_target) + noise. All views are worked on at once; sums
 over a view's corners are segments of the stack.
@@ -21,6 +21,7 @@ class CornerStack:
 
     Attributes:
         views: (v,) view numbers.
+        blurs: (v,) width of each view's edges, as a sigma [px].
         starts: (v,) where each view's corners begin.
         view_of: (n,) index of each corner's view.
         ids: (n,) each corner's number on the target.
@@ -29,6 +30,7 @@ class CornerStack:
     """
 
     views: tuple[int, ...]
+    blurs: tuple[float, ...]
     starts: IntArray
     view_of: IntArray
     ids: IntArray
@@ -41,6 +43,7 @@ class CornerStack:
         counts = [len(it.ids) for it in corners.values()]
         return cls(
             tuple(corners),
+            tuple(it.blur_px for it in corners.values()),
             np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
             np.repeat(np.arange(len(counts)), counts),
             np.concatenate([it.ids for it in corners.values()]),
@@ -53,6 +56,7 @@ class CornerStack:
         kept_views, view_of = np.unique(self.view_of[mask], return_inverse=True)
         return CornerStack(
             tuple(self.views[at] for at in kept_views),
+            tuple(self.blurs[at] for at in kept_views),
             np.searchsorted(view_of, np.arange(len(kept_views))),
             view_of,
             self.ids[mask],
@@ -72,7 +76,7 @@ class CornerStack:
 
 @dataclass(frozen=True, eq=False)
 class Reprojection:
-    """Reprojection of a stack, and its normal equations where they were asked for.
+    """Reprojection of a stack.
 
     Attributes:
         residuals: (n, 2) predicted minus seen [px].

@@ -1,12 +1,13 @@
 """What the motion can tell about the two unknown edges, and what it leaves open, in words."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
-from visioncal.estimator.closure import Closure, Noise, closure_information
+from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimator.linalg import Spectrum, covariance, spectrum
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, Mount
@@ -17,7 +18,7 @@ _NULL_RATIO = 1e-8
 SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
-_FEWEST_VIEWS = 3
+FEWEST_VIEWS = 3
 # A null direction moves a part of an edge if it moves it by this much, of a length of one.
 _PART_OF_NULL = 0.05
 
@@ -52,107 +53,90 @@ def edge_names(mount: Mount) -> tuple[str, str]:
     return "base_from_cam", "flange_from_target"
 
 
-def check_observability(
-    data: Closure,
-    x: FloatArray,
-    z: FloatArray,
-    noise: Noise,
-    mount: Mount,
-    common: FloatArray | None = None,
-) -> tuple[Direction, ...]:
+def check_observability(data: Closure, edges: Edges, noise: Noise) -> tuple[Direction, ...]:
     """Refuses motion that leaves a direction open; otherwise tells the worst ones.
+
+    Views that disagree wildly are no fault of the motion: poses in other units, of other images or
+    through a wrong lens leave residuals that no motion could average out. The motion is judged by a
+    noise of at most the limits themselves; what is beyond is the verdict's business.
 
     Args:
         data: The used views.
-        x: (4, 4) first edge.
-        z: (4, 4) second edge.
+        edges: The answer.
         noise: Of the residuals.
-        mount: Which tree it is.
-        common: (12, 12) covariance that errors common to all views add.
 
     Returns:
-        The worst direction of each edge, in translation and in rotation.
+        The worst direction of each edge: x's offset and rotation, then z's.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    if len(data) < _FEWEST_VIEWS:
-        raise _too_few(data, mount)
-    spread = spectrum(closure_information(data, x, z, noise))
+    if len(data) < FEWEST_VIEWS:
+        raise _too_few(data)
+    held, still = replace(data, lens=None), replace(edges, lens=np.zeros(0))
+    spread = spectrum(closure_information(held, still, noise))
     if spread.ratio < _NULL_RATIO:
-        culprit = _null_direction(spread, x, z, mount)
+        culprit = _null_direction(spread, edges, data.mount)
         verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
             f"hand-eye: {culprit} {verb} not determined at all (information ratio "
-            f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data, mount)}.",
+            f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data)}.",
             culprits=[culprit],
-            next_step=_advice(mount),
+            next_step=_advice(data.mount),
         )
-    blamed = _worst_directions(data, x, z, _plausible(noise), mount, common)
-    beyond = [it for it in blamed if it.sigma > it.limit]
+    plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
+    _refuse(worst_directions(held, still, plausible), _motion(data), _advice(data.mount))
+    _refuse(
+        worst_directions(data, edges, plausible),
+        "the views do not determine the lens well enough",
+        "Give matrix and distortion in [camera], or add views tilted by 30 to 45 degrees.",
+    )
+    return worst_directions(data, edges, noise)
+
+
+def _refuse(worst: Sequence[Direction], cause: str, next_step: str) -> None:
+    beyond = [it for it in worst if it.sigma > it.limit]
     if beyond:
         raise DegenerateError(
-            f"hand-eye: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
-            f"{_motion(data, mount)}.",
+            f"hand-eye: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: {cause}.",
             culprits=[it.words for it in beyond],
-            next_step=_advice(mount),
+            next_step=next_step,
         )
-    return _worst_directions(data, x, z, noise, mount, common)
 
 
-def _plausible(noise: Noise) -> Noise:
-    """The noise that a motion is judged by: views that disagree wildly are no fault of it.
-
-    Poses in other units, of other images or through a wrong lens leave residuals that no motion
-    could average out; they get an answer, and a verdict that says so.
-    """
-    return Noise(
-        min(noise.sigma_rad, SIGMA_LIMIT_RAD),
-        min(noise.sigma_m, SIGMA_LIMIT_M),
-    )
-
-
-def _worst_directions(
-    data: Closure,
-    x: FloatArray,
-    z: FloatArray,
-    noise: Noise,
-    mount: Mount,
-    common: FloatArray | None,
-) -> tuple[Direction, ...]:
+def worst_directions(data: Closure, edges: Edges, noise: Noise) -> tuple[Direction, ...]:
     """The worst direction of each edge, first x's and then z's, offset before rotation."""
-    spread = covariance(closure_information(data, x, z, noise))
-    spread = spread + (0.0 if common is None else common)
+    spread = covariance(closure_information(data, edges, noise))
     found = []
-    for edge, transform in enumerate((x, z)):
+    for edge, transform in enumerate((edges.x, edges.z)):
         for is_rotation in (False, True):
             start = 6 * edge + (0 if is_rotation else 3)
             block = spread[start : start + 3, start : start + 3]
             values, vectors = np.linalg.eigh(block)
             limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
-            words = _words(edge, transform[:3, :3] @ vectors[:, -1], mount, is_rotation)
+            words = _words(edge, transform[:3, :3] @ vectors[:, -1], data.mount, is_rotation)
             found.append(Direction(words, float(np.sqrt(values[-1])), float(limit), is_rotation))
     return tuple(found)
 
 
-def _too_few(data: Closure, mount: Mount) -> DegenerateError:
-    culprit = f"the camera's offset from the {_frame(mount)}"
+def _too_few(data: Closure) -> DegenerateError:
+    culprit = f"the camera's offset from the {_frame(data.mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
     if len(data) == 2:
-        culprit += f" along the {_frame(mount)}'s {_axis(_main_axis(_turns(data)))}"
+        culprit += f" along the {_frame(data.mount)}'s {_axis(_main_axis(_turns(data)))}"
         cause = f"two views share that axis of rotation, and {cause}"
     return DegenerateError(
-        f"hand-eye: {len(data)} usable views, at least {_FEWEST_VIEWS} are needed; {culprit} is "
+        f"hand-eye: {len(data)} usable views, at least {FEWEST_VIEWS} are needed; {culprit} is "
         f"not determined: {cause}.",
         culprits=[culprit],
-        next_step=_advice(mount),
+        next_step=_advice(data.mount),
     )
 
 
-def _null_direction(spread: Spectrum, x: FloatArray, z: FloatArray, mount: Mount) -> str:
+def _null_direction(spread: Spectrum, edges: Edges, mount: Mount) -> str:
     """Names what the null directions leave open: of the camera's edge, or else the target's."""
     null = spread.vectors[:, spread.values < _NULL_RATIO * spread.values[-1]]
-    for edge, transform in enumerate((x, z)):
+    for edge, transform in enumerate((edges.x, edges.z)):
         rotation, translation = (
             transform[:3, :3] @ null[6 * edge + at : 6 * edge + at + 3] for at in (0, 3)
         )
@@ -217,12 +201,12 @@ def _main_axis(turns: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(turns, full_matrices=False)[2][0])
 
 
-def _motion(data: Closure, mount: Mount) -> str:
+def _motion(data: Closure) -> str:
     """Says what is wrong with the motion."""
     turns, count = _turns(data), len(data)
     largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
     # The flange's own positions: the robot's part is inverted where the camera stands still.
-    flange = data.robot if mount == "eye-in-hand" else invert(data.robot)
+    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
     spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
     if largest < 0.5 and spread_mm < 1.0:
         return f"the {count} used views are all from one pose of the robot"
@@ -235,7 +219,7 @@ def _motion(data: Closure, mount: Mount) -> str:
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
     if aside < 0.1 * largest:
         return (
-            f"all {count} used views turn about the {_frame(mount)}'s {_axis(main)} to within "
+            f"all {count} used views turn about the {_frame(data.mount)}'s {_axis(main)} to within "
             f"{max(aside, 0.01):.2g} deg"
         )
     return (

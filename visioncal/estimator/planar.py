@@ -1,37 +1,80 @@
 """First guesses of a planar target's pose: both of the two that look almost alike."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from visioncal.camera import normalise
 from visioncal.estimator.corners import CornerStack
-from visioncal.types import Camera, FloatArray
+from visioncal.types import Camera, FloatArray, Mask
+
+# A homography takes four points. Nearer to a line than this share of the target is on it.
+_FEWEST, _ON_LINE = 4, 1e-6
 
 
-def planar_poses(stack: CornerStack, camera: Camera) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True, eq=False)
+class PlanarPoses:
+    """Guesses for v views.
+
+    Attributes:
+        first: (v, 4, 4) the better `cam_from_target`.
+        second: (v, 4, 4) the other; equal where there is one.
+        solved: (v,) whether there is any; the poses of the others mean nothing.
+    """
+
+    first: FloatArray
+    second: FloatArray
+    solved: Mask
+
+
+def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
     """Solves each view's pose in closed form (Collins and Bartoli 2014, IPPE; OpenCV).
 
     Args:
-        stack: The corners of v views; at least 4 a view, not on one line.
+        stack: The corners of v views.
         camera: The intrinsics.
 
     Returns:
-        (v, 4, 4) the better and (v, 4, 4) the other `cam_from_target`; equal where there is one.
+        Both solutions. There is none where the lens cannot be inverted at the corners, or where
+        they do not determine a pose.
     """
     plane = normalise(camera, stack.px)
-    first, second = [], []
-    for start, count in zip(stack.starts, stack.counts, strict=True):
+    poses = np.tile(np.eye(4), (2, len(stack.views), 1, 1))
+    solved = np.zeros(len(stack.views), dtype=bool)
+    for at, (start, count) in enumerate(zip(stack.starts, stack.counts, strict=True)):
         rows = slice(start, start + count)
+        usable = np.isfinite(plane[rows]).all(axis=1)
+        points = stack.points[rows][usable]
+        if not determines_pose(points):
+            continue
         _, rotations, translations, _ = cv2.solvePnPGeneric(
-            stack.points[rows], plane[rows], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            points, plane[rows][usable], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
         )
-        poses = [
+        found = [
             _pose(np.asarray(rotation, float), np.asarray(translation, float))
             for rotation, translation in zip(rotations, translations, strict=True)
         ]
-        first.append(poses[0])
-        second.append(poses[-1])
-    return np.array(first), np.array(second)
+        if found and np.isfinite(found).all():
+            solved[at] = True
+            poses[0, at], poses[1, at] = found[0], found[-1]
+    return PlanarPoses(poses[0], poses[1], solved)
+
+
+def determines_pose(points: FloatArray) -> bool:
+    """Whether (n, 3) points of a plane determine its pose: at least two lie off every line.
+
+    A line that all but one lie on passes through two of any three: three lines are enough to try.
+    """
+    if len(points) < _FEWEST:
+        return False
+    a, b, c = points[:3]
+    span = float(np.ptp(points, axis=0).max())
+    for start, end in ((a, b), (a, c), (b, c)):
+        away = np.linalg.norm(np.cross(points - start, end - start), axis=1)
+        if np.sum(away > _ON_LINE * span * np.linalg.norm(end - start)) < 2:
+            return False
+    return True
 
 
 def _pose(rotation_vector: FloatArray, translation: FloatArray) -> FloatArray:

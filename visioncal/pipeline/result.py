@@ -5,18 +5,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from visioncal.calibration import Calibration, Edge, SolverResult, Validation
-from visioncal.errors import DataError
+from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult, Validation
+from visioncal.errors import DataError, VisioncalError
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES, rms_of
-from visioncal.pipeline.views import holdout_rms, view_evidence, view_results
+from visioncal.pipeline.known import Known, rms_of
+from visioncal.pipeline.steps import STAGES
+from visioncal.pipeline.views import holdout_rms, used_rms, view_evidence, view_results
 from visioncal.session import Session
 from visioncal.stages.handeye import SOLVER_NAMES
-from visioncal.types import FloatArray, Progress, SolverName
+from visioncal.stages.validate import changed_lens
+from visioncal.types import Progress, SolverName
 
 _LEVELS = ("auto", "hand-eye")
 
@@ -77,14 +77,18 @@ def run(
     for at, stage in enumerate(STAGES):
         if progress is not None:
             progress(stage.name, at, len(STAGES))
-        known = stage.run(known)
+        try:
+            known = stage.run(known)
+        except VisioncalError as error:
+            # Views that are out of the game are often why the rest does not suffice.
+            raise error.with_culprits(known.lost_views) from error
     return Run(_calibration(known), view_evidence(known))
 
 
 def _calibration(known: Known) -> Calibration:
-    held, rms, verdict = known.held_out, known.rms, known.verdict
-    if held is None or rms is None or verdict is None:
-        raise DataError("pipeline: a stage is missing.")
+    held, verdict = known.held_out, known.verdict
+    if held is None or verdict is None:
+        raise RuntimeError("a stage is missing")
     session, result = known.session, known.solved
     x_name, z_name = edge_names(session.mount)
     spread = result.covariance
@@ -94,13 +98,13 @@ def _calibration(known: Known) -> Calibration:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         mount=session.mount,
         edges={
-            x_name: Edge(_transform(result.x), spread[:6, :6]),
-            z_name: Edge(_transform(result.z), spread[6:, 6:]),
+            x_name: Edge(result.edges.x, spread[:6, :6]),
+            z_name: Edge(result.edges.z, spread[6:12, 6:12]),
         },
-        joint_covariance=spread,
+        joint_covariance=spread[:12, :12],
         solvers={
             name: SolverResult(
-                {x_name: _transform(it.x), z_name: _transform(it.z)},
+                {x_name: it.x, z_name: it.z},
                 1e3 * it.rms_m,
                 float(np.rad2deg(it.rms_rad)),
             )
@@ -108,25 +112,35 @@ def _calibration(known: Known) -> Calibration:
         },
         noise=_noise(known),
         views=view_results(known),
-        rms=rms,
+        rms=used_rms(known),
         validation=Validation(
             held.method, rms_of(held.away_m, held.away_rad, held.rms_px), holdout_rms(known)
         ),
         verdict=verdict,
-        camera=known.camera,
+        camera=_camera(known),
         robot=known.robot,
     )
 
 
+def _camera(known: Known) -> CameraResult | None:
+    """The camera as the whole chain left it."""
+    result, camera = known.solved, known.camera
+    if camera is None or not len(result.edges.lens):
+        return camera
+    return CameraResult(
+        changed_lens(camera.camera, result.edges.lens),
+        estimated=True,
+        covariance=result.covariance[12:, 12:],
+    )
+
+
 def _noise(known: Known) -> dict[str, float]:
-    """Standard deviations per axis; sensor and robot are told apart only in the pixels."""
+    """Standard deviations per axis: of corners and flange, or of both as one without corners."""
     noise = known.solved.noise
+    separate = known.closure(known.used).camera_covariance is not None
+    of = "robot" if separate else "combined"
     pixel = {} if known.pixel_px is None else {"pixel_px": known.pixel_px}
     return pixel | {
-        "combined_translation_mm": 1e3 * noise.sigma_m,
-        "combined_rotation_deg": float(np.rad2deg(noise.sigma_rad)),
+        f"{of}_translation_mm": 1e3 * noise.sigma_m,
+        f"{of}_rotation_deg": float(np.rad2deg(noise.sigma_rad)),
     }
-
-
-def _transform(matrix: FloatArray) -> RigidTransform:
-    return RigidTransform.from_matrix(matrix)

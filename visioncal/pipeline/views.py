@@ -7,12 +7,11 @@ import numpy as np
 from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import distances
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import rms_of
-from visioncal.stages.validate import chain_rms_px, predict_corners
+from visioncal.pipeline.known import Known, rms_of
+from visioncal.stages.validate import chain_rms_px, changed_lens, predict_corners
 from visioncal.targets import corner_positions
-from visioncal.transforms import invert, mean_transform
-from visioncal.types import FloatArray
+from visioncal.transforms import mean_transform
+from visioncal.types import Corners, FloatArray
 
 _HELD_BACK = "held out of the fit by the session (role = holdout)"
 _NO_POSE = "no pose of the target: it has neither image nor cft_ columns"
@@ -38,6 +37,11 @@ def view_results(known: Known) -> tuple[ViewResult, ...]:
     return tuple(results)
 
 
+def used_rms(known: Known) -> Rms:
+    """Residuals of the used views."""
+    return rms_of(*_residuals(known, list(known.used)))
+
+
 def holdout_rms(known: Known) -> Rms | None:
     """Residuals of the views that the session held back; None where there are none."""
     views = [view for view in _measurable(known) if view in known.held_back]
@@ -57,11 +61,11 @@ def _measurable(known: Known) -> list[int]:
 
 def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Deviations (m,) [m], [rad] from the used views' mean, and through the chain [px]."""
-    result, data = known.solved, known.closure(views)
-    centre = mean_transform(known.closure(known.used).placed(result.x))
+    edges, data = known.solved.edges, known.closure(views)
+    centre = mean_transform(known.closure(known.used).through(edges.lens).placed(edges.x))
     camera = None if known.camera is None else known.camera.camera
-    rms_px = chain_rms_px(data, result.x, result.z, known.seen(views), camera)
-    return (*distances(data.placed(result.x), centre), rms_px)
+    rms_px = chain_rms_px(data, edges, known.seen(views), camera)
+    return (*distances(data.through(edges.lens).placed(edges.x), centre), rms_px)
 
 
 def _reason(known: Known, view: int) -> str:
@@ -78,22 +82,28 @@ def _corners(known: Known, view: int) -> int | None:
 
 
 def _evidence(known: Known, view: int) -> ViewEvidence:
-    poses, target, result = known.poses.get(view), known.session.target, known.solved
+    poses, target, edges = known.poses.get(view), known.session.target, known.solved.edges
     corners = known.corners.get(view) if poses is None else poses.corners
     base_from_flange = known.base_from_flange.get(view)
-    predicted = None
-    if corners is not None and target is not None and base_from_flange is not None:
-        robot = (
-            base_from_flange if known.session.mount == "eye-in-hand" else invert(base_from_flange)
-        )
-        cam_from_target = invert(robot @ result.x) @ result.z
-        if known.camera is not None:
-            positions = corner_positions(target)[corners.ids]
-            predicted = predict_corners(known.camera.camera, cam_from_target, positions)
+    predicted = cam_from_target = None
+    if poses is not None and base_from_flange is not None:
+        data = known.closure([view]).through(edges.lens)
+        cam_from_target = data.camera[0]
+        # Of several poses that were never chosen from, the corners' numbering is not known.
+        if corners is not None and target is not None and len(poses.cam_from_target) == 1:
+            predicted = _predicted(known, data.predicted_camera(edges.x, edges.z)[0], corners)
     return ViewEvidence(
         view=view,
         corners=corners,
         predicted_px=predicted,
         base_from_flange=base_from_flange,
-        cam_from_target=None if poses is None else poses.cam_from_target[0],
+        cam_from_target=cam_from_target,
     )
+
+
+def _predicted(known: Known, cam_from_target: FloatArray, corners: Corners) -> FloatArray | None:
+    if known.camera is None or known.session.target is None:
+        return None
+    camera = changed_lens(known.camera.camera, known.solved.edges.lens)
+    positions = corner_positions(known.session.target)[corners.ids]
+    return predict_corners(camera, cam_from_target, positions)

@@ -1,9 +1,18 @@
 """Recordings: a session and its results in one `.rrd`, which the rerun viewer opens.
 
-The facts of the session lie in it without loss, beside what is drawn of them; see `codec`.
+The facts of the session lie in it without loss, beside what is drawn of them; see `codec`. What was
+changed or cut off after it was written is noticed; see `frames`.
 """
 
-from visioncal.recording.codec import read_session
-from visioncal.recording.writer import write_recording
+from visioncal.recording.reader import read_session
+from visioncal.recording.results import append_results, read_calibration, read_evidence
+from visioncal.recording.writer import RecordingWriter, write_recording
 
-__all__ = ["read_session", "write_recording"]
+__all__ = [
+    "RecordingWriter",
+    "append_results",
+    "read_calibration",
+    "read_evidence",
+    "read_session",
+    "write_recording",
+]

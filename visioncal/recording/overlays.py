@@ -8,12 +8,8 @@ import rerun as rr
 
 from visioncal.calibration import Calibration
 from visioncal.evidence import ViewEvidence, magnification
-from visioncal.recording import paths
+from visioncal.recording import colours, paths
 from visioncal.session import Session
-
-_DETECTED_RGB = (50, 220, 110)
-_PREDICTED_RGB = (80, 160, 255)
-_RESIDUAL_RGB = (255, 70, 60)
 
 # Rerun puts the image's corner, not the first pixel's centre, at the origin.
 _CENTRE = 0.5
@@ -59,25 +55,29 @@ class Overlay:
         corners, predicted = seen.corners, seen.predicted_px
         px = np.zeros((0, 2)) if corners is None else corners.px
         predicted_px = np.zeros((0, 2)) if predicted is None else predicted
+        frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
         # Empty batches take back what the view before has left.
         stream.log(
             paths.DETECTED,
-            rr.Points2D(px + _CENTRE, colors=_DETECTED_RGB, radii=_DOT * self.width),
+            frame,
+            rr.Points2D(px + _CENTRE, colors=colours.DETECTED, radii=_DOT * self.width),
         )
         stream.log(
             paths.PREDICTED,
+            frame,
             rr.Points2D(
-                predicted_px + _CENTRE, colors=_PREDICTED_RGB, radii=0.5 * _DOT * self.width
+                predicted_px + _CENTRE, colors=colours.PREDICTED, radii=0.5 * _DOT * self.width
             ),
         )
         paired = len(predicted_px) == len(px)
         vectors = predicted_px - px if paired else np.zeros((0, 2))
         stream.log(
             paths.magnified_residuals(self.factor),
+            frame,
             rr.Arrows2D(
                 vectors=self.factor * vectors,
                 origins=px + _CENTRE if paired else np.zeros((0, 2)),
-                colors=_RESIDUAL_RGB,
+                colors=colours.RESIDUAL,
                 radii=_LINE * self.width,
             ),
         )

@@ -1,6 +1,6 @@
-"""Where things are in a recording: the names of its entities and of its timeline.
+"""Where things are in a recording: the names of its entities, its frames and its timeline.
 
-Everything in 3D is logged in the robot's base frame, which is the root.
+The frames of the cell are rerun's named frames, all placed in the base frame.
 """
 
 TIMELINE = "view"
@@ -9,9 +9,14 @@ APPLICATION = "visioncal"
 # The facts of the session, to be read back.
 SESSION = "/session"
 ROWS = "/session/rows"
+END = "/session/end"
 IMAGE = "/camera/image"
 
-# Results, exact.
+# The frames of the cell.
+BASE_FRAME, FLANGE_FRAME, CAM_FRAME, TARGET_FRAME = "base", "flange", "cam", "target"
+IMAGE_FRAME = "image"
+
+# Results, exact; the calibration's text is written last and makes them count.
 CALIBRATION = "/results/calibration"
 EVIDENCE = "/results/evidence"
 
@@ -24,6 +29,11 @@ CAMERA = "/camera"
 TARGET = "/target"
 SEEN_TARGET = "/target_as_this_view_sees_it"
 
+# Charts over all views.
+IMAGE_COVERAGE = "/coverage/image"
+DIRECTIONS = "/coverage/directions"
+ROTATION_AXES = "/coverage/rotation_axes"
+
 # In the image.
 DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
@@ -34,11 +44,17 @@ POSITION_MM = f"{RESIDUALS}/position_mm"
 ORIENTATION_DEG = f"{RESIDUALS}/orientation_deg"
 REPROJECTION_PX = f"{RESIDUALS}/reprojection_px"
 VERDICT = "/notes/verdict"
+FIGURES = "/notes/figures"
 SOLVERS = "/notes/solvers"
 VIEW_NOTE = "/notes/view"
-USED, REJECTED = "used", "rejected"
+USED, REJECTED, THIS_VIEW = "used", "rejected", "this_view"
 
 
 def magnified_residuals(factor: int) -> str:
     """The entity of residuals that are drawn `factor` times longer than they are."""
     return f"{IMAGE}/residuals_magnified_{factor}x"
+
+
+def over_joint(joint: int) -> str:
+    """The entity of the residuals over the angle of a joint, which is counted from 0."""
+    return f"{RESIDUALS}/over_joints/q{joint + 1}"

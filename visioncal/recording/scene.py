@@ -9,19 +9,17 @@ import rerun as rr
 from visioncal.calibration import Calibration
 from visioncal.camera import matrix_3x3
 from visioncal.evidence import ViewEvidence
-from visioncal.recording import paths
+from visioncal.recording import board, colours, paths
+from visioncal.recording.arm import log_arm
+from visioncal.recording.charts import Charts
+from visioncal.recording.uncertainty import Uncertainty
 from visioncal.session import Session, View
-from visioncal.targets import corner_positions
-from visioncal.types import FloatArray, Target
-
-_ROBOT_RGB = (140, 150, 165)
-_TARGET_RGB = (240, 180, 40)
-_SEEN_RGB = (240, 90, 60)
-_USED_RGB = (70, 150, 250)
-_UNUSED_RGB = (230, 70, 60)
+from visioncal.types import Camera, FloatArray
 
 # Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
-_AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.007
+_AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
+# The views that are not the current one, drawn as small frusta or boards.
+_SMALL_FRUSTUM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +31,16 @@ class Scene:
         calibration: Its result, if there is one; without it only the flange is drawn.
         base_from_flange: (4, 4) by the view's number, where known.
         size_m: Typical distance of the flange from the base [m].
+        uncertainty: What is drawn of the result's uncertainty.
+        charts: The charts over all views.
     """
 
     session: Session
     calibration: Calibration | None
     base_from_flange: Mapping[int, FloatArray]
     size_m: float
+    uncertainty: Uncertainty | None
+    charts: Charts | None
 
     @classmethod
     def of(
@@ -57,82 +59,135 @@ class Scene:
             elif reported is not None:
                 poses[view.number] = reported.as_matrix()
         distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
-        return cls(session, calibration, poses, float(np.median(distances)) if distances else 1.0)
+        size_m = float(np.median(distances)) if distances else 1.0
+        if calibration is None:
+            return cls(session, None, poses, size_m, None, None)
+        return cls(
+            session,
+            calibration,
+            poses,
+            size_m,
+            Uncertainty.of(calibration, evidence, size_m),
+            Charts.of(session, calibration, evidence),
+        )
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Logs what does not change from view to view."""
-        axis_m = _AXIS * self.size_m
-        stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        stream.log(paths.BASE, rr.TransformAxes3D(2.0 * axis_m), static=True)
-        stream.log(paths.FLANGE, rr.TransformAxes3D(axis_m), static=True)
-        self._log_stops(stream)
+        # The edge to the cell keeps the base known in views that know no other frame.
+        stream.log(
+            paths.BASE,
+            rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME),
+            static=True,
+        )
+        for entity in ("links", "joints", "reach"):
+            frame = rr.CoordinateFrame(paths.BASE_FRAME)
+            stream.log(f"{paths.ROBOT}/{entity}", frame, static=True)
+        self._log_axes(stream, paths.BASE, paths.BASE_FRAME, 2.0)
+        self._log_axes(stream, paths.FLANGE, paths.FLANGE_FRAME, 1.0)
         if self.calibration is None:
+            self._log_stops(stream)
             return
-        stream.log(paths.CAMERA, rr.TransformAxes3D(axis_m), static=True)
+        self._log_axes(stream, paths.CAMERA, paths.CAM_FRAME, 0.7)
+        self._log_axes(stream, paths.TARGET, paths.TARGET_FRAME, 0.7)
         if self.calibration.camera is not None:
-            self._log_frustum(stream)
+            self._log_frustum(stream, self.calibration.camera.camera)
         if self.session.target is not None:
-            self._log_board(stream, self.session.target)
+            frame = rr.CoordinateFrame(paths.TARGET_FRAME)
+            stream.log(
+                f"{paths.TARGET}/sheet", frame, board.sheet(self.session.target), static=True
+            )
+        self._log_mount(stream)
+        self._log_stops(stream)
+        if self.uncertainty is not None:
+            self.uncertainty.log_static(stream)
+        if self.charts is not None:
+            self.charts.log_static(stream)
 
     def log_view(self, stream: rr.RecordingStream, view: View, seen: ViewEvidence) -> None:
         """Logs where everything is in one view, at the stream's current time."""
         base_from_flange = self.base_from_flange.get(view.number)
-        _log_pose(stream, paths.FLANGE, base_from_flange)
-        self._log_links(stream, view)
+        _log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, base_from_flange)
+        self._log_arm(stream, view)
         if self.calibration is None:
             return
-        base_from_cam, base_from_target = self._ends(base_from_flange)
-        _log_pose(stream, paths.CAMERA, base_from_cam)
-        _log_pose(stream, paths.TARGET, base_from_target)
-        if seen.cam_from_target is None or base_from_cam is None:
-            stream.log(paths.SEEN_TARGET, rr.Clear(recursive=True))
-        else:
-            _log_pose(stream, paths.SEEN_TARGET, base_from_cam @ seen.cam_from_target)
-            if self.session.target is not None:
-                outline = _outline(self.session.target)
-                stream.log(
-                    f"{paths.SEEN_TARGET}/outline",
-                    rr.LineStrips3D([outline], colors=_SEEN_RGB, radii=self._radius(0.5 * _LINE)),
-                )
+        base_from_cam = self._base_from("cam", base_from_flange)
+        base_from_target = self._base_from("target", base_from_flange)
+        _log_pose(stream, paths.CAMERA, paths.CAM_FRAME, base_from_cam)
+        _log_pose(stream, paths.TARGET, paths.TARGET_FRAME, base_from_target)
+        self._log_seen_target(stream, base_from_cam, seen)
+        if self.uncertainty is not None:
+            self.uncertainty.log_view(stream, view.number)
+        if self.charts is not None:
+            self.charts.log_view(stream, view.number)
 
-    def _ends(
-        self, base_from_flange: FloatArray | None
-    ) -> tuple[FloatArray | None, FloatArray | None]:
-        """Where the calibration puts camera and target in one view: `base_from_...`."""
+    def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
+        """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""
         edges = {} if self.calibration is None else self.calibration.transforms
-        known = {name: edge.as_matrix() for name, edge in edges.items()}
-        ends = []
-        for end in ("cam", "target"):
-            if f"base_from_{end}" in known:
-                ends.append(known[f"base_from_{end}"])
-            elif base_from_flange is not None and f"flange_from_{end}" in known:
-                ends.append(base_from_flange @ known[f"flange_from_{end}"])
-            else:
-                ends.append(None)
-        return ends[0], ends[1]
+        if f"base_from_{end}" in edges:
+            return np.asarray(edges[f"base_from_{end}"].as_matrix())
+        if base_from_flange is not None and f"flange_from_{end}" in edges:
+            return np.asarray(base_from_flange @ edges[f"flange_from_{end}"].as_matrix())
+        return None
 
     def _radius(self, share: float) -> float:
         return share * self.size_m
 
+    def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str, times: float) -> None:
+        """Draws a frame's axes with its name."""
+        axes = rr.TransformAxes3D(times * _AXIS * self.size_m, show_frame=True)
+        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
+
+    def _log_mount(self, stream: rr.RecordingStream) -> None:
+        """Draws the edge that hangs on the flange, as a line."""
+        edges = {} if self.calibration is None else self.calibration.transforms
+        for name, edge in edges.items():
+            if name.startswith("flange_from_"):
+                line = rr.LineStrips3D(
+                    [[np.zeros(3), edge.translation]],
+                    colors=colours.JOINT,
+                    radii=self._radius(2 * _LINE),
+                )
+                frame = rr.CoordinateFrame(paths.FLANGE_FRAME)
+                stream.log(f"{paths.FLANGE}/{name}", frame, line, static=True)
+
     def _log_stops(self, stream: rr.RecordingStream) -> None:
         """All places of the flange; those of views that were not used in another colour."""
-        used = {
-            view.view for view in (self.calibration.views if self.calibration else ()) if view.used
-        }
-        for name, rgb in ((paths.USED, _USED_RGB), (paths.REJECTED, _UNUSED_RGB)):
-            positions = [
-                pose[:3, 3]
+        views = () if self.calibration is None else self.calibration.views
+        rejected = {view.view for view in views if not view.used}
+        for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
+            poses = [
+                pose
                 for view, pose in self.base_from_flange.items()
-                if (view in used or self.calibration is None) is (name == paths.USED)
+                if (view in rejected) is (name == paths.REJECTED)
             ]
-            if positions:
-                points = rr.Points3D(positions, colors=rgb, radii=self._radius(_POINT))
-                stream.log(f"{paths.STOPS}/{name}", points, static=True)
+            if not poses:
+                continue
+            frame = rr.CoordinateFrame(paths.BASE_FRAME)
+            points = rr.Points3D(
+                [pose[:3, 3] for pose in poses], colors=colour, radii=self._radius(_POINT)
+            )
+            stream.log(f"{paths.STOPS}/{name}", frame, points, static=True)
+            strips = [strip for pose in poses for strip in self._carried(pose)]
+            if strips:
+                lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
+                stream.log(f"{paths.STOPS}/{name}/carried", frame, lines, static=True)
 
-    def _log_frustum(self, stream: rr.RecordingStream) -> None:
-        if self.calibration is None or self.calibration.camera is None:
-            return
-        camera = self.calibration.camera.camera
+    def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
+        """What the flange carries at one stop, as (k, 3) lines in the base: camera or board."""
+        if self.calibration is None:
+            return []
+        if self.calibration.mount == "eye-in-hand":
+            camera, end = self.calibration.camera, "cam"
+            shapes = [] if camera is None else _frustum(camera.camera, _SMALL_FRUSTUM * self.size_m)
+        else:
+            target, end = self.session.target, "target"
+            shapes = [] if target is None else [board.closed_outline(target)]
+        base_from_end = self._base_from(end, base_from_flange)
+        if base_from_end is None:
+            return []
+        return [shape @ base_from_end[:3, :3].T + base_from_end[:3, 3] for shape in shapes]
+
+    def _log_frustum(self, stream: rr.RecordingStream, camera: Camera) -> None:
         matrix = matrix_3x3(camera)
         # Rerun puts the image's corner, not the first pixel's centre, at the origin.
         matrix[:2, 2] += 0.5
@@ -141,50 +196,64 @@ class Scene:
             resolution=camera.resolution,
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=_FRUSTUM * self.size_m,
+            parent_frame=paths.CAM_FRAME,
+            child_frame=paths.IMAGE_FRAME,
         )
-        stream.log(paths.IMAGE, pinhole, static=True)
+        stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), pinhole, static=True)
 
-    def _log_board(self, stream: rr.RecordingStream, target: Target) -> None:
-        outline = rr.LineStrips3D(
-            [_outline(target)], colors=_TARGET_RGB, radii=self._radius(1.5 * _LINE)
-        )
-        corners = rr.Points3D(
-            corner_positions(target), colors=_TARGET_RGB, radii=self._radius(_LINE)
-        )
-        stream.log(f"{paths.TARGET}/outline", outline, static=True)
-        stream.log(f"{paths.TARGET}/corners", corners, static=True)
-        stream.log(paths.TARGET, rr.TransformAxes3D(0.7 * _AXIS * self.size_m), static=True)
-
-    def _log_links(self, stream: rr.RecordingStream, view: View) -> None:
+    def _log_arm(self, stream: rr.RecordingStream, view: View) -> None:
+        """Draws the robot, or only a line to its flange where its joints are not known."""
         robot = None if self.calibration is None else self.calibration.robot
-        q = view.joints_rad
-        if robot is None or q is None or len(q) != robot.joint_count:
+        q, base_from_flange = view.joints_rad, self.base_from_flange.get(view.number)
+        if robot is not None and q is not None and len(q) == robot.joint_count:
+            log_arm(stream, robot.link_frames(q))
             return
-        origins = np.vstack([np.zeros(3), robot.link_frames(q)[:, :3, 3]])
-        links = rr.LineStrips3D([origins], colors=_ROBOT_RGB, radii=self._radius(0.012))
-        joints = rr.Points3D(origins, colors=_ROBOT_RGB, radii=self._radius(0.02))
-        stream.log(f"{paths.ROBOT}/links", links)
-        stream.log(f"{paths.ROBOT}/joints", joints)
+        stream.log(paths.ROBOT, rr.Clear(recursive=True))
+        if base_from_flange is not None:
+            line = rr.LineStrips3D(
+                [[np.zeros(3), base_from_flange[:3, 3]]],
+                colors=colours.JOINT,
+                radii=self._radius(2 * _LINE),
+            )
+            stream.log(f"{paths.ROBOT}/reach", line)
+
+    def _log_seen_target(
+        self, stream: rr.RecordingStream, base_from_cam: FloatArray | None, seen: ViewEvidence
+    ) -> None:
+        """Draws the target's outline where this view alone sees it."""
+        if self.session.target is None:
+            return
+        strips = []
+        if seen.cam_from_target is not None and base_from_cam is not None:
+            base_from_target = base_from_cam @ seen.cam_from_target
+            corners = board.closed_outline(self.session.target)
+            strips.append(corners @ base_from_target[:3, :3].T + base_from_target[:3, 3])
+        # Without strips, this takes those of the view before off the screen.
+        line = rr.LineStrips3D(strips, colors=colours.DETECTED, radii=self._radius(_LINE))
+        stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
 
 
-def _log_pose(stream: rr.RecordingStream, entity: str, pose: FloatArray | None) -> None:
-    """Logs (4, 4) `base_from_entity`; an unknown one must not keep the place of the view before."""
-    if pose is None:
+def _frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
+    """The edges of a camera's field of view down to a depth [m], as lines in its frame."""
+    width, height = camera.resolution
+    fx, fy, cx, cy = camera.matrix
+    corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
+    plane = (corners_px - [cx, cy]) / [fx, fy]
+    rim = depth_m * np.column_stack([plane, np.ones(5)])
+    return [rim, *(np.stack([np.zeros(3), corner]) for corner in rim[:4])]
+
+
+def _log_pose(
+    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray | None
+) -> None:
+    """Places a frame; an unknown one must not keep the place of the view before."""
+    if base_from_frame is None:
         stream.log(entity, rr.Clear(recursive=False))
-    else:
-        stream.log(entity, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-
-
-def _outline(target: Target) -> FloatArray:
-    """(5, 3) closed outline of the printed pattern in the target's frame [m]."""
-    side = target.square_m
-    if target.kind == "marker":
-        low, high = np.full(2, -0.5 * side), np.full(2, 0.5 * side)
-    else:
-        # A checkerboard's origin is its first inner corner, one square inside.
-        low = np.full(2, 0.0 if target.kind == "charuco" else -side)
-        high = side * np.array([target.columns, target.rows], dtype=float)
-    x, y = np.array([low, high]).T
-    return np.array(
-        [[x[0], y[0], 0], [x[1], y[0], 0], [x[1], y[1], 0], [x[0], y[1], 0], [x[0], y[0], 0]]
+        return
+    pose = rr.Transform3D(
+        translation=base_from_frame[:3, 3],
+        mat3x3=base_from_frame[:3, :3],
+        parent_frame=paths.BASE_FRAME,
+        child_frame=frame,
     )
+    stream.log(entity, pose)

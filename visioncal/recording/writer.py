@@ -1,32 +1,145 @@
-"""Writes a recording: the facts of a session, and what was computed from them."""
+"""Writes a session to a recording: view by view as it is captured, or as a whole."""
 
-import json
-import os
-import shutil
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-from uuid import uuid4
+from types import TracebackType
+from typing import Self
 
-import numpy as np
-import pyarrow as pa
-import rerun as rr
 from rerun.blueprint import BlueprintLike
-from rerun.chunk import RrdReader
-from rerun.error_utils import RerunWarning
 
-from visioncal.calibration import Calibration, to_document
+from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
-from visioncal.recording import codec, notes, overlays, paths
-from visioncal.recording.scene import Scene
+from visioncal.files import sha256
+from visioncal.recording import codec
+from visioncal.recording.recorder import Recorder, beside, named_errors
+from visioncal.recording.results import log_results
 from visioncal.session import Session
+from visioncal.session.checks import check_images_can_be_used
+from visioncal.session.table import Row, View, read_views
 
-_EVIDENCE = "visioncal.Evidence"
-# Room for one more view, however large its image, and for the end of the file.
-_ROOM_BYTES = 100_000_000
+
+class RecordingWriter:
+    """Writes a recording while its session is captured.
+
+    A view survives the death of the process as soon as `add_view` returns. A recording that is left
+    by an exception opens as one that was cut off.
+
+        with RecordingWriter(path, session, announced=20) as writer:
+            writer.add_view(["1", "images/001.png", "0.4", ...], png)
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        session: Session,
+        *,
+        announced: int | None = None,
+        blueprint: BlueprintLike | None = None,
+        label: Path | None = None,
+    ) -> None:
+        """Begins the file.
+
+        Args:
+            path: The `.rrd`, which must not exist.
+            session: What holds for all views; those that it has are not written.
+            announced: How many views are to come, so that a reader can say how many were lost.
+            blueprint: The layout to open the recording in.
+            label: The path that messages name; `path` where None.
+
+        Raises:
+            DataError: The file exists or cannot be written.
+        """
+        self._label = label or path
+        self._session = session
+        self._numbers: set[int] = set()
+        self._images: dict[str, str] = {}
+        with named_errors(self._label):
+            path.open("xb").close()
+            self._recorder = Recorder(path, blueprint=blueprint)
+            self._recorder.stream.send_recording_name(session.name)
+            header = codec.Header.of(session, codec.UNKNOWN if announced is None else announced)
+            codec.log_header(self._recorder.stream, header)
+            self._recorder.keep()
+
+    def add_view(self, cells: Sequence[str], image: bytes | None) -> None:
+        """Adds one view.
+
+        Args:
+            cells: One text for each of the session's columns, as views.csv has them.
+            image: The bytes of the file that the column `image` names; None where it names none,
+                or one that is missing.
+
+        Raises:
+            DataError: A cell is wrong, the view's number is already there, its image is another
+                than an earlier view has by the same name, or the file cannot be written. The views
+                before stay as they are.
+        """
+        view = self._checked(cells, image)
+        row, recorder = len(self._numbers), self._recorder
+        with named_errors(self._label):
+            recorder.at(row)
+            codec.log_row(recorder.stream, codec.Row.of(self._session.columns, view, image))
+            codec.log_image(recorder.stream, view.image, image)
+            recorder.keep()
+        self._numbers.add(view.number)
+
+    def add_results(
+        self, session: Session, calibration: Calibration | None, evidence: Sequence[ViewEvidence]
+    ) -> None:
+        """Adds what was computed, as `append_results` does once the recording is closed.
+
+        Args:
+            session: The session with all of its views.
+            calibration: Its result; None draws the cell as it was recorded.
+            evidence: What was seen and computed of the views, in any order.
+
+        Raises:
+            DataError: The file cannot be written.
+        """
+        with named_errors(self._label):
+            log_results(self._recorder, session, calibration, evidence)
+
+    def _checked(self, cells: Sequence[str], image: bytes | None) -> View:
+        """Refuses what could be written but not be read again."""
+        where = f"row {len(self._numbers) + 1}"
+        (view,) = read_views(self._session.columns, [Row(where, tuple(cells))], "views.csv")
+        check_images_can_be_used(self._session.declaration, [view])
+        if view.number in self._numbers:
+            raise DataError(
+                f"{where}: view {view.number} is already there; each view has a number of its own.",
+                culprits=[f"view {view.number}"],
+            )
+        if image is None:
+            return view
+        if not view.image:
+            raise DataError(f"{where}: it has an image but does not name it.", culprits=[where])
+        digest = sha256(image)
+        if self._images.setdefault(view.image, digest) != digest:
+            raise DataError(
+                f"{where}: another image is already there by the name {view.image}.",
+                culprits=[view.image],
+            )
+        return view
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Closes the recording, with a mark that all views are there unless an error left it.
+
+        Raises:
+            DataError: The file cannot be written.
+        """
+        with named_errors(self._label):
+            if kind is None:
+                codec.log_end(self._recorder.stream, len(self._numbers))
+            self._recorder.__exit__(kind, error, trace)
 
 
 def write_recording(
@@ -49,113 +162,13 @@ def write_recording(
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
-    with _whole_or_absent(path) as aside:
-        stream = rr.RecordingStream(paths.APPLICATION)
-        _open(stream, aside, blueprint)
-        try:
-            stream.send_recording_name(session.name)
-            _log_all(stream, session, calibration, {it.view: it for it in evidence}, path.parent)
-        finally:
-            # Writes the footer, which comes last.
-            stream.disconnect()
-        _check_finished(aside)
-
-
-def _open(stream: rr.RecordingStream, path: Path, blueprint: BlueprintLike | None) -> None:
-    try:
-        stream.save(path, default_blueprint=blueprint)
-    except RuntimeError as error:
-        # This is how rerun reports a file that it cannot create.
-        raise OSError(str(error)) from error
-
-
-def _check_room(folder: Path) -> None:
-    """Stops in time: on a full disk, rerun's own thread dies and whoever waits for it hangs."""
-    free_bytes = shutil.disk_usage(folder).free
-    if free_bytes < _ROOM_BYTES:
-        raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")
-
-
-def _check_finished(path: Path) -> None:
-    """Rerun only prints that it could not write; a file that lacks its footer is not whole."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RerunWarning)
-            RrdReader(path).store()
-    except (RuntimeError, ValueError) as error:
-        raise OSError("its end is missing; the disk may be full") from error
-
-
-def _log_all(
-    stream: rr.RecordingStream,
-    session: Session,
-    calibration: Calibration | None,
-    evidence: dict[int, ViewEvidence],
-    folder: Path,
-) -> None:
-    codec.log_header(stream, session)
-    scene = Scene.of(session, calibration, evidence)
-    overlay = overlays.Overlay.of(session, calibration, evidence)
-    scene.log_static(stream)
-    if calibration is not None:
-        _log_calibration(stream, calibration)
-        notes.log_static(stream, calibration)
-    results = {} if calibration is None else {it.view: it for it in calibration.views}
-    for index, view in enumerate(session.views):
-        _check_room(folder)
-        stream.set_time(paths.TIMELINE, sequence=index)
-        seen = evidence.get(view.number, ViewEvidence(view.number))
-        codec.log_row(stream, session, view)
-        _log_evidence(stream, seen)
-        scene.log_view(stream, view, seen)
-        overlay.log_view(stream, seen)
-        if view.number in results:
-            notes.log_view(stream, results[view.number])
-        # Keeps one view in memory rather than all, and the room that is left up to date.
-        stream.flush()
-
-
-def _log_calibration(stream: rr.RecordingStream, calibration: Calibration) -> None:
-    text = json.dumps(to_document(calibration), indent=2)
-    document = rr.TextDocument(text, media_type="application/json")
-    stream.log(paths.CALIBRATION, document, static=True)
-
-
-def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence) -> None:
-    """Keeps what was computed of a view exactly; what is drawn has single precision."""
-    components: dict[str, pa.Array] = {}
-    if seen.corners is not None:
-        components["corner_ids"] = pa.array(seen.corners.ids, pa.int64())
-        components["corner_px"] = _exact(seen.corners.px)
-        components["blur_px"] = _exact(seen.corners.blur_px)
-    for name in ("predicted_px", "base_from_flange", "cam_from_target"):
-        values = getattr(seen, name)
-        if values is not None:
-            components[name] = _exact(values)
-    if components:
-        stream.log(paths.EVIDENCE, rr.DynamicArchetype(_EVIDENCE, components=components))
-
-
-def _exact(values: Any) -> pa.Array:  # noqa: ANN401 - a number or an array
-    return pa.array(np.ravel(values), pa.float64())
-
-
-@contextmanager
-def _whole_or_absent(path: Path) -> Iterator[Path]:
-    """Gives a name beside `path` to write to; what was written takes the place of `path`."""
-    aside = path.parent / f".{uuid4().hex}.tmp"
-    try:
-        try:
-            yield aside
-            with aside.open("rb") as file:
-                os.fsync(file.fileno())
-            aside.replace(path)
-        finally:
-            with suppress(OSError):
-                aside.unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(
-            f"{path} cannot be written: {error}.",
-            culprits=[str(path)],
-            next_step="Choose a folder that exists, can be written, and has room.",
-        ) from error
+    with beside(path) as aside:
+        with RecordingWriter(
+            aside, session, announced=len(session.views), blueprint=blueprint, label=path
+        ) as writer:
+            for view in session.views:
+                known = bool(view.image) and session.images.exists(view.image)
+                cells = [view.cell(column) for column in session.columns]
+                writer.add_view(cells, session.images.read(view.image) if known else None)
+            writer.add_results(session, calibration, evidence)
+        aside.replace(path)

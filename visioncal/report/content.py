@@ -1,17 +1,24 @@
 """What the report says: rows of ready text, made from a calibration."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from importlib import metadata
 
 import numpy as np
 
-from visioncal.calibration import Calibration, CameraResult, Edge, Rms, SolverResult, ViewResult
+from visioncal.calibration import Calibration, Edge, Rms, SolverResult, ViewResult
+from visioncal.camera import intrinsics
+from visioncal.compare import intrinsics_names
+from visioncal.report.advice import Suspects, outlying_views
 from visioncal.report.numbers import decimals_for, matched, significant
 from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray
 
+PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
+
+_VIEW_COLUMNS = 3
 
 _HEADLINES = {
     "good": "Good: ready to use",
@@ -52,7 +59,10 @@ class EdgeCard:
 
 @dataclass(frozen=True)
 class SolverRow:
-    """One solver: its residuals, and how far each of its edges is from the result's."""
+    """One solver: its residuals, and how far each of its edges is from the result's.
+
+    The solver that gave the result has no differences.
+    """
 
     name: str
     rms_mm: str
@@ -62,11 +72,10 @@ class SolverRow:
 
 @dataclass(frozen=True)
 class ViewRow:
-    """One view, as text."""
+    """One view, as text; `mark` is `used`, `look` (used, but outlying) or `rejected`."""
 
     number: int
-    used: bool
-    reason: str
+    mark: str
     corners: str
     px: str
     mm: str
@@ -88,6 +97,15 @@ def headline(calibration: Calibration) -> str:
     return _HEADLINES[calibration.verdict.status]
 
 
+def created(calibration: Calibration) -> str:
+    """When the result was computed, for people."""
+    try:
+        time = datetime.fromisoformat(calibration.created)
+    except ValueError:
+        return calibration.created
+    return f"{time:%Y-%m-%d %H:%M %Z}".strip()
+
+
 def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
     """The estimated transforms, the wanted one first."""
     return tuple(_edge_card(name, edge) for name, edge in calibration.edges.items())
@@ -95,7 +113,7 @@ def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
 
 def _edge_card(name: str, edge: Edge) -> EdgeCard:
     parent, _, child = name.partition("_from_")
-    rotation = edge.transform.rotation.as_matrix()
+    rotation = edge.matrix[:3, :3]
     # The perturbation is in the child's frame; the components are along the parent's axes.
     covariance_m2 = rotation @ edge.covariance[3:, 3:] @ rotation.T
     sigmas_mm = 1e3 * np.sqrt(np.clip(np.diag(covariance_m2), 0.0, None))
@@ -103,7 +121,7 @@ def _edge_card(name: str, edge: Edge) -> EdgeCard:
     sigma_axis_deg = edge.sigma_deg / np.sqrt(3.0)
     quaternion_decimals = decimals_for(0.5 * np.deg2rad(sigma_axis_deg))
     rows = [
-        Fact(axis, matched(value, sigma), f"\N{PLUS-MINUS SIGN} {_rounded(sigma)} mm")
+        Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {_rounded(sigma)} mm")
         for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
     ]
     rotvec_deg = edge.transform.rotation.as_rotvec(degrees=True)
@@ -128,7 +146,7 @@ def _edge_card(name: str, edge: Edge) -> EdgeCard:
         _rounded(edge.sigma_mm),
         _rounded(edge.sigma_deg),
         tuple(rows),
-        _matrix_text(edge.transform.as_matrix()),
+        _matrix_text(edge.matrix),
     )
 
 
@@ -145,23 +163,39 @@ def _matrix_text(matrix: FloatArray) -> str:
     return "[[" + "],\n [".join(rows) + "]]"
 
 
+def answering_solver(calibration: Calibration) -> str | None:
+    """The solver whose transforms are the result; None where none's are."""
+    for name, result in calibration.solvers.items():
+        if all(
+            edge in result.matrices and np.array_equal(result.matrices[edge], it.matrix)
+            for edge, it in calibration.edges.items()
+        ):
+            return name
+    return None
+
+
 def solver_rows(calibration: Calibration) -> tuple[SolverRow, ...]:
     """The solvers, each with its distance from the result in position [mm] and angle [deg]."""
-    return tuple(_solver_row(calibration, name, it) for name, it in calibration.solvers.items())
+    answer = answering_solver(calibration)
+    return tuple(
+        _solver_row(calibration, name, it, is_answer=name == answer)
+        for name, it in calibration.solvers.items()
+    )
 
 
-def _solver_row(calibration: Calibration, name: str, result: SolverResult) -> SolverRow:
+def _solver_row(
+    calibration: Calibration, name: str, result: SolverResult, *, is_answer: bool
+) -> SolverRow:
     differences = []
     for edge_name, edge in calibration.edges.items():
-        if edge_name not in result.transforms:
+        if is_answer or edge_name not in result.matrices:
             differences.append((significant(None), significant(None)))
             continue
-        mm, deg = pose_difference(
-            edge.transform.as_matrix(), result.transforms[edge_name].as_matrix()
-        )
+        mm, deg = pose_difference(edge.matrix, result.matrices[edge_name])
         differences.append((significant(mm), significant(deg)))
+    label = f"{name} (result)" if is_answer else name
     return SolverRow(
-        name, significant(result.rms_mm), significant(result.rms_deg), tuple(differences)
+        label, significant(result.rms_mm), significant(result.rms_deg), tuple(differences)
     )
 
 
@@ -212,50 +246,47 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         ),
         Fact("views", f"{used} used of {len(calibration.views)}"),
     ]
+    answer = answering_solver(calibration)
+    if answer is not None:
+        note = (
+            "fit of both transforms, weighted by the noise"
+            if answer == "joint"
+            else "a closed form"
+        )
+        facts.append(Fact("solver", answer, note))
     if calibration.robot is not None:
         facts.append(Fact("robot model", str(calibration.robot.document.get("name", "given"))))
     if calibration.camera is not None:
-        facts += _camera_facts(calibration.camera)
+        camera = calibration.camera.camera
+        width, height = camera.resolution
+        facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
     noise = [_noise_fact(name, value) for name, value in calibration.noise.items()]
     return (*facts, *noise)
 
 
-_MATRIX = ("fx", "fy", "cx", "cy")
+def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:
+    """The intrinsics, each with its standard deviation where it was estimated."""
+    result = calibration.camera
+    if result is None:
+        return ()
+    values = intrinsics(result.camera)
+    names = intrinsics_names(result.camera)
+    units = ["px"] * len(result.camera.matrix) + [""] * len(result.camera.distortion)
+    if result.covariance is None or len(result.covariance) != len(values):
+        shown = [f"{value:.2f}" for value in result.camera.matrix]
+        shown += [f"{value:.5g}" for value in result.camera.distortion]
+        return tuple(Fact(*it) for it in zip(names, shown, units, strict=True))
+    sigmas = np.sqrt(np.clip(np.diag(result.covariance), 0.0, None))
+    return tuple(
+        Fact(name, matched(value, sigma), f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip())
+        for name, value, sigma, unit in zip(names, values, sigmas, units, strict=True)
+    )
 
 
-def _lens_names(model: str) -> tuple[str, ...]:
-    """OpenCV's names of the distortion coefficients, in its order."""
-    if model == "fisheye":
-        return ("k1", "k2", "k3", "k4")
-    return ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
-
-def _camera_facts(result: CameraResult) -> list[Fact]:
-    camera = result.camera
-    values = np.concatenate([camera.matrix, camera.distortion])
-    if result.covariance is not None and len(result.covariance) == len(values):
-        sigmas = np.sqrt(np.clip(np.diag(result.covariance), 0.0, None))
-        texts = [
-            f"{matched(value, sigma)} \N{PLUS-MINUS SIGN} {_rounded(sigma)}"
-            for value, sigma in zip(values, sigmas, strict=True)
-        ]
-    else:
-        texts = [f"{value:.2f}" for value in camera.matrix]
-        texts += [f"{value:.5g}" for value in camera.distortion]
-    width, height = camera.resolution
-    how = "estimated from this session" if result.estimated else "as given by the session"
-    matrix = ", ".join(f"{name} {text}" for name, text in zip(_MATRIX, texts, strict=False))
-    return [
-        Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px", how),
-        Fact("camera matrix [px]", matrix),
-        Fact(
-            "distortion",
-            ", ".join(
-                f"{name} {text}"
-                for name, text in zip(_lens_names(camera.model), texts[4:], strict=False)
-            ),
-        ),
-    ]
+def lens_origin(calibration: Calibration) -> str:
+    """Where the intrinsics are from, in words."""
+    estimated = calibration.camera is not None and calibration.camera.estimated
+    return "estimated from this session" if estimated else "as given by the session"
 
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
@@ -271,19 +302,25 @@ def _noise_fact(name: str, value: float) -> Fact:
     )
 
 
-def view_rows(views: Sequence[ViewResult]) -> tuple[ViewRow, ...]:
-    """One row for each view of the session, in its order."""
-    return tuple(
-        ViewRow(
-            view.view,
-            view.used,
-            view.reason,
-            significant(None) if view.corners is None else str(view.corners),
-            significant(view.rms_px),
-            significant(view.residual_mm),
-            significant(view.residual_deg),
-        )
-        for view in views
+def view_columns(
+    views: Sequence[ViewResult], found: Sequence[Suspects]
+) -> tuple[tuple[ViewRow, ...], ...]:
+    """The views of the session in its order, split into columns that stand side by side."""
+    outlying = outlying_views(found)
+    rows = [_view_row(view, outlying) for view in views]
+    height = max(-(-len(rows) // _VIEW_COLUMNS), 1)
+    return tuple(tuple(rows[start : start + height]) for start in range(0, len(rows), height))
+
+
+def _view_row(view: ViewResult, outlying: Collection[int]) -> ViewRow:
+    mark = "rejected" if not view.used else "look" if view.view in outlying else "used"
+    return ViewRow(
+        view.view,
+        mark,
+        significant(None) if view.corners is None else str(view.corners),
+        significant(view.rms_px),
+        significant(view.residual_mm),
+        significant(view.residual_deg),
     )
 
 

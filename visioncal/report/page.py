@@ -12,8 +12,9 @@ from visioncal.calibration import Calibration, ViewResult
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence, magnification
 from visioncal.files import write_atomically
-from visioncal.report import content, plots
+from visioncal.report import advice, content, plots
 from visioncal.report.thumbnails import Thumbnail, thumbnail
+from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
 from visioncal.version import __version__
 
@@ -25,25 +26,30 @@ def write_report(
     calibration: Calibration,
     session: Session | None,
     evidence: Sequence[ViewEvidence],
+    note: str = "",
 ) -> None:
     """Writes the report as one HTML file that needs no network and no script.
 
     Args:
         path: The file to write; it appears whole or not at all.
         calibration: What to report.
-        session: Where its images are; without it the report has no pictures.
+        session: Where its images and joint angles are; without it the report shows none.
         evidence: What was seen and computed of each view, in any order.
+        note: What the reader should know of this report itself.
 
     Raises:
         DataError: The file cannot be written.
     """
-    write_atomically(path, render(calibration, session, evidence))
+    write_atomically(path, render(calibration, session, evidence, note))
 
 
 def render(
-    calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
+    calibration: Calibration,
+    session: Session | None,
+    evidence: Sequence[ViewEvidence],
+    note: str = "",
 ) -> str:
-    """Renders the report as HTML text."""
+    """Renders the report as HTML text; see `write_report`."""
     environment = Environment(
         loader=PackageLoader("visioncal", "report"),
         autoescape=True,
@@ -51,30 +57,63 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    return environment.get_template("report.html.j2").render(
+        calibration=calibration,
+        note=note,
+        version=__version__,
+        python=platform.python_version(),
+        versions=content.dependency_versions(),
+        **_words(calibration),
+        **_plots(calibration, session, evidence),
+        **_pictures(calibration, session, evidence),
+    )
+
+
+def _words(calibration: Calibration) -> dict[str, object]:
+    found = advice.suspects(calibration)
+    return {
+        "headline": content.headline(calibration),
+        "created": content.created(calibration),
+        "next_steps": advice.next_steps(calibration, found),
+        "suspects": [(advice.listed(it.views), it) for it in found],
+        "has_outliers": any(it.used for it in found),
+        "key_figures": content.key_figures(calibration),
+        "edges": content.edge_cards(calibration),
+        "method": content.method_facts(calibration),
+        "lens": content.lens_facts(calibration),
+        "lens_origin": content.lens_origin(calibration),
+        "residuals": content.residual_rows(calibration),
+        "solvers": content.solver_rows(calibration),
+        "has_pixels": calibration.rms.px is not None,
+        "view_columns": content.view_columns(calibration.views, found),
+    }
+
+
+def _plots(
+    calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
+) -> dict[str, object]:
+    outlying = advice.outlying_views(advice.suspects(calibration))
+    return {
+        "residual_plot": plots.residuals(calibration, outlying),
+        "trend_plot": residuals_over_joints(calibration, session, evidence, outlying),
+        "coverage_plot": plots.image_coverage(calibration, evidence),
+        "direction_plot": plots.viewing_directions(calibration, evidence),
+        "rotation_plot": plots.flange_rotations(calibration, evidence),
+    }
+
+
+def _pictures(
+    calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
+) -> dict[str, object]:
     seen = {it.view: it for it in evidence}
     extremes = _extremes(calibration, seen)
     magnify = _magnification(calibration, [seen[view.view] for _, view in extremes])
     pictures = None if session is None else _Pictures(session, seen)
-    return environment.get_template("report.html.j2").render(
-        calibration=calibration,
-        headline=content.headline(calibration),
-        key_figures=content.key_figures(calibration),
-        edges=content.edge_cards(calibration),
-        method=content.method_facts(calibration),
-        residuals=content.residual_rows(calibration),
-        solvers=content.solver_rows(calibration),
-        views=content.view_rows(calibration.views),
-        residual_plot=plots.residuals(calibration),
-        coverage_plot=plots.image_coverage(calibration, evidence),
-        direction_plot=plots.viewing_directions(calibration, evidence),
-        rotation_plot=plots.flange_rotations(calibration, evidence),
-        used_pictures=pictures.of_used(extremes, magnify) if pictures else [],
-        rejected_pictures=pictures.of_rejected(calibration.views) if pictures else [],
-        magnify=magnify,
-        versions=content.dependency_versions(),
-        version=__version__,
-        python=platform.python_version(),
-    )
+    return {
+        "used_pictures": pictures.of_used(extremes, magnify) if pictures else [],
+        "rejected_pictures": pictures.of_rejected(calibration.views) if pictures else [],
+        "magnify": magnify,
+    }
 
 
 def _magnification(calibration: Calibration, shown: Sequence[ViewEvidence]) -> int:

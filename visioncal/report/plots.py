@@ -1,6 +1,6 @@
 """The report's plots: residuals, image coverage and coverage of orientations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,16 @@ _ROOM = 1.25
 _WIDE_IN, _SMALL_IN = 9.2, 3.7
 
 
-def residuals(calibration: Calibration) -> Markup:
-    """Position, orientation and reprojection residual of every view, the rejected ones marked."""
+def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Markup:
+    """Position, orientation and reprojection residual of every view.
+
+    Args:
+        calibration: The result.
+        outlying: Numbers of used views that are marked, beside those that were not used.
+
+    Returns:
+        The figure; empty where there are no residuals.
+    """
     panels: list[tuple[str, Callable[[ViewResult], float | None], float | None]] = [
         ("position [mm]", lambda view: view.residual_mm, calibration.rms.mm),
         ("orientation [deg]", lambda view: view.residual_deg, calibration.rms.deg),
@@ -34,10 +42,10 @@ def residuals(calibration: Calibration) -> Markup:
     if not shown:
         return Markup("")
     with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 1.55 * len(shown) + 0.25)
+        figure = svg.new_figure(_WIDE_IN, 1.3 * len(shown) + 0.25)
         rows = figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0]
         for axes, (label, value_of, rms) in zip(rows, shown, strict=True):
-            _residual_panel(axes, calibration.views, value_of, rms)
+            _residual_panel(axes, calibration.views, value_of, rms, outlying)
             axes.set_ylabel(label)
         rows[-1].set_xlabel("view")
         return svg.inline(figure, "residuals")
@@ -48,6 +56,7 @@ def _residual_panel(
     views: Sequence[ViewResult],
     value_of: Callable[[ViewResult], float | None],
     rms: float | None,
+    outlying: Collection[int],
 ) -> None:
     """Bars by the view's place in the session; what exceeds the used views' scale is clipped."""
     known = [(place, view, value_of(view)) for place, view in enumerate(views)]
@@ -55,11 +64,13 @@ def _residual_panel(
     unknown = [place for place, view, value in known if value is None and not view.used]
     used = [value for _, is_used, value in values if is_used]
     top = _ROOM * max(used or [value for _, _, value in values], default=1.0) or 1.0
-    for is_used, colour in ((True, svg.ACCENT), (False, svg.BAD)):
-        bars = [(place, min(value, top)) for place, flag, value in values if flag is is_used]
-        if bars:
-            places, heights = zip(*bars, strict=True)
-            axes.bar(places, heights, width=0.7, color=colour, alpha=0.9)
+    if values:
+        places, flags, heights = zip(*values, strict=True)
+        colours = [
+            svg.BAD if not is_used else svg.CHECK if views[place].view in outlying else svg.ACCENT
+            for place, is_used in zip(places, flags, strict=True)
+        ]
+        axes.bar(places, np.minimum(heights, top), width=0.7, color=colours, alpha=0.9)
     for place, is_used, value in values:
         if not is_used:
             clipped = value > top

@@ -13,7 +13,7 @@ from matplotlib.typing import RcKeyType
 
 # Drawn with these stand-ins, figures get the page's own colours, in light, dark and print alike.
 INK, MUTED, LINE = "#010101", "#020202", "#030303"
-ACCENT, GOOD, BAD = "#040404", "#050505", "#060606"
+ACCENT, GOOD, BAD, CHECK = "#040404", "#050505", "#060606", "#070707"
 _THEME = {
     INK: "var(--ink)",
     MUTED: "var(--muted)",
@@ -21,10 +21,13 @@ _THEME = {
     ACCENT: "var(--accent)",
     GOOD: "var(--good)",
     BAD: "var(--bad)",
+    CHECK: "var(--check)",
 }
 
 _STYLE: dict[RcKeyType, Any] = {
     "svg.fonttype": "none",
+    "path.simplify": False,
+    "lines.solid_capstyle": "butt",
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
     "axes.edgecolor": LINE,

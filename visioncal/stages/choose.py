@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from visioncal.errors import DegenerateError
-from visioncal.estimator.closure import Closure
+from visioncal.estimator.closure import Edges
 from visioncal.solvers import SOLVERS
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import rotations
@@ -21,7 +21,6 @@ _CLEAR_RATIO = 3.0
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.
 _TRIPLES = 40
-_MOST_COMBINATIONS = 64
 # Of the starts, so many are followed up with all views.
 _REFINED, _ROUNDS = 5, 10
 
@@ -63,12 +62,16 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
     if all(len(view.cam_from_target) == 1 for view in views) or len(views) < 3:
         return Choice(tuple(_chosen(view, 0, target) for view in views), ())
     candidates = _pad(views)
-    picks = _assign(robot, candidates, views)
+    turns = len(set(views[0].turns))
+    picks = _as_the_first(_assign(robot, candidates, views), turns)
     distance = _distances(robot, candidates, picks)
     best = distance[np.arange(len(views)), picks]
     others = distance.copy()
     others[np.arange(len(views)), picks] = np.inf
-    unclear = others.min(axis=1) < _CLEAR_RATIO * np.maximum(best, np.median(best))
+    typical = np.median(best)
+    unclear = others.min(axis=1) < _CLEAR_RATIO * np.maximum(best, typical)
+    # A view far from all others with any of its poses is wrong, which is for the verdict to say.
+    unclear &= best < _CLEAR_RATIO**2 * typical
     if unclear.sum() > len(views) / 2:
         raise DegenerateError(
             f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
@@ -91,19 +94,16 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
     )
 
 
-def choose_by(
-    view: ViewPoses, robot: FloatArray, x: FloatArray, z: FloatArray, target: Target | None
-) -> ViewPoses:
+def choose_by(view: ViewPoses, robot: FloatArray, edges: Edges, target: Target | None) -> ViewPoses:
     """Chooses the pose of one view by edges that are known already.
 
     Args:
         view: The view with its candidates.
         robot: (4, 4) the robot's part of its chain.
-        x: (4, 4) first edge.
-        z: (4, 4) second edge.
+        edges: Both edges.
         target: What was seen, for its symmetries.
     """
-    pick = _nearest(robot[None], _pad([view]), x, z)[0].argmin()
+    pick = _nearest(robot[None], _pad([view]), edges.x, edges.z)[0].argmin()
     return _chosen(view, int(pick), target)
 
 
@@ -128,6 +128,15 @@ def _assign(robot: FloatArray, candidates: _Candidates, views: Sequence[ViewPose
     picked.sort(key=_score)
     settled = [_settle(robot, candidates, it.argmin(axis=1)) for it in picked[:_REFINED]]
     return min(settled, key=lambda picks: _score(_distances(robot, candidates, picks)))
+
+
+def _as_the_first(picks: IntArray, turns: int) -> IntArray:
+    """Turns all picks alike, so that the first view keeps the numbering that it was found with.
+
+    A target's turns are powers of the first, and candidates come in blocks of all turns.
+    """
+    planar, turn = np.divmod(picks, turns)
+    return np.asarray(planar * turns + (turn - turn[0]) % turns)
 
 
 def _score(distance: FloatArray) -> float:
@@ -157,7 +166,7 @@ def _starts(
         options = [list(range(counts[at])) for at in triple]
         # A turn of the target in all views alike is a change of its frame, and no other solution.
         options[0] = [at for at in options[0] if views[triple[0]].turns[at] == 0]
-        for picks in list(product(*options))[:_MOST_COMBINATIONS]:
+        for picks in product(*options):
             yield triple, np.array(picks)
 
 
@@ -176,7 +185,7 @@ def _nearest(
     robot: FloatArray, candidates: _Candidates, x: FloatArray, z: FloatArray
 ) -> FloatArray:
     """Distance (m, k) [m] between where each candidate places the target, and z."""
-    placed = Closure(robot[:, None], candidates.poses).placed(x)
+    placed = robot[:, None] @ x @ candidates.poses
     away = np.linalg.norm(placed[..., :3, 3] - z[:3, 3], axis=-1)
     away = away + _LEVER_M * rotation_angle(invert(z) @ placed)
     return np.asarray(np.where(candidates.valid, away, np.inf))

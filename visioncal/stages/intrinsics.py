@@ -136,7 +136,7 @@ def _first_fit(
         width, height = resolution
         matrix = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
         camera = Camera(model, resolution, matrix, np.zeros(coefficients))
-        fit = _fit(stack, camera, planar_poses(stack, camera)[0])
+        fit = _fit(stack, camera, planar_poses(stack, camera).first)
         if best is None or fit.sigma_px < best.sigma_px:
             best = fit
         # Corners are found to a few tenths of a pixel; a wrong basin is off by many pixels.

@@ -5,10 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration import Rms, Verdict, VerdictStatus
+from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
 from visioncal.stages.handeye import HandEyeResult
-from visioncal.transforms import invert, rotation_angle
+from visioncal.transforms import pose_difference
 from visioncal.types import Rejection
+
+# Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
+_ROUNDING = 1e-6
+_LISTED_VIEWS = 3
 
 
 @dataclass(frozen=True)
@@ -18,12 +22,15 @@ class JudgeOptions:
     Attributes:
         scatter_mm: Held-out scatter of the target's position [mm]. Pick cells live with 1 mm.
         scatter_deg: Held-out scatter of its orientation [deg].
-        sigma_mm: Predicted sigma of the worst direction of the camera's edge [mm].
+        sigma_mm: Predicted sigma of the worst direction of an edge [mm].
         sigma_deg: The same in rotation [deg].
         pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
-        views: Used views; fewer leave too little to check the result with.
+        stops: Stops of the robot in the fit; fewer leave too little to check the result with.
         lost_share: Share of views that could not be used.
         optimism: Held-out over in-sample scatter; large where each view carries the fit.
+        outlier: Residual of a view over the median of all.
+        holdout: Residuals of views held back over those of views left out in turn.
+        disagreement: Distance of half of the closed forms from the answer, over its sigma.
     """
 
     scatter_mm: tuple[float, float] = (2.0, 10.0)
@@ -31,9 +38,12 @@ class JudgeOptions:
     sigma_mm: tuple[float, float] = (1.0, 3.0)
     sigma_deg: tuple[float, float] = (0.1, 0.3)
     pixel_px: tuple[float, float] = (0.7, 3.0)
-    views: tuple[int, int] = (10, 5)
+    stops: tuple[int, int] = (10, 5)
     lost_share: tuple[float, float] = (0.25, 0.6)
     optimism: tuple[float, float] = (1.6, 4.0)
+    outlier: float = 6.0
+    holdout: float = 4.0
+    disagreement: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -41,20 +51,24 @@ class Findings:
     """What the verdict is made of.
 
     Attributes:
-        used: Number of views in the fit.
-        rejections: Views that could not be used; views held out on purpose are not among them.
+        views: What became of each view.
+        stops: Number of the robot's stops in the fit.
+        lost: Views that could not be used; those held back on purpose are not among them.
         hand_eye: The fit.
         rms: Residuals of the used views.
-        held_out: Residuals of views left out.
+        held_out: Residuals of views left out in turn.
+        holdout: Residuals of views held back by the session; None where there are none.
         pixel_px: Noise of a corner's coordinate; None without images [px].
         warnings: What earlier stages had to say.
     """
 
-    used: int
-    rejections: Sequence[Rejection]
+    views: Sequence[ViewResult]
+    stops: int
+    lost: Sequence[Rejection]
     hand_eye: HandEyeResult
     rms: Rms
     held_out: Rms
+    holdout: Rms | None
     pixel_px: float | None
     warnings: Sequence[str]
 
@@ -64,7 +78,7 @@ class _Doubt:
     """A reason not to trust the result, and whether it settles the matter."""
 
     sentence: str
-    is_fatal: bool
+    is_fatal: bool = False
 
 
 def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
@@ -78,13 +92,17 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
         `bad` with a reason that settles it, `check` with doubts, `good` without.
     """
     options = options or JudgeOptions()
+    scatter = list(_scatter_doubts(findings, options))
     doubts = [
-        *_scatter_doubts(findings, options),
-        *_observability_doubts(findings, options),
+        *scatter,
+        *_outlier_doubts(findings, options),
+        *_holdout_doubts(findings, options),
+        # Views that disagree wildly have no sigma worth a word about the motion.
+        *([] if any(it.is_fatal for it in scatter) else _sigma_doubts(findings, options)),
         *_view_doubts(findings, options),
         *_pixel_doubts(findings, options),
-        *_solver_doubts(findings),
-        *(_Doubt(sentence, is_fatal=False) for sentence in findings.warnings),
+        *_solver_doubts(findings, options),
+        *(_Doubt(sentence) for sentence in findings.warnings),
     ]
     if not doubts:
         return Verdict("good", (_praise(findings),))
@@ -94,31 +112,40 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
 
 
 def _praise(findings: Findings) -> str:
-    worst = findings.hand_eye.worst
+    used, worst = sum(view.used for view in findings.views), findings.hand_eye.worst[0]
     return (
-        f"All {findings.used} used views agree: left out of the fit, they are predicted to "
+        f"All {used} used views agree: left out of the fit, they are predicted to "
         f"{findings.held_out.mm:.2g} mm and {findings.held_out.deg:.2g} deg (rms), and "
-        f"{worst[0].words}, its worst direction, is known to {1e3 * worst[0].sigma:.2g} mm."
+        f"{worst.words}, its worst direction, is known to {1e3 * worst.sigma:.2g} mm."
     )
 
 
 def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
     held, inside = findings.held_out, findings.rms
-    for value, unit, (check, bad) in (
-        (held.mm, "mm", options.scatter_mm),
-        (held.deg, "deg", options.scatter_deg),
-    ):
-        if value > check:
-            yield _Doubt(
-                f"Left out of the fit, views disagree with the others by {value:.2g} {unit} (rms; "
-                f"doubt begins at {check:g}). Look at the worst views in the table: a board that "
-                "moved, poses of other images, units, intrinsics, or an arm with large model "
-                "errors.",
-                value > bad,
-            )
-    ratio = max(held.mm / max(inside.mm, 1e-9), held.deg / max(inside.deg, 1e-9))
-    # Under a nanometre both are rounding, and their ratio says nothing.
-    if ratio > options.optimism[0] and held.mm > 1e-6:
+    limits = (options.scatter_mm, options.scatter_deg)
+    beyond = [
+        (f"{value:.2g} {unit} (doubt begins at {check:g})", value > bad)
+        for value, unit, (check, bad) in zip(
+            (held.mm, held.deg), ("mm", "deg"), limits, strict=True
+        )
+        if value > check
+    ]
+    if beyond:
+        yield _Doubt(
+            f"Left out of the fit, views disagree with the others by "
+            f"{' and '.join(words for words, _ in beyond)}, rms; the worst are "
+            f"{_worst_views(findings.views)}. Possible causes: a board that moved, images paired "
+            "with other poses, units or conventions of the poses, intrinsics, a warped board, or "
+            "an arm with large model errors.",
+            any(is_fatal for _, is_fatal in beyond),
+        )
+    ratios = [
+        outside / within
+        for outside, within in ((held.mm, inside.mm), (held.deg, inside.deg))
+        if outside > _ROUNDING and within > 0.0
+    ]
+    ratio = max(ratios, default=0.0)
+    if ratio > options.optimism[0]:
         yield _Doubt(
             f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
             "views for their noise. Add 5 or more, tilted about different axes.",
@@ -126,8 +153,45 @@ def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
         )
 
 
-def _observability_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    for direction in findings.hand_eye.worst[:2]:
+def _worst_views(views: Sequence[ViewResult]) -> str:
+    measured = [view for view in views if view.used and view.residual_mm is not None]
+    measured.sort(key=lambda view: -(view.residual_mm or 0.0))
+    return ", ".join(
+        f"view {view.view} ({view.residual_mm:.2g} mm, {view.residual_deg:.2g} deg)"
+        for view in measured[:_LISTED_VIEWS]
+    )
+
+
+def _outlier_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    """Names single views whose residual stands out from the others'."""
+    used = [view for view in findings.views if view.used]
+    away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
+    typical = np.maximum(np.median(away, axis=0), _ROUNDING)
+    for view, ratio in zip(used, (away / typical).max(axis=1), strict=True):
+        if ratio > options.outlier:
+            yield _Doubt(
+                f"View {view.view} stands out: it places the target {view.residual_mm:.2g} mm and "
+                f"{view.residual_deg:.2g} deg from the others, {ratio:.0f} times what is typical. "
+                "It is in the fit and pulls at it: look at its image and its pose, and take it out "
+                "of views.csv if one of them is wrong."
+            )
+
+
+def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    holdout, held = findings.holdout, findings.held_out
+    if holdout is None:
+        return
+    ratio = max(holdout.mm / max(held.mm, _ROUNDING), holdout.deg / max(held.deg, _ROUNDING))
+    if ratio > options.holdout and max(holdout.mm, holdout.deg) > _ROUNDING:
+        yield _Doubt(
+            f"The views that the session holds back are missed by {holdout.mm:.2g} mm and "
+            f"{holdout.deg:.2g} deg, {ratio:.0f} times worse than views left out in turn. They lie "
+            "where the result does not hold, or their poses or images are wrong."
+        )
+
+
+def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    for direction in findings.hand_eye.worst:
         scale, unit, (check, bad) = (
             (np.rad2deg(1.0), "deg", options.sigma_deg)
             if direction.is_rotation
@@ -144,13 +208,14 @@ def _observability_doubts(findings: Findings, options: JudgeOptions) -> Iterator
 
 
 def _view_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    used, lost = findings.used, findings.rejections
-    check, bad = options.views
-    if used < check:
+    used, lost = sum(view.used for view in findings.views), findings.lost
+    check, bad = options.stops
+    if findings.stops < check:
+        counted = f"{used} views" if findings.stops == used else f"{findings.stops} stops"
         yield _Doubt(
-            f"Only {used} views are used; {check} or more give the result something to be checked "
+            f"Only {counted} are used; {check} or more give the result something to be checked "
             "with.",
-            used < bad,
+            findings.stops < bad,
         )
     share = len(lost) / max(used + len(lost), 1)
     if share > options.lost_share[0]:
@@ -173,19 +238,23 @@ def _pixel_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
         )
 
 
-def _solver_doubts(findings: Findings) -> Iterator[_Doubt]:
-    """Compares the solvers with the answer, in units of what the views leave open."""
+def _solver_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    """Compares the closed forms with the answer, in units of what the views leave open.
+
+    Single ones have weaknesses of their own, and an answer that changed the lens is another
+    question: what half of them agree on is meant.
+    """
     result = findings.hand_eye
-    sigma_m = float(np.sqrt(np.trace(result.covariance[3:6, 3:6])))
-    sigma_rad = float(np.sqrt(np.trace(result.covariance[:3, :3])))
-    for name, other in result.solutions.items():
-        step = invert(result.x) @ other.x
-        away_m, away_rad = float(np.linalg.norm(step[:3, 3])), float(rotation_angle(step))
-        # Closed forms use the views less well and stray by more than one sigma; five is no noise.
-        if away_m > max(5 * sigma_m, 1e-4) or away_rad > max(5 * sigma_rad, 1e-4):
-            yield _Doubt(
-                f"Solver {name} disagrees by {1e3 * away_m:.2g} mm and "
-                f"{np.rad2deg(away_rad):.2g} deg, more than noise explains. Wrong views pull "
-                "solvers apart: look at the largest residuals.",
-                is_fatal=False,
-            )
+    if len(result.edges.lens):
+        return
+    sigma_mm = 1e3 * float(np.sqrt(np.trace(result.covariance[3:6, 3:6])))
+    sigma_deg = float(np.rad2deg(np.sqrt(np.trace(result.covariance[:3, :3]))))
+    steps = [pose_difference(result.edges.x, it.x) for it in result.solutions.values()]
+    away_mm, away_deg = np.median(steps, axis=0)
+    ratio = max(away_mm / max(sigma_mm, _ROUNDING), away_deg / max(sigma_deg, _ROUNDING))
+    if ratio > options.disagreement:
+        yield _Doubt(
+            f"Half of the solvers disagree with the answer by {away_mm:.2g} mm and "
+            f"{away_deg:.2g} deg or more, {ratio:.0f} times its sigma. Wrong views pull solvers "
+            "apart: look at the largest residuals."
+        )

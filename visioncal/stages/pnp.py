@@ -40,7 +40,6 @@ class ViewPoses:
             the pose itself.
         by_intrinsics: (c, 6, k) how each candidate moves with the intrinsics; k = 0 where the
             session gave the pose itself.
-        rms_px: Reprojection error of the first candidate by itself [px]; 0 without corners.
     """
 
     view: int
@@ -49,7 +48,6 @@ class ViewPoses:
     turns: tuple[int, ...]
     covariance: FloatArray
     by_intrinsics: FloatArray
-    rms_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,62 +59,108 @@ class Poses:
     sigma_px: float
 
 
-def estimate_poses(corners: Mapping[int, Corners], target: Target, camera: Camera) -> Poses:
+def estimate_poses(
+    corners: Mapping[int, Corners], target: Target, camera: Camera, lens_unknowns: int = 0
+) -> Poses:
     """Estimates `cam_from_target` of each view.
 
     Both solutions of the planar problem are refined and kept while they cannot be told apart, and
     a board that looks the same after a turn gives each of them once a turn.
 
     Args:
-        corners: The corners by view.
+        corners: The corners by view; at least one view.
         target: What was seen.
         camera: The intrinsics.
+        lens_unknowns: How many intrinsics were estimated from these same corners.
 
     Returns:
         The poses; views whose residual is no noise are rejected.
 
     Raises:
-        DataError: No view is left.
+        DataError: The lens's distortion cannot be inverted at any view's corners.
     """
-    if not corners:
-        raise DataError("pnp: no view shows the target.", next_step="Look at the reasons above.")
-    stack = CornerStack.of(corners, corner_positions(target))
+    positions = corner_positions(target)
     reasons: dict[int, str] = {}
     with one_blas_thread():
-        starts = planar_poses(stack, camera)
+        stack, starts = _started(CornerStack.of(corners, positions), camera, reasons)
         fit = fit_poses(stack, camera, starts[0])
         for _ in range(_ROUNDS):
             passed = gate(stack, fit.residuals)
             if passed.is_open:
                 break
             reasons |= passed.reasons
-            stack = stack.keep(passed.mask)
-            starts = planar_poses(stack, camera)
+            stack, starts = _started(stack.keep(passed.mask), camera, reasons)
             fit = fit_poses(stack, camera, starts[0])
-        best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, starts[1]))
-    sigma_px = pixel_noise(stack, best.residuals)
-    mean_squares = [mean_square_by_view(stack, fit.residuals) for fit in (best, other)]
+        freedom = 2 * len(stack.px) - 6 * len(stack.views) - lens_unknowns
+        sigma_px = float(np.sqrt(np.sum(fit.residuals**2) / max(freedom, 1)))
+        views = _with_rivals(stack, camera, fit, starts[1], sigma_px, target)
+    return Poses(views, tuple(Rejection(*item) for item in reasons.items()), sigma_px)
+
+
+def measure_poses(
+    corners: Mapping[int, Corners], target: Target, camera: Camera, sigma_px: float
+) -> tuple[ViewPoses, ...]:
+    """Poses of views that are only to be looked at: by a noise that others have set, ungated."""
+    if not corners:
+        return ()
+    with one_blas_thread():
+        stack, starts = _started(
+            CornerStack.of(corners, corner_positions(target)), camera, reasons={}
+        )
+        fit = fit_poses(stack, camera, starts[0])
+        return _with_rivals(stack, camera, fit, starts[1], sigma_px, target)
+
+
+def _started(
+    stack: CornerStack, camera: Camera, reasons: dict[int, str]
+) -> tuple[CornerStack, tuple[FloatArray, FloatArray]]:
+    """Closed-form starts, and the views that have them; the others' reasons are added."""
+    guess = planar_poses(stack, camera)
+    if not guess.solved.any():
+        raise DataError(
+            "pnp: no view's pose can be solved: the lens's distortion cannot be inverted where the "
+            "corners are.",
+            next_step="Check the distortion coefficients: their number, order and model.",
+        )
+    lost = [view for view, solved in zip(stack.views, guess.solved, strict=True) if not solved]
+    reasons |= dict.fromkeys(
+        lost, "no pose: the lens's distortion cannot be inverted where its corners are"
+    )
+    first, second = guess.first[guess.solved], guess.second[guess.solved]
+    return stack.keep(guess.solved[stack.view_of]), (first, second)
+
+
+def _with_rivals(
+    stack: CornerStack,
+    camera: Camera,
+    fit: PoseFit,
+    mirrored: FloatArray,
+    sigma_px: float,
+    target: Target,
+) -> tuple[ViewPoses, ...]:
+    """Gives each view its candidates: the planar solutions that rival, in all of its turns."""
+    best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, mirrored))
+    mean_squares = [mean_square_by_view(stack, it.residuals) for it in (best, other)]
     turns = rotation_transforms(target)
     turned = adjoint(invert(turns))
-    spreads = [sigma_px**2 * covariance(fit.information) for fit in (best, other)]
+    # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
+    spreads = [max(sigma_px, 1e-6) ** 2 * covariance(it.information) for it in (best, other)]
     views = []
     for at, view in enumerate(stack.views):
         rival = _is_rival(mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px)
         fits = (best, other) if rival else (best,)
-        poses = [fit.cam_from_target[at] @ turns for fit in fits]
         spread = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
         views.append(
             ViewPoses(
                 view,
-                _surviving(corners[view], stack, at),
-                np.concatenate(poses),
+                _surviving(stack, at),
+                np.concatenate([it.cam_from_target[at] @ turns for it in fits]),
                 tuple(range(len(turns))) * len(fits),
                 np.concatenate(spread),
-                np.concatenate([turned @ fit.by_intrinsics[at] for fit in fits]),
-                float(np.sqrt(mean_squares[0][at])),
+                np.concatenate([turned @ it.by_intrinsics[at] for it in fits]),
             )
         )
-    return Poses(tuple(views), tuple(Rejection(*item) for item in reasons.items()), sigma_px)
+    return tuple(views)
 
 
 def given_poses(session: Session) -> dict[int, ViewPoses]:
@@ -130,17 +174,10 @@ def given_poses(session: Session) -> dict[int, ViewPoses]:
             (0,),
             np.zeros((1, 6, 6)),
             np.zeros((1, 6, 0)),
-            0.0,
         )
         for view, pose in given
         if pose is not None
     }
-
-
-def pixel_noise(stack: CornerStack, residuals: FloatArray, parameters: int = 0) -> float:
-    """Standard deviation of a corner's coordinate [px], poses (and more parameters) fitted."""
-    freedom = 2 * len(stack.px) - 6 * len(stack.views) - parameters
-    return float(np.sqrt(np.sum(residuals**2) / max(freedom, 1)))
 
 
 def _mirrored(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArray) -> PoseFit:
@@ -190,11 +227,11 @@ def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
     """Whether the mirrored pose explains a view's corners about as well as the better one."""
     if np.isclose(best, other, rtol=1e-6, atol=0.0):
         return False  # both starts ran into the same pose
-    surprise = corners * (other - best) / sigma_px**2
+    surprise = corners * (other - best) / max(sigma_px, 1e-6) ** 2
     return bool(other < _RIVAL_RATIO**2 * best or surprise < _RIVAL_CHI2)
 
 
-def _surviving(corners: Corners, stack: CornerStack, at: int) -> Corners:
+def _surviving(stack: CornerStack, at: int) -> Corners:
     """The corners of a view that the gate let pass."""
     rows = slice(stack.starts[at], stack.starts[at] + stack.counts[at])
-    return Corners(corners.view, stack.ids[rows], stack.px[rows], corners.blur_px)
+    return Corners(stack.views[at], stack.ids[rows], stack.px[rows], stack.blurs[at])

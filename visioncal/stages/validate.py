@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.camera import project
-from visioncal.estimator.closure import Closure, distances
+from visioncal.camera import intrinsics, project, with_intrinsics
+from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.stages.handeye import HandEyeResult, refit
-from visioncal.types import Camera, Corners, FloatArray, SolverName
+from visioncal.types import Camera, Corners, FloatArray, IntArray, SolverName
 
 # Up to here every view is left out by itself; beyond, ten groups tell the same.
 _MOST_FOLDS_OF_ONE = 30
@@ -35,15 +35,17 @@ class HeldOut:
 
 def validate(
     data: Closure,
+    stops: IntArray,
     result: HandEyeResult,
     solver: SolverName,
     corners: Sequence[tuple[Corners, FloatArray] | None],
     camera: Camera | None,
 ) -> HeldOut:
-    """Leaves views out, one by one or in ten groups, and predicts them from the others.
+    """Leaves stops out, one by one or in ten groups, and predicts their views from the others.
 
     Args:
         data: The used views.
+        stops: (m,) which stop of the robot each was taken at; they are left out together.
         result: The fit to all of them.
         solver: The solver to fit again with.
         corners: Each view's corners with their (n, 3) positions on the target [m], if any.
@@ -52,39 +54,57 @@ def validate(
     Returns:
         The residuals.
     """
-    count = len(data)
+    count = int(stops.max()) + 1
     folds = count if count <= _MOST_FOLDS_OF_ONE else _FOLDS
-    # Strides, so that a group's views are not neighbours.
-    fold = np.arange(count) % folds
-    away_m, away_rad, rms_px = np.zeros(count), np.zeros(count), np.full(count, np.nan)
+    # Strides, so that a group's stops are not neighbours.
+    fold = stops % folds
+    away_m, away_rad, rms_px = (np.full(len(data), np.nan) for _ in range(3))
     with one_blas_thread():
         for left_out in range(folds):
             held = fold == left_out
-            x, z = refit(data.subset(~held), result, solver)
-            away_m[held], away_rad[held] = distances(data.subset(held).placed(x), z)
-            rms_px[held] = chain_rms_px(
-                data.subset(held), x, z, [corners[int(at)] for at in np.flatnonzero(held)], camera
-            )
+            rest = data.subset(~held).merged(_renumbered(stops[~held]))
+            edges = refit(rest, result, solver)
+            left = data.subset(held)
+            placed = left.through(edges.lens).placed(edges.x)
+            away_m[held], away_rad[held] = distances(placed, edges.z)
+            seen = [corners[int(at)] for at in np.flatnonzero(held)]
+            rms_px[held] = chain_rms_px(left, edges, seen, camera)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
-    return HeldOut(method, away_m, away_rad, rms_px)
+    unit = "views" if count == len(data) else "stops of the robot"
+    return HeldOut(f"{method} over {unit}, of the hand-eye fit", away_m, away_rad, rms_px)
+
+
+def _renumbered(stops: IntArray) -> IntArray:
+    return np.unique(stops, return_inverse=True)[1].astype(np.int64)
 
 
 def chain_rms_px(
     data: Closure,
-    x: FloatArray,
-    z: FloatArray,
+    edges: Edges,
     corners: Sequence[tuple[Corners, FloatArray] | None],
     camera: Camera | None,
 ) -> FloatArray:
-    """Reprojection error of each view through the whole chain, (m,) [px]; NaN where unseen."""
+    """Reprojection error of each view through the whole chain, (m,) [px]; NaN where unseen.
+
+    The camera is the one that the views' poses were made with; the edges carry its change.
+    """
     rms = np.full(len(data), np.nan)
     if camera is None:
         return rms
-    for at, (pose, seen) in enumerate(zip(data.predicted_camera(x, z), corners, strict=True)):
+    changed = changed_lens(camera, edges.lens)
+    poses = data.predicted_camera(edges.x, edges.z)
+    for at, (pose, seen) in enumerate(zip(poses, corners, strict=True)):
         if seen is not None:
-            away = predict_corners(camera, pose, seen[1]) - seen[0].px
+            away = predict_corners(changed, pose, seen[1]) - seen[0].px
+            # A corner behind the camera counts as a whole image away.
+            away = np.nan_to_num(away, nan=float(max(camera.resolution)))
             rms[at] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
     return rms
+
+
+def changed_lens(camera: Camera, change: FloatArray) -> Camera:
+    """The camera with its (k,) intrinsics changed; k = 0 where they are held."""
+    return with_intrinsics(camera, intrinsics(camera) + change) if len(change) else camera
 
 
 def predict_corners(

@@ -1,0 +1,104 @@
+"""Converting sessions: the same facts in another form, and nothing overwritten."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from samples import made_up
+
+from visioncal.errors import DataError
+from visioncal.formats import convert
+from visioncal.pipeline import calibrate
+from visioncal.session import Session
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "cell, größer"
+    made_up(5).session.save(path)
+    return path
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """The bytes of every file, by its path in the folder."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_there_and_back_again(folder: Path, tmp_path: Path) -> None:
+    recording, again = tmp_path / "cell.rrd", tmp_path / "again"
+    convert(folder, recording)
+    convert(recording, again)
+    assert Session.load(recording).digest() == Session.load(folder).digest()
+    assert content(again) == content(folder)
+
+
+def test_a_recording_of_a_recording_and_a_folder_of_a_folder(folder: Path, tmp_path: Path) -> None:
+    for first, second in (("a.rrd", "b.RRD"), ("a", "b")):
+        convert(folder, tmp_path / first)
+        convert(tmp_path / first, tmp_path / second)
+        assert Session.load(tmp_path / second).digest() == Session.load(folder).digest()
+
+
+@pytest.mark.parametrize("name", ["taken", "taken.rrd"])
+def test_what_is_there_stays(folder: Path, tmp_path: Path, name: str) -> None:
+    taken = tmp_path / name
+    taken.write_bytes(b"kept")
+    with pytest.raises(DataError, match="exists, and nothing is overwritten"):
+        convert(folder, taken)
+    assert taken.read_bytes() == b"kept"
+
+
+def test_force_replaces_a_recording_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "old.rrd").write_bytes(b"old")
+    convert(folder, tmp_path / "old.rrd", force=True)
+    assert Session.load(tmp_path / "old.rrd").digest() == Session.load(folder).digest()
+    (tmp_path / "file").write_bytes(b"kept")
+    (tmp_path / "folder.rrd").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/file").write_bytes(b"kept")
+    for name in ("file", "folder.rrd", "full"):
+        with pytest.raises(DataError, match=name):
+            convert(folder, tmp_path / name, force=True)
+    assert (tmp_path / "file").read_bytes() == (tmp_path / "full/file").read_bytes() == b"kept"
+
+
+def test_a_recording_is_not_written_over_itself(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cell.rrd"
+    convert(folder, path)
+    before = path.read_bytes()
+    with pytest.raises(DataError, match="nothing is overwritten"):
+        convert(path, path, force=True)
+    assert path.read_bytes() == before
+
+
+def test_the_recording_that_comes_along_calibrates(tmp_path: Path) -> None:
+    path = Path(__file__).parents[1] / "recordings" / "ur10e_charuco.rrd"
+    assert path.stat().st_size < 3_000_000
+    folder = tmp_path / "ur10e_charuco"
+    convert(path, folder)
+    calibration = calibrate(folder)
+    assert calibration.session_sha256 == Session.load(path).digest()
+    assert calibration.verdict.status == "good"
+    assert calibration.camera is not None
+    assert calibration.camera.estimated
+
+
+@pytest.mark.parametrize("name", ["absent", "empty", "notes.txt"])
+def test_what_is_no_session_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("no session")
+    with pytest.raises(DataError, match=name):
+        convert(tmp_path / name, tmp_path / "new.rrd")
+    assert not (tmp_path / "new.rrd").exists()
+
+
+def test_the_command_converts_and_refuses(folder: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "visioncal", "convert", str(folder), str(tmp_path / "new.rrd")]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, encoding="utf-8")
+    assert done.returncode == 0, done.stderr
+    assert Session.load(folder).digest() in done.stderr
+    again = subprocess.run(command, check=False, capture_output=True, text=True, encoding="utf-8")
+    assert again.returncode == 2
+    assert "--force" in again.stderr

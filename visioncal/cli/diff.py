@@ -1,0 +1,111 @@
+"""`visioncal diff`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from visioncal.compare import Comparison, LensChange, Significance, compare, to_document
+from visioncal.stored import load_calibration
+
+# Under a nanometre and a micro-degree lies rounding.
+_DECIMALS = 6
+_WHOLE_PERCENT, _LEAST_PERCENT = 10.0, 0.01
+
+
+def diff_command(
+    first: Annotated[
+        Path, typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd).")
+    ],
+    second: Annotated[Path, typer.Argument(help="The one to compare with it.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
+) -> None:
+    """Tell what changed between two calibrations, and what is only noise.
+
+    Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
+    """
+    comparison = compare(load_calibration(first), load_calibration(second))
+    if as_json:
+        typer.echo(json.dumps(to_document(comparison), indent=2))
+        return
+    _print(comparison, (str(first), str(second)))
+
+
+def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    for order, path, mount, verdict in zip(
+        ("first", "second"), paths, comparison.mounts, comparison.verdicts, strict=True
+    ):
+        console.print(f"{order:<7} {path}: {mount}, verdict {verdict}")
+    for finding in comparison.findings:
+        console.print(f"- {finding}")
+    if comparison.edges:
+        console.print(_edge_table(comparison))
+    for name, where in (
+        *((it, "first") for it in comparison.only_in_a),
+        *((it, "second") for it in comparison.only_in_b),
+    ):
+        console.print(f"{name} is in the {where} only.")
+    lens = comparison.lens
+    if lens is not None and lens.significance is None and not lens.is_change:
+        console.print("The lens was given, and is the same in both.")
+    elif lens is not None:
+        console.print(_lens_table(lens))
+    console.print(_noise_table(comparison))
+
+
+def _edge_table(comparison: Comparison) -> Table:
+    table = _table("transform", "moved", "sigma", "moved / sigma", "by chance", "")
+    for edge in comparison.edges:
+        for moved, sigma, unit, test in (
+            (edge.moved_mm, edge.sigma_mm, "mm", edge.translation),
+            (edge.moved_deg, edge.sigma_deg, "deg", edge.rotation),
+        ):
+            table.add_row(
+                edge.name,
+                f"{round(moved, _DECIMALS):.3g} {unit}",
+                f"{sigma:.2g} {unit}",
+                f"{moved / sigma:.1f}" if sigma > 0.0 else "",
+                *_outcome(test),
+            )
+    return table
+
+
+def _lens_table(lens: LensChange) -> Table:
+    table = _table("lens", "first", "second", "difference", "sigma")
+    sigmas = [""] * len(lens.names)
+    if lens.sigmas is not None:
+        sigmas = [f"{sigma:.2g}" for sigma in lens.sigmas]
+    for name, a, b, sigma in zip(lens.names, lens.a, lens.b, sigmas, strict=True):
+        table.add_row(name, f"{a:.6g}", f"{b:.6g}", f"{b - a:+.3g}", sigma)
+    if lens.significance is not None:
+        chance, outcome = _outcome(lens.significance)
+        table.caption = f"all together: by chance {chance}, {outcome}"
+    return table
+
+
+def _noise_table(comparison: Comparison) -> Table:
+    table = _table("noise, per axis", "first", "second")
+    for it in comparison.noise:
+        values = ("" if value is None else f"{value:.3g}" for value in (it.a, it.b))
+        table.add_row(it.name, *values)
+    return table
+
+
+def _outcome(test: Significance) -> tuple[str, str]:
+    percent = 100 * test.p_value
+    chance = f"{percent:.0f} %" if percent > _WHOLE_PERCENT else f"{percent:.2g} %"
+    return (
+        "under 0.01 %" if percent < _LEAST_PERCENT else chance,
+        "changed" if test.is_change else "noise",
+    )
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, caption_justify="left")
+    for column in columns:
+        table.add_column(column, no_wrap=True)
+    return table

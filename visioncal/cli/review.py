@@ -1,0 +1,88 @@
+"""`visioncal review`."""
+
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from visioncal.cli.console import messages
+from visioncal.errors import DataError
+from visioncal.outputs import RECORDING
+
+# The first bytes of every recording that rerun writes.
+_MAGIC = b"RRF2"
+
+
+def review_command(
+    recording: Annotated[
+        Path, typer.Argument(help="A recording.rrd, or the folder that calibrate wrote it to.")
+    ],
+    web: Annotated[
+        bool, typer.Option("--web", help="Show it in a browser instead of a window.")
+    ] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="With --web: where to listen; a free one otherwise."),
+    ] = None,
+    no_open: Annotated[
+        bool, typer.Option("--no-open", help="With --web: print the URL and open no browser.")
+    ] = False,
+) -> None:
+    """Open a recording in the rerun viewer, on this machine alone.
+
+    With --web the page's URL goes to stdout, and only this machine can reach it. Ctrl-C ends.
+    """
+    if not web and (port is not None or no_open):
+        raise typer.BadParameter("--port and --no-open belong to --web.")
+    file = find_recording(recording)
+    # Half a second, which help need not wait for.
+    from visioncal.viewer import review_native, review_web
+
+    if not web:
+        review_native(file)
+        return
+
+    def opened(url: str) -> None:
+        typer.echo(url)
+        messages().print("Ctrl-C ends.")
+        if not no_open and not webbrowser.open(url):
+            messages().print("No browser could be opened; visit the address above.")
+
+    review_web(file, port or 0, opened)
+
+
+def find_recording(path: Path) -> Path:
+    """Finds the recording that is meant.
+
+    Args:
+        path: An `.rrd`, or a folder that holds recording.rrd.
+
+    Raises:
+        DataError: There is none, or it is no recording; a session's folder is told from others.
+    """
+    file = path / RECORDING if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
+        is_session = (path / "session.toml").is_file()
+        raise DataError(
+            f"{path} is a session, which has no recording yet."
+            if is_session
+            else f"{path} holds no {RECORDING}.",
+            culprits=[str(path)],
+            next_step=f"Calibrate first: visioncal calibrate {path if is_session else 'SESSION'} "
+            "-o OUT; then visioncal review OUT.",
+        )
+    try:
+        with file.open("rb") as stream:
+            magic = stream.read(len(_MAGIC))
+    except OSError as error:
+        raise DataError(
+            f"{file} cannot be read: {error.strerror or error}.", culprits=[str(file)]
+        ) from error
+    if magic != _MAGIC:
+        raise DataError(
+            f"{file} is no recording: its first bytes are not those of an .rrd.",
+            culprits=[str(file)],
+            next_step=f"Give the {RECORDING} that visioncal calibrate wrote.",
+        )
+    return file

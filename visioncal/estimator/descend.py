@@ -1,0 +1,49 @@
+"""Levenberg-Marquardt, for any problem that can linearise itself."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+State = TypeVar("State")
+
+_ITERATIONS = 100
+_START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised(Generic[State]):
+    """A problem at one state: its cost, and where a damped step leads to."""
+
+    state: State
+    cost: float
+    step: Callable[[float], State]
+
+
+def descend(
+    start: State, linearise: Callable[[State], Linearised[State]], settled: float
+) -> tuple[State, bool]:
+    """Minimises a sum of squares (Levenberg 1944; Marquardt 1963).
+
+    Args:
+        start: Where to begin.
+        linearise: Gives the cost at a state and the way on.
+        settled: Decrease of the cost under which the state has come to rest, relative to the
+            cost and one: in units of the noise, less than one is no difference.
+
+    Returns:
+        The state of the least cost, and whether it came to rest there.
+    """
+    now, damping = linearise(start), _START_DAMPING
+    for _ in range(_ITERATIONS):
+        then = linearise(now.step(damping))
+        if then.cost <= now.cost:
+            rested = now.cost - then.cost <= settled * (now.cost + 1.0)
+            now, damping = then, max(damping / 10, _LEAST_DAMPING)
+            if rested:
+                return now.state, True
+        else:
+            damping *= 10
+            # No step, however small, goes down any more: rounding is all that is left.
+            if damping > _WORST_DAMPING:
+                return now.state, True
+    return now.state, False

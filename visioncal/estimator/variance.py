@@ -1,0 +1,168 @@
+"""Noise levels from residuals: restricted maximum likelihood of variance components."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.estimator.linalg import covariance
+from visioncal.types import FloatArray
+
+# Standard deviations stay within these, in units of the residuals [rad and m].
+LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
+_ITERATIONS = 60
+# A step changes a sigma by a factor of e at most; 1e-4 of it is far below its own uncertainty.
+_LONGEST_STEP, _SETTLED = 1.0, 1e-4
+_WORST_DAMPING = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """What the covariance of m residuals of size d is made of: `known + sum sigma_k^2 parts_k`.
+
+    Attributes:
+        known: (m, d, d) the part that needs no estimate.
+        parts: (k, m, d, d) what each component adds, at a standard deviation of one.
+    """
+
+    known: FloatArray
+    parts: FloatArray
+
+    def total(self, sigmas: FloatArray) -> FloatArray:
+        """Covariances (m, d, d) of the residuals at some (k,) standard deviations."""
+        return np.asarray(self.known + np.tensordot(sigmas**2, self.parts, axes=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What is known of p parameters from elsewhere.
+
+    Attributes:
+        information: (p, p), zero on those of which nothing is known.
+        offset: (p,) how far the present state is from what is known.
+    """
+
+    information: FloatArray
+    offset: FloatArray
+
+
+@dataclass(frozen=True)
+class RatioPrior:
+    """What is known beforehand of the first two sigmas' ratio, as a log-normal.
+
+    Attributes:
+        ratio: The second over the first, typically.
+        spread: Standard deviation of the ratio's logarithm.
+    """
+
+    ratio: float
+    spread: float
+
+
+def estimate_sigmas(
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    components: Components,
+    known: Knowledge,
+    start: FloatArray,
+    prior: RatioPrior,
+) -> FloatArray:
+    """Estimates the standard deviations of variance components.
+
+    Maximises the restricted likelihood (Patterson and Thompson 1971; in the form of Harville 1977,
+    section 3), which accounts for the parameters that the residuals have been fitted with, by
+    Fisher's scoring on the logarithms of the sigmas. Start from above, and go down by short steps:
+    a long one may end in a false optimum without any noise.
+
+    Args:
+        residuals: (m, d) at a state near the best one.
+        jacobian: (m, d, p) their derivatives by the parameters.
+        components: What the covariance is made of.
+        known: What is known of the parameters from elsewhere.
+        start: (k,) sigmas to start from.
+        prior: Of the first two sigmas' ratio: it decides where the residuals cannot, because one
+            kind of them can be fitted away altogether.
+
+    Returns:
+        (k,) standard deviations.
+    """
+    limits = np.log([LEAST_SIGMA, MOST_SIGMA])
+    logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), *limits)
+    now, damping = _likelihood(residuals, jacobian, components, known, logs, prior), 1e-3
+    for _ in range(_ITERATIONS):
+        curvature = now.curvature + damping * np.eye(len(logs))
+        step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
+        candidate = np.clip(logs + step, *limits)
+        then = _likelihood(residuals, jacobian, components, known, candidate, prior)
+        if then.value <= now.value:
+            moved = np.abs(candidate - logs).max()
+            logs, now, damping = candidate, then, max(damping / 10, 1e-6)
+            if moved < _SETTLED:
+                break
+        else:
+            damping *= 10
+            if damping > _WORST_DAMPING:
+                break
+    return np.asarray(np.exp(logs), dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """Negative log-likelihood at some logarithms of the sigmas, its slope and its curvature."""
+
+    value: float
+    slope: FloatArray
+    curvature: FloatArray
+
+
+def _likelihood(
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    components: Components,
+    known: Knowledge,
+    logs: FloatArray,
+    prior: RatioPrior,
+) -> _Likelihood:
+    sigmas = np.exp(logs)
+    total = components.total(sigmas)
+    weights = np.linalg.inv(total)
+    weighted = weights @ jacobian
+    spread = covariance(np.einsum("mij,mik->jk", jacobian, weighted) + known.information)
+    pull = np.einsum("mij,mi->j", weighted, residuals) + known.information @ known.offset
+    best = spread @ pull
+    left = residuals - jacobian @ best
+    pulled = (weights @ left[:, :, None])[:, :, 0]
+    value = 0.5 * float(
+        np.linalg.slogdet(total)[1].sum()
+        - np.linalg.slogdet(spread)[1]
+        + np.einsum("mi,mi->", left, pulled)
+        + (known.offset - best) @ known.information @ (known.offset - best)
+    )
+    # How the residuals' covariance grows with the logarithm of each sigma.
+    growth = 2 * sigmas[:, None, None, None] ** 2 * components.parts
+    whitened = weights @ growth
+    carried = growth @ weighted
+    taken = _products(weighted[None], carried)[0]
+    traces = np.einsum("kmii->k", whitened) - np.einsum("jp,kpj->k", spread, taken)
+    slope = 0.5 * (traces - np.einsum("mi,kmi->k", pulled, (growth @ pulled[:, :, None])[..., 0]))
+    # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
+    both = _products(carried, weights @ carried)
+    shrunk = spread @ taken
+    curvature = 0.5 * (
+        np.einsum("kmij,lmji->kl", whitened, whitened)
+        - 2 * np.einsum("rj,kljr->kl", spread, both)
+        + np.einsum("kij,lji->kl", shrunk, shrunk)
+    )
+
+    offset = (logs[1] - logs[0] - np.log(prior.ratio)) / prior.spread
+    lean = np.zeros(len(logs))
+    lean[:2] = np.array([-1.0, 1.0]) / prior.spread
+    return _Likelihood(
+        value + 0.5 * float(offset**2), slope + offset * lean, curvature + np.outer(lean, lean)
+    )
+
+
+def _products(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Sums over residuals of `left_k^T right_l`, of (k, m, d, p) and (l, m, d, p): (k, l, p, p)."""
+    columns = left.shape[-1]
+    rows_l, rows_r = left.reshape(len(left), -1, columns), right.reshape(len(right), -1, columns)
+    return np.asarray(np.swapaxes(rows_l, 1, 2)[:, None] @ rows_r[None])

@@ -1,0 +1,128 @@
+"""Opens a stream of rerun that writes to a file, and finds out whether it could."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from uuid import uuid4
+
+import rerun as rr
+from rerun.blueprint import BlueprintLike
+
+from visioncal.errors import DataError
+from visioncal.recording import paths
+from visioncal.recording.frames import scan
+
+# Room for one more view, however large its image, and for the end of the file.
+_ROOM_BYTES = 100_000_000
+
+
+class Recorder:
+    """A stream of rerun that writes to a file.
+
+    Attributes:
+        stream: Where to log.
+    """
+
+    def __init__(
+        self, path: Path, *, recording_id: str | None = None, blueprint: BlueprintLike | None = None
+    ) -> None:
+        """Begins the file.
+
+        Args:
+            path: The `.rrd`; one that is there is replaced.
+            recording_id: Of the recording that the file is a part of; None where it is one.
+            blueprint: The layout to open it in.
+
+        Raises:
+            OSError: The file cannot be created.
+        """
+        self._path = path
+        self.stream = rr.RecordingStream(
+            paths.APPLICATION, recording_id=recording_id, send_properties=recording_id is None
+        )
+        _check_room(path.parent)
+        try:
+            self.stream.save(path, default_blueprint=blueprint)
+        except RuntimeError as error:
+            # This is how rerun reports a file that it cannot create.
+            raise OSError(str(error)) from error
+
+    def at(self, row: int) -> None:
+        """Says which view is logged next, by its place in the session.
+
+        Raises:
+            OSError: There is too little room for another view.
+        """
+        _check_room(self._path.parent)
+        self.stream.set_time(paths.TIMELINE, sequence=row)
+
+    def keep(self) -> None:
+        """Hands what was logged to the operating system: it survives the death of the process."""
+        self.stream.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Writes the end of the file, and waits until it is on the disk.
+
+        Raises:
+            OSError: The file could not be written.
+        """
+        self.stream.disconnect()
+        if kind is not None:
+            return
+        # Rerun only prints that it could not write.
+        if not scan(self._path).finished:
+            raise OSError("its end is missing; the disk may be full")
+        with self._path.open("r+b") as file:
+            os.fsync(file.fileno())
+
+
+def _check_room(folder: Path) -> None:
+    """Stops in time: on a full disk, rerun's own thread dies and whoever waits for it hangs."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < _ROOM_BYTES:
+        raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")
+
+
+@contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """Gives a name for a file in the same folder, which is removed in the end if it is there.
+
+    Raises:
+        DataError: What is done within cannot be written; it names `path`.
+    """
+    aside = path.parent / f".{uuid4().hex}.tmp"
+    with named_errors(path):
+        try:
+            yield aside
+        finally:
+            with suppress(OSError):
+                aside.unlink(missing_ok=True)
+
+
+@contextmanager
+def named_errors(path: Path) -> Iterator[None]:
+    """Turns an error of the operating system into one that names the recording.
+
+    Raises:
+        DataError: In its place.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be written: {error.strerror or error}.",
+            culprits=[str(path)],
+            next_step="Choose a folder that exists, can be written, and has room.",
+        ) from error

@@ -1,0 +1,151 @@
+"""How well the edges are known, in the cell: ellipsoids, and where each view puts the target.
+
+Both are far too small to be seen at their true size, so both are drawn larger by one factor,
+which their names tell.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from visioncal.calibration import Calibration, Edge
+from visioncal.evidence import ViewEvidence
+from visioncal.recording import colours, paths
+from visioncal.transforms import invert, mean_transform
+from visioncal.types import FloatArray
+
+_SIGMAS = 2.0
+# How large the largest of them is drawn, as a share of the cell's size.
+_SHARE = 0.07
+_POINT, _LINE = 0.005, 0.0015
+# What lies at the child's end of each edge, whose frame its covariance is given in.
+_ENTITIES = {"cam": paths.CAMERA, "target": paths.TARGET}
+_FRAMES = {"cam": paths.CAM_FRAME, "target": paths.TARGET_FRAME}
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What is drawn of the uncertainty.
+
+    Attributes:
+        edges: The estimated edges by name.
+        scatter_m: By view, how far from the mean it puts the target: (3,) in the target's frame.
+        used: The views that the fit used.
+        factor: How many times larger than it is everything is drawn.
+        size_m: The cell's size [m].
+    """
+
+    edges: Mapping[str, Edge]
+    scatter_m: Mapping[int, FloatArray]
+    used: frozenset[int]
+    factor: int
+    size_m: float
+
+    @classmethod
+    def of(
+        cls, calibration: Calibration, evidence: Mapping[int, ViewEvidence], size_m: float
+    ) -> "Uncertainty":
+        """Collects the placements and chooses the factor by the used views."""
+        used = frozenset(view.view for view in calibration.views if view.used)
+        scatter_m = _scatter_m(calibration, evidence, used)
+        sizes_m = [_SIGMAS * _axes(edge)[0].max() for edge in calibration.edges.values()]
+        sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
+        factor = _round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
+        return cls(calibration.edges, scatter_m, used, factor, size_m)
+
+    def log_static(self, stream: rr.RecordingStream) -> None:
+        """Draws the ellipsoids, and all views' placements of the target."""
+        for name, edge in self.edges.items():
+            child = name.rpartition("_from_")[2]
+            sigmas_m, axes = _axes(edge)
+            ellipsoid = rr.Ellipsoids3D(
+                half_sizes=[_SIGMAS * self.factor * sigmas_m],
+                quaternions=[Rotation.from_matrix(axes).as_quat()],
+                colors=colours.UNCERTAINTY,
+                line_radii=_LINE * self.size_m,
+            )
+            # Above the camera and beside the board, clear of the name of the frame.
+            label = rr.Points3D(
+                [[0.0, -1.2 * _SHARE * self.size_m, 0.0]],
+                radii=0.0,
+                colors=colours.UNCERTAINTY,
+                labels=f"{_SIGMAS:g} sigma, {self.factor} x",
+                show_labels=True,
+            )
+            frame = rr.CoordinateFrame(_FRAMES[child])
+            entity = f"{_ENTITIES[child]}/{name}_{_SIGMAS:g}_sigma_magnified_{self.factor}x"
+            stream.log(entity, frame, ellipsoid, static=True)
+            stream.log(f"{entity}/label", frame, label, static=True)
+        for name, colour, wanted in (
+            (paths.USED, colours.USED, True),
+            (paths.REJECTED, colours.REJECTED, False),
+        ):
+            some = [it for view, it in self.scatter_m.items() if (view in self.used) is wanted]
+            if some:
+                self._log_scatter(stream, name, some, colour, static=True)
+
+    def log_view(self, stream: rr.RecordingStream, view: int) -> None:
+        """Marks one view's placement of the target, at the stream's current time."""
+        some = [self.scatter_m[view]] if view in self.scatter_m else []
+        self._log_scatter(stream, paths.THIS_VIEW, some, colours.THIS_VIEW, static=False)
+
+    def _log_scatter(
+        self,
+        stream: rr.RecordingStream,
+        name: str,
+        scatter_m: list[FloatArray],
+        colour: tuple[int, int, int],
+        *,
+        static: bool,
+    ) -> None:
+        positions_m = self.factor * np.reshape(scatter_m, (-1, 3))
+        larger = 1.5 if name == paths.THIS_VIEW else 1.0
+        points = rr.Points3D(positions_m, colors=colour, radii=larger * _POINT * self.size_m)
+        entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{name}"
+        stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), points, static=static)
+
+
+def _axes(edge: Edge) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations (3,) [m] along the columns of a (3, 3) rotation, in the child's frame."""
+    variances_m2, axes = np.linalg.eigh(edge.covariance[3:, 3:])
+    return np.sqrt(np.clip(variances_m2, 0.0, None)), axes * np.sign(np.linalg.det(axes))
+
+
+def _scatter_m(
+    calibration: Calibration, evidence: Mapping[int, ViewEvidence], used: frozenset[int]
+) -> dict[int, FloatArray]:
+    """By view, the target's place less its mean over the used views, in the target's frame."""
+    placed = {
+        view: pose
+        for view, it in evidence.items()
+        if (pose := _placed(calibration, it)) is not None
+    }
+    some = [placed[view] for view in used if view in placed]
+    if not some:
+        return {}
+    mean_from_parent = invert(mean_transform(np.stack(some)))
+    return {view: (mean_from_parent @ pose)[:3, 3] for view, pose in placed.items()}
+
+
+def _placed(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
+    """(4, 4) the target as this view alone puts it, in the frame that carries it."""
+    if seen.base_from_flange is None or seen.cam_from_target is None:
+        return None
+    edges = calibration.transforms
+    if "flange_from_cam" in edges:
+        flange_from_cam = edges["flange_from_cam"].as_matrix()
+        return np.asarray(seen.base_from_flange @ flange_from_cam @ seen.cam_from_target)
+    base_from_cam = edges["base_from_cam"].as_matrix()
+    return np.asarray(invert(seen.base_from_flange) @ base_from_cam @ seen.cam_from_target)
+
+
+def _round_factor(wanted_m: float, size_m: float) -> int:
+    """The largest of 1, 2, 5, 10, 20 ... by which a size stays under the wanted one."""
+    if not size_m > 0.0:
+        return 1
+    ratio = max(wanted_m / size_m, 1.0)
+    decade = 10 ** int(np.floor(np.log10(ratio)))
+    return int(max(step * decade for step in (1, 2, 5) if step * decade <= ratio))

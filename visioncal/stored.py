@@ -1,0 +1,88 @@
+"""Finds again what an earlier calibration has written."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from visioncal.calibration import Calibration, to_document
+from visioncal.errors import DataError
+from visioncal.evidence import ViewEvidence
+from visioncal.outputs import RECORDING
+from visioncal.session import Session
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A result, with all that was kept of the way to it.
+
+    Attributes:
+        calibration: The result.
+        session: What it was computed from; None where it was not kept.
+        evidence: What was seen and computed of each view; empty likewise.
+        note: Why something is missing, in words for the user; empty where nothing is.
+    """
+
+    calibration: Calibration
+    session: Session | None
+    evidence: tuple[ViewEvidence, ...]
+    note: str = ""
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Loads a result.
+
+    Args:
+        path: An output folder, its calibration.json, or a recording with a result.
+
+    Raises:
+        DataError: There is none, or it cannot be read.
+    """
+    if path.suffix.lower() != ".rrd":
+        return Calibration.load(path)
+    # The codec takes half a second to import, which a calibration.json need not wait for.
+    from visioncal.recording import read_calibration
+
+    calibration = read_calibration(path)
+    if calibration is None:
+        raise DataError(
+            f"{path} is the recording of a session without a result.",
+            culprits=[str(path)],
+            next_step=f"Run visioncal calibrate {path} first.",
+        )
+    return calibration
+
+
+def load_stored(path: Path) -> Stored:
+    """Loads a result with its session and evidence, from the recording or the one beside it.
+
+    Args:
+        path: An output folder, its calibration.json, or a recording with a result.
+
+    Raises:
+        DataError: There is no result, or it cannot be read. A recording that is missing beside a
+            calibration.json, is damaged or belongs to another result is no error but noted.
+    """
+    calibration = load_calibration(path)
+    if path.suffix.lower() == ".rrd":
+        return _with_recording(calibration, path)
+    recording = (path if path.is_dir() else path.parent) / RECORDING
+    if not recording.is_file():
+        return _alone(calibration, f"There is no {RECORDING} beside this result.")
+    try:
+        recorded = load_calibration(recording)
+        if to_document(recorded) != to_document(calibration):
+            return _alone(calibration, f"The {RECORDING} beside this result holds another one.")
+        return _with_recording(calibration, recording)
+    except DataError as error:
+        return _alone(calibration, error.message)
+
+
+def _with_recording(calibration: Calibration, recording: Path) -> Stored:
+    from visioncal.recording import read_evidence, read_session
+
+    return Stored(calibration, read_session(recording), read_evidence(recording))
+
+
+def _alone(calibration: Calibration, why: str) -> Stored:
+    return Stored(
+        calibration, None, (), f"{why} Pictures, coverage and joint angles are left out here."
+    )

@@ -1,0 +1,189 @@
+"""The layout in which the rerun viewer opens a recording."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from visioncal.calibration import Calibration
+from visioncal.recording import paths
+from visioncal.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
+from visioncal.session import Session
+
+# Distance of the eye from the cell's centre, in extents of all that the cell holds.
+_EYE_DISTANCE = 0.8
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """What a session has to show."""
+
+    images: bool
+    joints: int
+
+
+def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
+    """Lays out a recording of a session and its result.
+
+    The first tab shows the verdict, the cell and the image; others the residuals, what the views
+    cover, and the solvers.
+
+    Args:
+        session: The session; what it does not have gets no room.
+        calibration: Its result, by which the eye finds camera and target too.
+
+    Returns:
+        The layout, to be written into the recording.
+    """
+    joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
+    contents = _Contents(any(view.image for view in session.views), min(joints, default=0))
+    tabs = rrb.Tabs(
+        _overview(contents, _eye(session, calibration)),
+        _residuals(contents),
+        _coverage(contents),
+        rrb.Horizontal(
+            rrb.TextDocumentView(name="Residuals and noise", origin=paths.FIGURES),
+            rrb.TextDocumentView(name="Solvers", origin=paths.SOLVERS),
+            name="Figures",
+            column_shares=[2, 3],
+        ),
+        active_tab=0,
+    )
+    return rrb.Blueprint(
+        tabs,
+        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.TIMELINE, play_state="paused"),
+        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
+        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+    )
+
+
+def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Container:
+    cell = rrb.Spatial3DView(
+        name="Cell",
+        origin="/",
+        contents=_cell_contents(contents),
+        eye_controls=eye,
+        spatial_information=rrb.SpatialInformation(
+            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        ),
+    )
+    plots = _plots(contents)
+    left = rrb.Vertical(cell, rrb.Horizontal(plots[0], plots[-1]), row_shares=[3, 1])
+    verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
+    if not contents.images:
+        right = rrb.Vertical(verdict, note, row_shares=[2, 1])
+        return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
+    image = rrb.Spatial2DView(
+        name="Image: green detected, blue predicted, red residual",
+        origin=paths.IMAGE,
+        contents=["$origin/**"],
+    )
+    right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
+    return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _residuals(contents: _Contents) -> rrb.Container:
+    over_views = rrb.Horizontal(*_plots(contents))
+    if contents.joints == 0:
+        return rrb.Vertical(over_views, name="Residuals")
+    over_joints = rrb.Grid(
+        *(
+            rrb.BarChartView(
+                name=f"Position residual [mm] over q{joint + 1} [deg]",
+                origin=paths.over_joint(joint),
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for joint in range(contents.joints)
+        ),
+        grid_columns=min(contents.joints, 4) if contents.joints != 6 else 3,
+    )
+    return rrb.Vertical(over_views, over_joints, name="Residuals", row_shares=[1, 2])
+
+
+def _coverage(contents: _Contents) -> rrb.Container:
+    directions = _disc(
+        "Where the camera looks from, about the target's normal",
+        paths.DIRECTIONS,
+        DIRECTIONS_RINGS_DEG,
+    )
+    axes = _disc(
+        "Axes of rotation from view to view, about the flange's z",
+        paths.ROTATION_AXES,
+        AXES_RINGS_DEG,
+    )
+    if not contents.images:
+        return rrb.Horizontal(directions, axes, name="Coverage")
+    image = rrb.Spatial2DView(
+        name="Corners of all views in the image",
+        origin=paths.IMAGE_COVERAGE,
+        contents=["$origin/**"],
+    )
+    return rrb.Horizontal(
+        image, rrb.Vertical(directions, axes), name="Coverage", column_shares=[1.6, 1]
+    )
+
+
+def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DView:
+    """A chart of directions, with room for the words around its rim."""
+    reach_deg = 1.2 * rings_deg[-1]
+    bounds = rrb.VisualBounds2D(x_range=(-reach_deg, reach_deg), y_range=(-reach_deg, reach_deg))
+    return rrb.Spatial2DView(
+        name=f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})",
+        origin=entity,
+        contents=["$origin/**"],
+        visual_bounds=bounds,
+    )
+
+
+def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
+    """Looks at the cell from the side, from where all of it fills the view."""
+    poses = [pose for view in session.views if (pose := view.base_from_flange()) is not None]
+    if not poses:
+        return None
+    edges = {} if calibration is None else calibration.transforms
+    fixed = [edge.translation for name, edge in edges.items() if name.startswith("base_from_")]
+    places = np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed])
+    low, high = places.min(axis=0), places.max(axis=0)
+    centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    forward = centre[:2] / max(float(np.linalg.norm(centre[:2])), 1e-9)
+    # From the robot's right and its front, above the table.
+    direction = np.array([forward[1] + 0.6 * forward[0], 0.6 * forward[1] - forward[0], 0.6])
+    return rrb.EyeControls3D(
+        position=centre + _EYE_DISTANCE * size_m * direction, look_target=centre
+    )
+
+
+def _cell_contents(contents: _Contents) -> list[str]:
+    entities = [
+        paths.BASE,
+        paths.ROBOT,
+        paths.FLANGE,
+        paths.STOPS,
+        paths.CAMERA,
+        paths.TARGET,
+        paths.SEEN_TARGET,
+    ]
+    # The image's overlays would float as a crowd of points in the frustum.
+    hidden = [f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"] if contents.images else []
+    return [*(f"+ {entity}/**" for entity in entities), *hidden]
+
+
+def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
+    wanted = [
+        ("Position residual [mm]", paths.POSITION_MM),
+        ("Orientation residual [deg]", paths.ORIENTATION_DEG),
+    ]
+    if contents.images:
+        wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
+    return [
+        rrb.TimeSeriesView(
+            name=name,
+            origin=entity,
+            contents=["$origin/**"],
+            # At the left below are the marks of views that were not used.
+            plot_legend=rrb.Corner2D.RightTop,
+        )
+        for name, entity in wanted
+    ]

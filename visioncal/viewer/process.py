@@ -1,0 +1,81 @@
+"""Rerun's viewer as a process of its own, which reaches no other machine and leaves none behind."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+_PATIENCE_S = 5.0
+# Nothing listens at the port of the discard service, so what goes there ends there.
+_NOWHERE = "http://127.0.0.1:9"
+
+
+@contextmanager
+def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Runs rerun's viewer; leaving the block ends it with all that it has started.
+
+    Args:
+        arguments: Those of the `rerun` command. What it writes can be read from `stdout`.
+
+    Yields:
+        The process, which leads a group of its own.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rerun_cli", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        env=_quiet(os.environ),
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        _end_group(process)
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Runs a block that Ctrl-C or SIGTERM ends as its ordinary end, not as an error."""
+    previous = {
+        number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        with suppress(KeyboardInterrupt):
+            yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - signal's interface
+    raise KeyboardInterrupt
+
+
+def _quiet(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment in which the viewer sends no statistics and asks for no newer version.
+
+    It sends none where it believes itself under continuous integration, and it asks through the
+    proxy; both leave the user's own settings of rerun as they are.
+    """
+    quiet = {key: it for key, it in environment.items() if key != "FORCE_RERUN_ANALYTICS"}
+    proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
+    return quiet | proxies | {"CI": "1", "NO_COLOR": "1"}
+
+
+def _end_group(process: subprocess.Popen[str]) -> None:
+    """Ends a process and those that it started; rerun's command starts the viewer as a child."""
+    # Both signals: the command may have ended while its child has not.
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_PATIENCE_S)
+    if process.stdout is not None:
+        process.stdout.close()
