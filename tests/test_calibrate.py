@@ -289,6 +289,119 @@ def test_a_wrong_lens_spoils_the_verdict(rendered, session_copy):
     assert verdict.status == "bad"
 
 
+def test_one_view_off_by_five_millimetres_is_named(tmp_path):
+    folder = write_session(simulate(CellOptions(views=15, seed=3)), tmp_path / "five", images=False)
+
+    def shifted(header, rows):
+        at = header.split(",").index("x_m")
+        cells = rows[4].split(",")
+        cells[at] = repr(float(cells[at]) + 0.005)
+        return header, [*rows[:4], ",".join(cells), *rows[5:]]
+
+    with_rows(folder, shifted)
+    verdict = visioncal.calibrate(folder).verdict
+    assert verdict.status != "good"
+    assert any("View 4 stands out" in it for it in verdict.reasons)
+
+
+def test_looking_again_and_again_from_one_stop_adds_no_views(tmp_path):
+    cell = simulate(CellOptions(views=4, seed=5, pixel_sigma_px=0.2))
+    folder = write_session(cell, tmp_path / "again", images=False)
+
+    def repeated(_, rows):
+        many = [row.split(",", 1)[1] for row in rows for _ in range(6)]
+        return _, [f"{at},{row}" for at, row in enumerate(many)]
+
+    with_rows(folder, repeated)
+    again = visioncal.calibrate(folder)
+    assert again.verdict.status == "bad"
+    assert any("Only 4 stops are used" in it for it in again.verdict.reasons)
+    assert "stops of the robot" in again.validation.method
+
+
+def test_images_and_measured_poses_in_one_session(session_copy, result):
+    """Some rows bring the target's pose themselves, the lens being estimated from the others."""
+    evidence = {it.view: it for it in run(session_copy).evidence}
+    names = [f"cft_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+
+    def measured(header, rows):
+        image = header.split(",").index("image")
+        out = []
+        for at, row in enumerate(rows):
+            cells = row.split(",")
+            pose = [""] * 7
+            if at < 3:
+                matrix = evidence[at].cam_from_target
+                cells[image] = ""
+                quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+                pose = [repr(float(it)) for it in (*matrix[:3, 3], *quaternion)]
+            out.append(",".join([*cells, *pose]))
+        return ",".join([header, *names]), out
+
+    with_rows(session_copy, measured)
+    mixed = visioncal.calibrate(session_copy)
+    assert all(view.used for view in mixed.views)
+    step = invert(result.transforms["flange_from_cam"].as_matrix()) @ (
+        mixed.transforms["flange_from_cam"].as_matrix()
+    )
+    assert 1e3 * np.linalg.norm(step[:3, 3]) < 4 * result.edges["flange_from_cam"].sigma_mm
+    # The noise of the measured poses is not known: both kinds are estimated as one.
+    assert "combined_translation_mm" in mixed.noise
+
+
+def test_a_spoilt_image_that_is_held_back_changes_nothing(session_copy):
+    def hold(header, rows):
+        marks = ["holdout" if at == 3 else "" for at in range(len(rows))]
+        return f"{header},role", [f"{row},{mark}" for row, mark in zip(rows, marks, strict=True)]
+
+    with_rows(session_copy, hold)
+    before = visioncal.calibrate(session_copy)
+    image = sorted((session_copy / "images").iterdir())[3]
+    image.write_bytes(image.read_bytes()[:5000])
+    after = visioncal.calibrate(session_copy)
+    np.testing.assert_array_equal(
+        after.transforms["flange_from_cam"].as_matrix(),
+        before.transforms["flange_from_cam"].as_matrix(),
+    )
+    assert after.verdict.status == before.verdict.status == "good"
+    assert "cut short" in after.views[3].reason
+
+
+def test_joints_of_another_robot_do_not_stop_a_session_with_poses(session_copy):
+    def without_the_last_joint(header, rows):
+        columns = header.split(",")
+        keep = [at for at, name in enumerate(columns) if name != "q6_rad"]
+        cut = [",".join(np.array(row.split(","))[keep]) for row in rows]
+        return ",".join(np.array(columns)[keep]), cut
+
+    with_rows(session_copy, without_the_last_joint)
+    verdict = visioncal.calibrate(session_copy).verdict
+    assert any("Joint angles were not used: there are 5" in it for it in verdict.reasons)
+
+
+def test_a_refusal_tells_what_became_of_the_views(session_copy):
+    for path in sorted((session_copy / "images").iterdir())[2:]:
+        path.unlink()
+    with pytest.raises(DataError, match="2 views show the target") as caught:
+        visioncal.calibrate(session_copy)
+    assert any("images/002.png is missing" in it for it in caught.value.culprits)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [("1e300", "x_m"), ("1e9", "no place in a robot cell")]
+)
+def test_a_number_that_is_no_place_is_refused(session_copy, value, words):
+    def absurd(header, rows):
+        at = header.split(",").index("x_m")
+        cells = rows[0].split(",")
+        cells[at] = value
+        return header, [",".join(cells), *rows[1:]]
+
+    with_rows(session_copy, absurd)
+    with pytest.raises(DataError, match=words):
+        visioncal.calibrate(session_copy)
+
+
 def test_progress_tells_of_every_stage_and_image(rendered):
     told = []
     run(rendered, progress=lambda stage, done, total: told.append((stage, done, total)))

@@ -118,6 +118,7 @@ def test_every_unusable_view_gets_its_reason(charuco):
         "text.png": b"no image at all",
         "cut.png": good[: len(good) // 2],
         "cut.jpg": jpeg[: len(jpeg) // 2],
+        "damaged.png": good[:9000] + bytes([good[9000] ^ 64]) + good[9001:],
         "uniform.png": encoded(row),
         "blurred.png": encoded(blurred),
         "good.jpg": jpeg,
@@ -132,6 +133,7 @@ def test_every_unusable_view_gets_its_reason(charuco):
         ("text.png", "decoded"),
         ("cut.png", "cut short"),
         ("cut.jpg", "cut short"),
+        ("damaged.png", "damaged"),
         ("uniform.png", "uniform"),
         ("blurred.png", "blurred"),
     ):

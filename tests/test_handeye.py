@@ -226,7 +226,7 @@ def test_translation_alone_is_refused(mount):
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_fewer_than_three_views_are_refused(count):
     x, z = some_edges()
-    with pytest.raises(DegenerateError, match=f"{count} usable views, at least 3"):
+    with pytest.raises(DegenerateError, match=f"{count} usable stops of the robot, at least 3"):
         solve_hand_eye(made_up(some_motion(count), x, z))
 
 

@@ -32,16 +32,21 @@ def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
     from visioncal.report import write_report
     from visioncal.viewer import blueprint
 
+    files = (RECORDING, REPORT, CALIBRATION)
+    taken = [folder / file for file in files if (folder / file).is_dir()]
+    if taken:
+        raise DataError(
+            f"{taken[0]} is a folder, where a file is to be written.", culprits=[str(taken[0])]
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
             aside = Path(name)
             run.calibration.save(aside / CALIBRATION)
             write_report(aside / REPORT, run.calibration, session, run.evidence)
-            write_recording(
-                aside / RECORDING, session, run.calibration, run.evidence, blueprint(session)
-            )
-            for file in (RECORDING, REPORT, CALIBRATION):
+            layout = blueprint(session, run.calibration)
+            write_recording(aside / RECORDING, session, run.calibration, run.evidence, layout)
+            for file in files:
                 (aside / file).replace(folder / file)
     except OSError as error:
         raise DataError(

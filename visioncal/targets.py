@@ -20,6 +20,9 @@ from visioncal.types import FloatArray, IntArray, Target
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
 DEFAULT_RELATIVE_SIGMA = 1e-3
 
+# No printed square is larger; a larger number is in millimetres.
+_LARGEST_M = 1.0
+
 # Fewer do not determine a pose robustly; more do not fit a printable board.
 _MIN_SQUARES, _MAX_SQUARES = 3, 100
 
@@ -79,7 +82,7 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
         return _marker(table, name)
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
-    square_m = table.number("square_m", positive=True)
+    square_m = _size(table, "square_m")
     sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * square_m, positive=True)
     if kind == "checkerboard":
         return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
@@ -98,8 +101,15 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     return Target(name, "charuco", columns, rows, square_m, sigma_m, marker_m, dictionary, legacy)
 
 
+def _size(table: Table, key: str) -> float:
+    size_m = table.number(key, positive=True)
+    if size_m > _LARGEST_M:
+        raise table.refuse(key, size_m, f"metres, such as {1e-3 * size_m:g} for {size_m:g} mm")
+    return size_m
+
+
 def _marker(table: Table, name: str) -> Target:
-    size_m = table.number("size_m", positive=True)
+    size_m = _size(table, "size_m")
     sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
     dictionary = table.text("dictionary")
     marker_id = table.integer("id", 0, _dictionary_size(table, dictionary) - 1)

@@ -23,7 +23,7 @@ def demo_command(
         Path, typer.Option("-o", "--out", help="Folder for the session and its result.")
     ] = Path("demo"),
     views: Annotated[int, typer.Option(min=3, help="Number of views.")] = 20,
-    seed: Annotated[int, typer.Option(help="Another cell for every number.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
     """Simulate a UR cell, calibrate it from its images, and compare with the truth.
 

@@ -36,10 +36,10 @@ def simulate_command(
         Literal["charuco", "checkerboard"], typer.Option(help="What is printed.")
     ] = "charuco",
     robot_sigma_mm: Annotated[
-        float, typer.Option(min=0.0, help="Repeatability of the robot [mm].")
+        float, typer.Option(min=0.0, max=100.0, help="Repeatability of the robot [mm].")
     ] = 0.03,
     robot_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, help="Repeatability of its rotation [mrad].")
+        float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation [mrad].")
     ] = 0.05,
     wrong_views: Annotated[
         int, typer.Option(min=0, help="Views whose reported pose is wrong.")
@@ -53,7 +53,7 @@ def simulate_command(
     images: Annotated[
         bool, typer.Option(help="Whether to render images; pose pairs are written otherwise.")
     ] = True,
-    seed: Annotated[int, typer.Option(help="Another cell for every number.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
     """Write a simulated session, and its truth in a file beside it."""
     options = CellOptions(

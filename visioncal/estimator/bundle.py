@@ -60,7 +60,7 @@ class _Blocks:
         """
         damped = self.by_pose + damping * self.by_pose * np.eye(6)
         right = np.concatenate([self.between, self.pose_gradient[:, :, None]], axis=2)
-        answer = np.linalg.solve(damped, right)
+        answer = covariance(damped) @ right
         taken = np.swapaxes(self.between, 1, 2) @ answer
         taken = taken.sum(axis=0)
         return (

@@ -107,7 +107,7 @@ class Closure:
 
     def through(self, lens_change: FloatArray) -> "Closure":
         """Returns the views as seen through a lens that is changed by (k,) intrinsics."""
-        if self.lens is None:
+        if self.lens is None or not len(lens_change):
             return self
         return replace(self, camera=self.camera @ exp(self.lens.shift @ lens_change))
 

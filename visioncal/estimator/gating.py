@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.corners import CornerStack, mean_square_by_view
+from visioncal.estimator.planar import determines_pose
 from visioncal.types import FloatArray, Mask
 
 # Views differ in noise by two or so, and eight sigma of all are four of the noisiest; a corner that
@@ -16,9 +17,9 @@ _CORNER_SIGMAS = 8.0
 _VIEW_RATIO = 5.0
 # No corner and no view is thrown out for less [px]: such errors do no harm.
 _CORNER_FLOOR_PX, _VIEW_FLOOR_PX = 0.5, 1.0
-# A view that loses more than this share of its corners is wrong as a whole; so is one that keeps
-# too few for a homography.
-_CORNER_SHARE, _FEWEST_CORNERS = 0.5, 4
+# A view that loses more than this share of its corners is wrong as a whole; so is one whose
+# remaining corners do not determine its pose.
+_CORNER_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +53,21 @@ def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
     rms = np.sqrt(mean_square_by_view(stack, residuals))
     limit = max(_VIEW_RATIO * float(np.median(rms)), _VIEW_FLOOR_PX)
     kept = stack.sum_by_view(passes.astype(float))
-    too_few = (kept < (1 - _CORNER_SHARE) * stack.counts) | (kept < _FEWEST_CORNERS)
     # A few wrong corners spoil a view's rms without spoiling the view.
     inner = np.sqrt(mean_square_by_view(stack, residuals * passes[:, None]))
-    wrong = too_few | ((rms > limit) & (inner > limit))
-    reasons = {
-        view: f"residual too large: {value:.2f} px (limit {limit:.2f}, set by the other views)"
-        for view, value, is_wrong in zip(stack.views, rms, wrong, strict=True)
-        if is_wrong
-    }
+    reasons = {}
+    for at, view in enumerate(stack.views):
+        places = stack.points[(stack.view_of == at) & passes]
+        if (rms[at] > limit) & (inner[at] > limit):
+            reasons[view] = (
+                f"residual too large: {rms[at]:.2f} px (limit {limit:.2f}, set by the other views)"
+            )
+        elif kept[at] < (1 - _CORNER_SHARE) * stack.counts[at] or (
+            kept[at] < stack.counts[at] and not determines_pose(places)
+        ):
+            reasons[view] = (
+                f"residual too large: only {kept[at]:.0f} of {stack.counts[at]} corners fit one pose "
+                f"of the board, the rms is {rms[at]:.2f} px"
+            )
+    wrong = np.isin(stack.views, list(reasons))
     return Gate(passes & ~wrong[stack.view_of], reasons)

@@ -126,8 +126,8 @@ def _too_few(data: Closure) -> DegenerateError:
         culprit += f" along the {_frame(data.mount)}'s {_axis(_main_axis(_turns(data)))}"
         cause = f"two views share that axis of rotation, and {cause}"
     return DegenerateError(
-        f"hand-eye: {len(data)} usable views, at least {FEWEST_VIEWS} are needed; {culprit} is "
-        f"not determined: {cause}.",
+        f"hand-eye: {len(data)} usable stops of the robot, at least {FEWEST_VIEWS} are needed; "
+        f"{culprit} is not determined: {cause}.",
         culprits=[culprit],
         next_step=_advice(data.mount),
     )

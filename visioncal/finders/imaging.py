@@ -1,7 +1,11 @@
 """Decoding image files, and measuring how sharp they are."""
 
+import zlib
+from typing import Any
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 from scipy.special import ndtri
 
 from visioncal.types import FloatArray, Image
@@ -31,14 +35,23 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
         return "unreadable: the file is empty"
     if _is_cut_short(data):
         return "unreadable: the file is cut short"
-    flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+    if data.startswith(b"\x89PNG") and _is_damaged_png(data):
+        return "unreadable: the file is damaged"
+    flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None
     if image is None:
         return "unreadable: not an image that can be decoded"
-    return np.asarray(image, dtype=np.uint8)
+    return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
+
+
+def _to_eight_bits(image: npt.NDArray[Any]) -> Image:
+    """Scales by the brightest levels: cameras of 10 or 12 bits fill the lower part of 16."""
+    levels = np.nan_to_num(image.astype(np.float32))
+    top = float(np.percentile(levels[::4, ::4], 99.9))
+    return np.asarray(np.clip(levels * (255.0 / max(top, 1e-9)), 0, 255), dtype=np.uint8)
 
 
 def _is_cut_short(data: bytes) -> bool:
@@ -48,6 +61,18 @@ def _is_cut_short(data: bytes) -> bool:
     if data.startswith(b"\xff\xd8"):
         scan = _start_of_scan(data)
         return scan < 0 or data.rfind(b"\xff\xd9") < scan
+    return False
+
+
+def _is_damaged_png(data: bytes) -> bool:
+    """Checks the sums of a PNG's chunks: decoders go on past damage, with other pixels."""
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return True
+        at = end + 4
     return False
 
 

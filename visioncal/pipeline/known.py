@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration import CameraResult, Rms, Verdict
-from visioncal.estimator.closure import Closure, Lens
+from visioncal.estimator.closure import Closure, Lens, Noise
 from visioncal.estimator.linalg import covariance
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -76,7 +76,10 @@ class Known:
         for view in self.held_back - self.reasons.keys():
             views["kept from every fit by the session (role = holdout)"].append(view)
         grouped = sorted(views.items(), key=lambda item: -len(item[1]))
-        return tuple(f"views {', '.join(map(str, it))}: {reason}" for reason, it in grouped)
+        return tuple(
+            f"view{'s' if len(it) > 1 else ''} {', '.join(map(str, it))}: {reason}"
+            for reason, it in grouped
+        )
 
     @property
     def held_back(self) -> frozenset[int]:
@@ -136,6 +139,12 @@ class Known:
         return [
             None if it is None or positions is None else (it, positions[it.ids]) for it in corners
         ]
+
+    @property
+    def robot_noise(self) -> Noise | None:
+        """Noise of the flange; None where it cannot be told from the camera's."""
+        separate = self.closure(self.used).camera_covariance is not None
+        return self.solved.noise if separate else None
 
     @property
     def solved(self) -> HandEyeResult:

@@ -81,7 +81,8 @@ def run(
             known = stage.run(known)
         except VisioncalError as error:
             # Views that are out of the game are often why the rest does not suffice.
-            raise error.with_culprits(known.lost_views) from error
+            more = [it for it in known.lost_views if it not in error.culprits]
+            raise error.with_culprits(more) from error
     return Run(_calibration(known), view_evidence(known))
 
 
@@ -137,8 +138,7 @@ def _camera(known: Known) -> CameraResult | None:
 def _noise(known: Known) -> dict[str, float]:
     """Standard deviations per axis: of corners and flange, or of both as one without corners."""
     noise = known.solved.noise
-    separate = known.closure(known.used).camera_covariance is not None
-    of = "robot" if separate else "combined"
+    of = "combined" if known.robot_noise is None else "robot"
     pixel = {} if known.pixel_px is None else {"pixel_px": known.pixel_px}
     return pixel | {
         f"{of}_translation_mm": 1e3 * noise.sigma_m,

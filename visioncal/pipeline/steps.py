@@ -40,7 +40,15 @@ def _read_robot(known: Known) -> Known:
     reported = reported_poses(known.session, robot)
     known = replace(known, robot=robot, base_from_flange=reported.base_from_flange)
     warnings = (*known.session.warnings, *reported.warnings, *_not_used(known.session))
-    return known.noting(reported.rejections, warnings)
+    known = known.noting(reported.rejections, warnings)
+    if not reported.base_from_flange:
+        raise DataError(
+            f"session {known.session.name!r}: no view has a pose of the robot.",
+            culprits=known.lost_views,
+            next_step=" ".join(known.session.warnings)
+            or "Fill in x_m to qw, or joint angles and [robot] model.",
+        )
+    return known
 
 
 def _not_used(session: Session) -> Iterator[str]:
@@ -95,6 +103,11 @@ def _pnp(known: Known) -> Known:
 
 
 def _nothing_seen(known: Known) -> DataError:
+    if not any(view.image for view in known.session.views):
+        return DataError(
+            f"session {known.session.name!r}: there are neither images nor measured poses.",
+            next_step="Give the views images, or cft_ columns.",
+        )
     return DataError(
         f"session {known.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "
@@ -110,8 +123,6 @@ def _choose(known: Known) -> Known:
         and view.number in known.base_from_flange
         and view.number not in known.held_back
     ]
-    if not known.base_from_flange:
-        raise DataError(f"session {known.session.name!r}: no view has a pose of the robot.")
     choice = choose_poses(
         [known.poses[view] for view in views], _robot(known, views), known.session.target
     )
@@ -156,6 +167,7 @@ def _judge(known: Known) -> Known:
         held_out=rms_of(held.away_m, held.away_rad, held.rms_px),
         holdout=holdout_rms(known),
         pixel_px=known.pixel_px,
+        robot=known.robot_noise,
         warnings=known.warnings,
     )
     return replace(known, verdict=judge(findings))

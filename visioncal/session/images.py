@@ -9,6 +9,8 @@ from typing import Protocol
 from visioncal.errors import DataError
 from visioncal.files import read_bytes
 
+_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+
 
 class ImageStore(Protocol):
     """The images of a session, by the paths that views.csv gives them."""
@@ -54,6 +56,22 @@ class MemoryImages:
     def exists(self, path: str) -> bool:
         """Tells whether there is such an image."""
         return path in self.files
+
+
+def image_path(path: str) -> str:
+    """Checks the path of an image: inside the session's folder, and of a kind that is read.
+
+    Raises:
+        DataError: It leaves the folder, or its ending is none of `.png`, `.jpg`, `.tif`.
+    """
+    inside = inside_path(path)
+    if not inside.lower().endswith(_ENDINGS):
+        raise DataError(
+            f"the image {path!r} is of a kind that is not read; png, jpg or tif is needed.",
+            culprits=[path],
+            next_step="Convert the images without loss, to png.",
+        )
+    return inside
 
 
 def inside_path(path: str) -> str:

@@ -13,10 +13,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.errors import DataError
 from visioncal.session import columns as known
-from visioncal.session.images import inside_path
+from visioncal.session.images import image_path
 from visioncal.types import FloatArray
 
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
+# Poses in micrometres stay under this many metres; a number beyond is a slip.
+_FARTHEST_M = 1e7
 _NORM_TOLERANCE = 1e-3
 _SHOWN_PROBLEMS = 10
 # Stricter than float(), which also takes 1_000, nan, and the digits of other scripts.
@@ -224,10 +226,11 @@ class _RowReader:
             self.report("view", "it is empty; a whole number is needed")
         number = self._take(cells, "view", _integer)
         stop = self._take(cells, "stop", _integer)
-        image = self._take(cells, "image", inside_path)
+        image = self._take(cells, "image", image_path)
         role = self._take(cells, "role", _role, keep=True)
         numbers = self._numbers(cells)
         text = {name: cell for name, cell in cells.items() if cell}
+        self._check_lengths(numbers)
         self._check_groups(numbers)
         observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text
         if not image and not observed and not self.problems:
@@ -257,6 +260,13 @@ class _RowReader:
                 if value is not None:
                     numbers[column] = value
         return numbers
+
+    def _check_lengths(self, numbers: Mapping[str, float]) -> None:
+        for column, value in numbers.items():
+            if column.endswith("_m") and abs(value) > _FARTHEST_M:
+                self.report(
+                    column, f"{value:g} m is no place in a robot cell; write metres ({value:g} mm?)"
+                )
 
     def _check_groups(self, numbers: Mapping[str, float]) -> None:
         # A cell that was refused would be reported again as missing from its group.

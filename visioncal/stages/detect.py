@@ -7,14 +7,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
 from visioncal.errors import DataError
+from visioncal.estimator.planar import determines_pose
 from visioncal.finders import NotFound, find_target, fitting_layouts
 from visioncal.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions
-from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
+from visioncal.types import Corners, IntArray, Progress, Rejection, Target
 
 # Images looked at to tell which layout was printed.
 _LAYOUT_SAMPLE = 3
@@ -129,16 +129,11 @@ def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptio
     needed = 4 if target.kind == "marker" else options.min_corners
     if len(ids) < needed:
         return f"too few corners: {len(ids)} of {len(corner_positions(target))}, needs {needed}"
-    if _on_one_line(corner_positions(target)[ids]):
-        return f"corners on one line: all {len(ids)} lie in one row of the board"
+    if not determines_pose(corner_positions(target)[ids]):
+        return f"corners on one line: all {len(ids)}, or all but one, lie in one row of the board"
     if blur_px > options.max_blur_px:
         return f"blurred: edges are {blur_px:.1f} px wide (limit {options.max_blur_px:.1f})"
     return ""
-
-
-def _on_one_line(positions: FloatArray) -> bool:
-    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < 1e-6 * spread[0])
 
 
 def _common_resolution(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
+from visioncal.estimator.closure import Noise
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.transforms import pose_difference
 from visioncal.types import Rejection
@@ -25,6 +26,8 @@ class JudgeOptions:
         sigma_mm: Predicted sigma of the worst direction of an edge [mm].
         sigma_deg: The same in rotation [deg].
         pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
+        robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better.
+        robot_deg: The same in rotation [deg].
         stops: Stops of the robot in the fit; fewer leave too little to check the result with.
         lost_share: Share of views that could not be used.
         optimism: Held-out over in-sample scatter; large where each view carries the fit.
@@ -38,6 +41,8 @@ class JudgeOptions:
     sigma_mm: tuple[float, float] = (1.0, 3.0)
     sigma_deg: tuple[float, float] = (0.1, 0.3)
     pixel_px: tuple[float, float] = (0.7, 3.0)
+    robot_mm: float = 0.5
+    robot_deg: float = 0.06
     stops: tuple[int, int] = (10, 5)
     lost_share: tuple[float, float] = (0.25, 0.6)
     optimism: tuple[float, float] = (1.6, 4.0)
@@ -59,6 +64,7 @@ class Findings:
         held_out: Residuals of views left out in turn.
         holdout: Residuals of views held back by the session; None where there are none.
         pixel_px: Noise of a corner's coordinate; None without images [px].
+        robot: Noise of the flange; None where it cannot be told from the camera's.
         warnings: What earlier stages had to say.
     """
 
@@ -70,6 +76,7 @@ class Findings:
     held_out: Rms
     holdout: Rms | None
     pixel_px: float | None
+    robot: Noise | None
     warnings: Sequence[str]
 
 
@@ -101,6 +108,7 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
         *([] if any(it.is_fatal for it in scatter) else _sigma_doubts(findings, options)),
         *_view_doubts(findings, options),
         *_pixel_doubts(findings, options),
+        *([] if scatter else _robot_doubts(findings, options)),
         *_solver_doubts(findings, options),
         *(_Doubt(sentence) for sentence in findings.warnings),
     ]
@@ -202,7 +210,7 @@ def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
             yield _Doubt(
                 f"{direction.words[0].upper()}{direction.words[1:]} is weakly determined: its "
                 f"sigma is {sigma:.2g} {unit} (doubt begins at {check:g}). Add views tilted by 20 "
-                "to 40 degrees about axes across it.",
+                "to 40 degrees about axes across that direction.",
                 sigma > bad,
             )
 
@@ -235,6 +243,20 @@ def _pixel_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
             f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
             "are blurred.",
             noise > bad,
+        )
+
+
+def _robot_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    """An arm is a good instrument: what looks like its error is often something else's."""
+    if findings.robot is None:
+        return
+    away_mm, away_deg = 1e3 * findings.robot.sigma_m, np.rad2deg(findings.robot.sigma_rad)
+    if away_mm > options.robot_mm or away_deg > options.robot_deg:
+        yield _Doubt(
+            f"To explain what is seen, the flange would have to be off by {away_mm:.2g} mm and "
+            f"{away_deg:.2g} deg from stop to stop; arms repeat to 0.1 mm. More likely the board "
+            "is of another size than stated, or warped, the intrinsics are not this camera's, or the "
+            "arm's model is off by as much. Measure the board's squares first."
         )
 
 

@@ -9,7 +9,7 @@ from visioncal.errors import DataError
 from visioncal.estimator.closure import deviations
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.transforms import invert
+from visioncal.transforms import invert, mean_transform, pose_difference
 from visioncal.types import FloatArray, Rejection
 
 # Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
@@ -47,7 +47,7 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         The poses, and whether joints and poses disagree.
 
     Raises:
-        DataError: The joints are not as many as the robot's.
+        DataError: Joints are all there is, and they are not as many as the robot's.
     """
     poses: dict[int, FloatArray] = {}
     rejections = []
@@ -79,20 +79,25 @@ def _forward(robot: Robot, joints: FloatArray) -> FloatArray:
 
 
 def _disagreement(session: Session, robot: Robot | None) -> Iterator[str]:
-    """Compares reported poses with the model's, up to one constant base and one constant tool."""
+    """Compares reported poses with the model's, up to one constant tool."""
     if robot is None:
         return
     both = [
-        (np.asarray(pose.as_matrix()), _forward(robot, joints))
+        (np.asarray(pose.as_matrix()), joints)
         for view in session.views
         if (pose := view.base_from_flange()) is not None and (joints := view.joints_rad) is not None
     ]
     if not both:
         return
-    reported, modelled = (np.array(it) for it in zip(*both, strict=True))
-    away_m, away_rad = deviations(invert(modelled) @ reported)
-    tool = (invert(modelled) @ reported)[0]
-    offset_m = float(np.linalg.norm(tool[:3, 3]))
+    if any(len(joints) != robot.joint_count for _, joints in both):
+        yield (
+            f"Joint angles were not used: there are {len(both[0][1])} a row, and {robot.name} has "
+            f"{robot.joint_count} joints."
+        )
+        return
+    reported = np.array([pose for pose, _ in both])
+    flange_from_reported = invert(robot.base_from_flange(np.array([q for _, q in both]))) @ reported
+    away_m, away_rad = deviations(flange_from_reported)
     if away_m.max() > _AGREE_M or away_rad.max() > _AGREE_RAD:
         yield (
             f"Poses and joint angles disagree: through the model of {robot.name} the joints give "
@@ -100,8 +105,10 @@ def _disagreement(session: Session, robot: Robot | None) -> Iterator[str]:
             f"{np.rad2deg(away_rad.max()):.2g} deg. The hand-eye result uses the poses. Check "
             "[robot] model and tip, and whether the base frame is the controller's."
         )
-    elif offset_m > _AGREE_M:
+        return
+    offset_mm, turn_deg = pose_difference(np.eye(4), mean_transform(flange_from_reported))
+    if offset_mm > 1e3 * _AGREE_M or turn_deg > np.rad2deg(_AGREE_RAD):
         yield (
-            f"Reported poses and the model's flange differ by a constant {1e3 * offset_m:.1f} mm: "
-            "the poses are of a tool frame. The camera's transform is then to that frame."
+            f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "
+            f"from the flange of {robot.name}: the camera's transform is to that frame."
         )

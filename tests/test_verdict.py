@@ -1,0 +1,151 @@
+"""The verdict: each doubt by itself, with the sentence that tells of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from visioncal.calibration import Rms, ViewResult
+from visioncal.estimator.closure import Edges, Noise
+from visioncal.estimator.observability import Direction
+from visioncal.stages.handeye import HandEyeResult, Solution
+from visioncal.stages.judge import Findings, judge
+from visioncal.transforms import exp
+from visioncal.types import Rejection
+
+SIGMA = 1e-4
+
+
+def directions(*sigmas):
+    return tuple(
+        Direction(f"the direction {at}", sigma, 5e-3, is_rotation=bool(at % 2))
+        for at, sigma in enumerate(sigmas)
+    )
+
+
+def hand_eye(**changes):
+    identity = np.eye(4)
+    result = HandEyeResult(
+        edges=Edges(identity, identity, np.zeros(0)),
+        covariance=np.eye(12) * SIGMA**2,
+        noise=Noise(1e-4, 1e-4),
+        solutions={name: Solution(identity, identity, 1e-4, 1e-4) for name in "abcd"},
+        worst=directions(1e-4, 1e-4, 1e-4, 1e-4),
+    )
+    return replace(result, **changes)
+
+
+def views(count=20, **odd):
+    """Views with like residuals, but for view 7 where `odd` says so."""
+    plain = [ViewResult(at, True, "", 40, 0.1, 0.1, 0.01) for at in range(count)]
+    return tuple(replace(view, **odd) if view.view == 7 else view for view in plain)
+
+
+SOUND = Findings(
+    views=views(),
+    stops=20,
+    lost=(),
+    hand_eye=hand_eye(),
+    rms=Rms(0.1, 0.01, 0.1),
+    held_out=Rms(0.11, 0.011, 0.12),
+    holdout=None,
+    pixel_px=0.05,
+    robot=Noise(1e-4, 1e-4),
+    warnings=(),
+)
+STRAYED = Solution(exp(np.array([0, 0, 0, 0.01, 0, 0.0])), np.eye(4), 1e-4, 1e-4)
+LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
+
+
+def test_sound_findings_are_good_and_say_how_good():
+    verdict = judge(SOUND)
+    assert verdict.status == "good"
+    assert len(verdict.reasons) == 1
+    assert "All 20 used views agree" in verdict.reasons[0]
+    assert "0.11 mm" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "words"),
+    [
+        ({"held_out": Rms(3.0, 0.011), "rms": Rms(2.9, 0.01)}, "check", "by 3 mm (doubt begins"),
+        ({"held_out": Rms(30.0, 0.011), "rms": Rms(29.0, 0.01)}, "bad", "by 30 mm"),
+        ({"held_out": Rms(0.11, 0.5), "rms": Rms(0.1, 0.45)}, "check", "by 0.5 deg"),
+        ({"held_out": Rms(0.11, 3.0), "rms": Rms(0.1, 2.9)}, "bad", "by 3 deg"),
+        ({"held_out": Rms(0.2, 0.011)}, "check", "fit 2.0 times worse than views in the fit"),
+        ({"held_out": Rms(0.5, 0.011)}, "bad", "fit 5.0 times worse"),
+        ({"held_out": Rms(0.11, 0.02)}, "check", "fit 2.0 times worse"),
+        ({"views": views(residual_mm=0.9)}, "check", "View 7 stands out: it places the target 0.9"),
+        ({"views": views(residual_deg=0.2)}, "check", "0.2 deg from the others, 20 times"),
+        ({"holdout": Rms(2.0, 0.01)}, "check", "holds back are missed by 2 mm"),
+        ({"holdout": Rms(0.1, 0.4)}, "check", "0.4 deg, 36 times worse"),
+        (
+            {"hand_eye": hand_eye(worst=directions(2e-3, 0, 0, 0))},
+            "check",
+            "The direction 0 is weak",
+        ),
+        ({"hand_eye": hand_eye(worst=directions(4e-3, 0, 0, 0))}, "bad", "sigma is 4 mm"),
+        ({"hand_eye": hand_eye(worst=directions(0, 3e-3, 0, 0))}, "check", "sigma is 0.17 deg"),
+        (
+            {"hand_eye": hand_eye(worst=directions(0, 0, 2e-3, 0))},
+            "check",
+            "The direction 2 is weak",
+        ),
+        ({"robot": Noise(1e-4, 1e-3)}, "check", "have to be off by 1 mm and 0.0057 deg"),
+        ({"robot": Noise(2e-3, 1e-4)}, "check", "0.11 deg from stop to stop"),
+        ({"stops": 8}, "check", "Only 8 stops are used"),
+        ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
+        ({"lost": LOST}, "check", "10 of 30 views could not be used; the first: view 30, blurred"),
+        ({"lost": LOST * 4}, "bad", "40 of 60 views"),
+        ({"pixel_px": 1.0}, "check", "Corners deviate by 1 px"),
+        ({"pixel_px": 4.0}, "bad", "Corners deviate by 4 px"),
+        (
+            {"hand_eye": hand_eye(solutions=dict.fromkeys("abc", STRAYED))},
+            "check",
+            "Half of the solvers disagree with the answer by 10 mm",
+        ),
+        ({"warnings": ("The board is upside down.",)}, "check", "The board is upside down."),
+    ],
+)
+def test_each_doubt_has_its_sentence(changes, status, words):
+    verdict = judge(replace(SOUND, **changes))
+    assert verdict.status == status
+    assert len(verdict.reasons) == 1
+    assert words in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"holdout": Rms(0.2, 0.02)},
+        {"views": views(residual_mm=0.5)},
+        {"lost": LOST[:3]},
+        {"pixel_px": None},
+        {"robot": None},
+        # One closed form by itself may be weak on such a motion.
+        {"hand_eye": hand_eye(solutions={**hand_eye().solutions, "a": STRAYED})},
+        # Exact data: held-out and in-sample scatter are both rounding.
+        {"rms": Rms(1e-10, 1e-11), "held_out": Rms(9e-10, 9e-11)},
+    ],
+)
+def test_what_is_ordinary_raises_no_doubt(changes):
+    assert judge(replace(SOUND, **changes)).status == "good"
+
+
+def test_a_scatter_that_settles_it_is_not_blamed_on_the_motion():
+    wild = replace(
+        SOUND,
+        held_out=Rms(80.0, 5.0),
+        rms=Rms(75.0, 4.8),
+        hand_eye=hand_eye(worst=directions(0.02, 0.02, 0.02, 0.02)),
+    )
+    verdict = judge(wild)
+    assert verdict.status == "bad"
+    assert not any("weakly determined" in it for it in verdict.reasons)
+    assert "units or conventions" in verdict.reasons[0]
+
+
+def test_what_settles_it_comes_first():
+    verdict = judge(replace(SOUND, pixel_px=4.0, warnings=("Something.",), stops=8))
+    assert verdict.reasons[0].startswith("Corners deviate")
+    assert len(verdict.reasons) == 3
