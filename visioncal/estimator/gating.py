@@ -66,8 +66,8 @@ def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
             kept[at] < stack.counts[at] and not determines_pose(places)
         ):
             reasons[view] = (
-                f"residual too large: only {kept[at]:.0f} of {stack.counts[at]} corners fit one pose "
-                f"of the board, the rms is {rms[at]:.2f} px"
+                f"residual too large: only {kept[at]:.0f} of {stack.counts[at]} corners fit one "
+                f"pose of the board, the rms is {rms[at]:.2f} px"
             )
     wrong = np.isin(stack.views, list(reasons))
     return Gate(passes & ~wrong[stack.view_of], reasons)

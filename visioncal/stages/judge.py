@@ -255,8 +255,8 @@ def _robot_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
         yield _Doubt(
             f"To explain what is seen, the flange would have to be off by {away_mm:.2g} mm and "
             f"{away_deg:.2g} deg from stop to stop; arms repeat to 0.1 mm. More likely the board "
-            "is of another size than stated, or warped, the intrinsics are not this camera's, or the "
-            "arm's model is off by as much. Measure the board's squares first."
+            "is of another size than stated, or warped, the intrinsics are not this camera's, or "
+            "the arm's model is off by as much. Measure the board's squares first."
         )
 
 
