@@ -223,16 +223,14 @@ def _dh_model(table: Table, tip: str) -> "pin.Model":
     model = pin.Model()
     model.name = table.text("name")
     pending, last = np.eye(4), 0
-    for joint in joints:
+    for name, joint in joints:
         constant = _dh_constant(joint, "theta_offset_rad", modified=modified)
         placement = pending @ constant if modified else pending
         pending = np.eye(4) if modified else constant
         lower, upper = joint.number("lower_deg", -360.0), joint.number("upper_deg", 360.0)
         if lower >= upper:
             raise joint.refuse("lower_deg", lower, f"less than upper_deg = {upper!r}")
-        last = model.addJoint(
-            last, pin.JointModelRZ(), pin.SE3(placement), joint.label.split("joint ", 1)[1]
-        )
+        last = model.addJoint(last, pin.JointModelRZ(), pin.SE3(placement), name)
         model.lowerPositionLimit[last - 1] = math.radians(lower)
         model.upperPositionLimit[last - 1] = math.radians(upper)
     if "flange" in table.content:
@@ -245,8 +243,8 @@ def _dh_model(table: Table, tip: str) -> "pin.Model":
     return model
 
 
-def _joint_tables(table: Table) -> list[Table]:
-    """The rows of a DH table; each one's label ends in `joint NAME`."""
+def _joint_tables(table: Table) -> list[tuple[str, Table]]:
+    """The rows of a DH table with their names."""
     rows = table.content.get("joint")
     if not isinstance(rows, Sequence) or not rows or not all(isinstance(r, Mapping) for r in rows):
         raise table.refuse("joint", rows, "one [[joint]] table for each joint")
@@ -257,7 +255,8 @@ def _joint_tables(table: Table) -> list[Table]:
     if len(set(names)) < len(names):
         raise table.refuse("joint", names, "a name of its own for each joint")
     return [
-        Table(row, f"{table.label}, joint {name}") for row, name in zip(rows, names, strict=True)
+        (name, Table(row, f"{table.label}, joint {name}"))
+        for row, name in zip(rows, names, strict=True)
     ]
 
 

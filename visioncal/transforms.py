@@ -82,9 +82,10 @@ def adjoint(matrices: FloatArray) -> FloatArray:
 def inverse_right_jacobian(twists: FloatArray) -> FloatArray:
     """Derivative of `log(exp(twist) * exp(step))` by the step, at zero.
 
-    The series in the adjoint `ad` of the twist with Bernoulli's numbers (Barfoot 2017, equation
-    7.76), which converges for rotations under 2 pi and is cut where it is exact to 1e-9 up to
-    0.5 rad.
+    The series in the adjoint `ad` of the twist with Bernoulli's numbers (Iserles, Munthe-Kaas,
+    Norsett and Zanna 2000, Lie-group methods, section 2), which converges for rotations under 2 pi
+    and is cut where it is exact to 1e-9 up to 0.5 rad. Beyond, it still points downhill, which is
+    all that a fit needs far from its minimum.
 
     Args:
         twists: (..., 6) twists (rotation [rad], translation [m]).

@@ -5,19 +5,22 @@ that each step solves a system of the size of the intrinsics.
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimator.corners import CornerStack, Reprojection, reproject
+from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance, damped_step
 from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray
 
-_ITERATIONS = 100
-_SETTLED = 1e-9  # relative decrease of the cost below which the fit has settled
-_START_DAMPING = 1e-3
-_WORST_DAMPING = 1e9
+# The intrinsics (4 + k,) and the poses (v, 4, 4).
+_State: TypeAlias = tuple[FloatArray, FloatArray]
+
+# Relative decrease of the cost below which the fit has settled.
+_SETTLED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,32 +87,26 @@ def fit_bundle(
     Returns:
         The fit. Its covariance counts the corners only, not the prior.
     """
-    poses, damping, settled = cam_from_target, _START_DAMPING, False
-    start = intrinsics(camera)
-    weight = 1.0 / prior_sigma**2
-    now = reproject(stack, camera, poses)
-    cost = float(np.sum(now.residuals**2))
-    for _ in range(_ITERATIONS):
-        if settled or damping > _WORST_DAMPING:
-            break
+    start, weight = intrinsics(camera), 1.0 / prior_sigma**2
+
+    def linearise(at: _State) -> Linearised[_State]:
+        values, poses = at
+        now = reproject(stack, with_intrinsics(camera, values), poses)
+        offset = values - start
         blocks = _blocks(stack, now)
-        offset = intrinsics(camera) - start
-        information, gradient, answer = blocks.reduced(damping)
-        # The prior is in units of a corner's noise of 1 px, as the information is.
-        step = damped_step(information + np.diag(weight), gradient + weight * offset, damping)
-        pose_step = -(answer[:, :, :-1] @ step) - answer[:, :, -1]
-        candidate = with_intrinsics(camera, intrinsics(camera) + step)
-        candidate_poses = poses @ exp(pose_step)
-        then = reproject(stack, candidate, candidate_poses)
-        moved = intrinsics(candidate) - start
-        cost_then = float(np.sum(then.residuals**2) + weight @ moved**2)
-        if not cost_then <= cost:
-            damping *= 10
-            continue
-        settled = cost - cost_then <= _SETTLED * cost
-        camera, poses, now, cost = candidate, candidate_poses, then, cost_then
-        damping = max(damping / 10, 1e-12)
-    return _finished(stack, camera, poses, now, settled=settled)
+
+        def step(damping: float) -> _State:
+            information, gradient, answer = blocks.reduced(damping)
+            # The prior is in units of a corner's noise of 1 px, as the information is.
+            moved = damped_step(information + np.diag(weight), gradient + weight * offset, damping)
+            pose_steps = -(answer[:, :, :-1] @ moved) - answer[:, :, -1]
+            return values + moved, poses @ exp(pose_steps)
+
+        return Linearised(at, float(np.sum(now.residuals**2) + weight @ offset**2), step)
+
+    (values, poses), settled = descend((start, cam_from_target), linearise, _SETTLED)
+    fitted = with_intrinsics(camera, values)
+    return _finished(stack, fitted, poses, reproject(stack, fitted, poses), settled=settled)
 
 
 def _finished(

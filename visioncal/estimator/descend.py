@@ -6,7 +6,8 @@ from typing import Generic, TypeVar
 
 State = TypeVar("State")
 
-_ITERATIONS = 100
+# Far more than a healthy problem takes: flat valleys of rational lenses take two hundred.
+_ITERATIONS = 400
 _START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
 
 
