@@ -27,15 +27,12 @@ class Recorder:
         stream: Where to log.
     """
 
-    def __init__(
-        self, path: Path, *, recording_id: str | None = None, blueprint: BlueprintLike | None = None
-    ) -> None:
+    def __init__(self, path: Path, *, recording_id: str | None = None) -> None:
         """Begins the file.
 
         Args:
             path: The `.rrd`; one that is there is replaced.
             recording_id: Of the recording that the file is a part of; None where it is one.
-            blueprint: The layout to open it in.
 
         Raises:
             OSError: The file cannot be created.
@@ -46,10 +43,19 @@ class Recorder:
         )
         _check_room(path.parent)
         try:
-            self.stream.save(path, default_blueprint=blueprint)
+            self.stream.save(path)
         except RuntimeError as error:
             # This is how rerun reports a file that it cannot create.
             raise OSError(str(error)) from error
+
+    def lay_out(self, blueprint: BlueprintLike | None) -> None:
+        """Adds the layout to open the recording in, if there is one.
+
+        It is a hundred kilobytes, and comes after the facts: a cut within it loses none of them.
+        It is made active because a browser has begun to draw by the time it arrives.
+        """
+        if blueprint is not None:
+            self.stream.send_blueprint(blueprint, make_active=True, make_default=True)
 
     def at(self, row: int) -> None:
         """Says which view is logged next, by its place in the session.

@@ -55,7 +55,8 @@ def append_results(
     """
     owner = _recording_of(path, session)
     with beside(path) as aside:
-        with Recorder(aside, recording_id=owner, blueprint=blueprint) as recorder:
+        with Recorder(aside, recording_id=owner) as recorder:
+            recorder.lay_out(blueprint)
             log_results(recorder, session, calibration, evidence)
         append(path, aside)
 

@@ -56,11 +56,12 @@ class RecordingWriter:
         self._images: dict[str, str] = {}
         with named_errors(self._label):
             path.open("xb").close()
-            self._recorder = Recorder(path, blueprint=blueprint)
+            self._recorder = Recorder(path)
             self._recorder.stream.send_recording_name(session.name)
             header = codec.Header.of(session, codec.UNKNOWN if announced is None else announced)
             codec.log_header(self._recorder.stream, header)
             self._recorder.keep()
+            self._recorder.lay_out(blueprint)
 
     def add_view(self, cells: Sequence[str], image: bytes | None) -> None:
         """Adds one view.
