@@ -210,9 +210,9 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[str]:
     causes = list(_causes(fit))
     advice = f" {' '.join(causes)}" if causes else " Add views, tilted and near the image's edges."
     if focal > _FOCAL_LIMIT:
-        yield f"The focal length is known to {100 * focal:.1f} % only.{advice}"
+        yield f"The corners alone tell the focal length to {100 * focal:.1f} % only.{advice}"
     if centre > _CENTRE_LIMIT_PX:
-        yield f"The image centre is known to {centre:.1f} px only.{advice}"
+        yield f"The corners alone tell the image centre to {centre:.1f} px only.{advice}"
     if focal <= _FOCAL_LIMIT and centre <= _CENTRE_LIMIT_PX:
         yield from causes
     empty = _unvisited(stack, fit.camera.resolution)
