@@ -92,7 +92,7 @@ def test_sound_findings_are_good_and_say_how_good():
             "The direction 2 is weak",
         ),
         ({"robot": Noise(1e-4, 1e-3)}, "check", "have to be off by 1 mm and 0.0057 deg"),
-        ({"robot": Noise(2e-3, 1e-4)}, "check", "0.11 deg from stop to stop"),
+        ({"robot": Noise(5e-4, 1e-4)}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
         ({"lost": LOST}, "check", "10 of 30 views could not be used; the first: view 30, blurred"),

@@ -26,7 +26,8 @@ class JudgeOptions:
         sigma_mm: Predicted sigma of the worst direction of an edge [mm].
         sigma_deg: The same in rotation [deg].
         pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
-        robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better.
+        robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and
+            what is beyond is seldom independent from stop to stop, as the covariance takes it.
         robot_deg: The same in rotation [deg].
         stops: Stops of the robot in the fit; fewer leave too little to check the result with.
         lost_share: Share of views that could not be used.
@@ -41,8 +42,8 @@ class JudgeOptions:
     sigma_mm: tuple[float, float] = (1.0, 3.0)
     sigma_deg: tuple[float, float] = (0.1, 0.3)
     pixel_px: tuple[float, float] = (0.7, 3.0)
-    robot_mm: float = 0.5
-    robot_deg: float = 0.06
+    robot_mm: float = 0.2
+    robot_deg: float = 0.02
     stops: tuple[int, int] = (10, 5)
     lost_share: tuple[float, float] = (0.25, 0.6)
     optimism: tuple[float, float] = (1.6, 4.0)
