@@ -56,6 +56,8 @@ class Recorder:
         """
         if blueprint is not None:
             self.stream.send_blueprint(blueprint, make_active=True, make_default=True)
+            # Not between the parts of what comes next.
+            self.keep()
 
     def at(self, row: int) -> None:
         """Says which view is logged next, by its place in the session.
