@@ -5,8 +5,8 @@ import hashlib
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
     content = data.encode("utf-8") if isinstance(data, str) else data
     # A short name of its own: the folder may already hold names of the longest kind allowed.
     aside = path.parent / f".{uuid4().hex}.tmp"
-    try:
+    with named_errors(path):
         try:
             with aside.open("xb") as file:
                 file.write(content)
@@ -48,6 +48,17 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
             raise
+
+
+@contextmanager
+def named_errors(path: Path) -> Iterator[None]:
+    """Turns an error of the operating system into one that names the file.
+
+    Raises:
+        DataError: In its place.
+    """
+    try:
+        yield
     except OSError as error:
         raise DataError(
             f"{path} cannot be written: {error.strerror or error}.",

@@ -13,10 +13,14 @@ from visioncal.estimator.linalg import covariance
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.stages.handeye import HandEyeResult, robot_part
+from visioncal.stages.judge import Findings
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.validate import HeldOut
 from visioncal.targets import corner_positions
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
+
+# Why a view is in no fit although nothing is wrong with it.
+HELD_BACK = "held out of the fit by the session (role = holdout)"
 
 # A view's corners with their (n, 3) places on the target [m]; None where it has no image.
 Seen = tuple[Corners, FloatArray] | None
@@ -40,6 +44,7 @@ class Known:
         used: The views in the fit, in the session's order.
         hand_eye: Both unknown edges.
         held_out: Residuals of used views, left out of the fit.
+        findings: What the verdict is made of.
         verdict: Whether to trust it all.
         reasons: Why a view cannot be used, by view.
         warnings: What the user should know, in sentences.
@@ -58,6 +63,7 @@ class Known:
     used: tuple[int, ...] = ()
     hand_eye: HandEyeResult | None = None
     held_out: HeldOut | None = None
+    findings: Findings | None = None
     verdict: Verdict | None = None
     reasons: Mapping[int, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
@@ -74,7 +80,7 @@ class Known:
         for view, reason in self.reasons.items():
             views[reason].append(view)
         for view in self.held_back - self.reasons.keys():
-            views["kept from every fit by the session (role = holdout)"].append(view)
+            views[HELD_BACK].append(view)
         grouped = sorted(views.items(), key=lambda item: -len(item[1]))
         return tuple(
             f"view{'s' if len(it) > 1 else ''} {', '.join(map(str, it))}: {reason}"

@@ -10,9 +10,9 @@ from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult,
 from visioncal.errors import DataError, VisioncalError
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.known import Known, rms_of
+from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
-from visioncal.pipeline.views import holdout_rms, used_rms, view_evidence, view_results
+from visioncal.pipeline.views import view_evidence
 from visioncal.session import Session
 from visioncal.stages.handeye import SOLVER_NAMES
 from visioncal.stages.validate import changed_lens
@@ -87,8 +87,8 @@ def run(
 
 
 def _calibration(known: Known) -> Calibration:
-    held, verdict = known.held_out, known.verdict
-    if held is None or verdict is None:
+    held, findings, verdict = known.held_out, known.findings, known.verdict
+    if held is None or findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
     session, result = known.session, known.solved
     x_name, z_name = edge_names(session.mount)
@@ -112,11 +112,9 @@ def _calibration(known: Known) -> Calibration:
             for name, it in result.solutions.items()
         },
         noise=_noise(known),
-        views=view_results(known),
-        rms=used_rms(known),
-        validation=Validation(
-            held.method, rms_of(held.away_m, held.away_rad, held.rms_px), holdout_rms(known)
-        ),
+        views=tuple(findings.views),
+        rms=findings.rms,
+        validation=Validation(held.method, findings.held_out, findings.holdout),
         verdict=verdict,
         camera=_camera(known),
         robot=known.robot,

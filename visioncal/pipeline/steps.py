@@ -17,13 +17,13 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.stages.choose import choose_by, choose_poses
 from visioncal.stages.detect import detect
-from visioncal.stages.handeye import robot_part, solve_hand_eye
+from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
 from visioncal.stages.reported import reported_poses
 from visioncal.stages.validate import validate
-from visioncal.types import FloatArray, Rejection
+from visioncal.types import Rejection
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _choose(known: Known) -> Known:
         and view.number not in known.held_back
     ]
     choice = choose_poses(
-        [known.poses[view] for view in views], _robot(known, views), known.session.target
+        [known.poses[view] for view in views], known.closure(views).robot, known.session.target
     )
     poses = {**known.poses, **{view.view: view for view in choice.views}}
     used = tuple(view.view for view in choice.views)
@@ -138,7 +138,7 @@ def _hand_eye(known: Known) -> Known:
     result = solve_hand_eye(data.merged(known.stops), known.solver)
     poses = dict(known.poses)
     for view in known.held_back & poses.keys() & known.base_from_flange.keys():
-        robot = _robot(known, [view])[0]
+        robot = known.closure([view]).robot[0]
         poses[view] = choose_by(poses[view], robot, result.edges, known.session.target)
     return replace(known, hand_eye=result, poses=poses)
 
@@ -170,7 +170,7 @@ def _judge(known: Known) -> Known:
         robot=known.robot_noise,
         warnings=known.warnings,
     )
-    return replace(known, verdict=judge(findings))
+    return replace(known, findings=findings, verdict=judge(findings))
 
 
 STAGES: tuple[Stage, ...] = (
@@ -183,8 +183,3 @@ STAGES: tuple[Stage, ...] = (
     Stage("validate", _validate),
     Stage("judge", _judge),
 )
-
-
-def _robot(known: Known, views: list[int]) -> FloatArray:
-    poses = np.array([known.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
-    return robot_part(poses, known.session.mount)

@@ -7,13 +7,12 @@ import numpy as np
 from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import distances
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.known import Known, rms_of
+from visioncal.pipeline.known import HELD_BACK, Known, rms_of
 from visioncal.stages.validate import chain_rms_px, changed_lens, predict_corners
 from visioncal.targets import corner_positions
 from visioncal.transforms import mean_transform
 from visioncal.types import Corners, FloatArray
 
-_HELD_BACK = "held out of the fit by the session (role = holdout)"
 _NO_POSE = "no pose of the target: it has neither image nor cft_ columns"
 
 
@@ -72,7 +71,7 @@ def _reason(known: Known, view: int) -> str:
     if view in known.used:
         return ""
     if view in known.held_back and view not in known.reasons:
-        return _HELD_BACK
+        return HELD_BACK
     return known.reasons.get(view, _NO_POSE)
 
 

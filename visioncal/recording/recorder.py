@@ -12,7 +12,7 @@ from uuid import uuid4
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
-from visioncal.errors import DataError
+from visioncal.files import named_errors
 from visioncal.recording import paths
 from visioncal.recording.frames import scan
 
@@ -117,20 +117,3 @@ def beside(path: Path) -> Iterator[Path]:
         finally:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
-
-
-@contextmanager
-def named_errors(path: Path) -> Iterator[None]:
-    """Turns an error of the operating system into one that names the recording.
-
-    Raises:
-        DataError: In its place.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise DataError(
-            f"{path} cannot be written: {error.strerror or error}.",
-            culprits=[str(path)],
-            next_step="Choose a folder that exists, can be written, and has room.",
-        ) from error

@@ -10,9 +10,9 @@ from rerun.blueprint import BlueprintLike
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
-from visioncal.files import sha256
+from visioncal.files import named_errors, sha256
 from visioncal.recording import codec
-from visioncal.recording.recorder import Recorder, beside, named_errors
+from visioncal.recording.recorder import Recorder, beside
 from visioncal.recording.results import log_results
 from visioncal.session import Session
 from visioncal.session.checks import check_images_can_be_used
