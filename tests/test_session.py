@@ -385,11 +385,13 @@ def test_a_missing_or_empty_file_is_named(folder: Path, name: str) -> None:
     assert f"{name} does not exist" in refusal(folder).message
 
 
-def test_a_header_without_rows_and_semicolons_are_named(folder: Path) -> None:
+def test_a_header_without_rows_and_other_separators_are_named(folder: Path) -> None:
     (folder / "views.csv").write_text(HEADER + "\n,,,,,,,,,,,,\n")
     assert "a header row and no views" in refusal(folder).message
     (folder / "views.csv").write_text(TABLE.replace(",", ";"))
     assert "commas, not semicolons" in refusal(folder).next_step
+    (folder / "views.csv").write_text(TABLE.replace(",", "\t"))
+    assert "commas, not tabs" in refusal(folder).next_step
 
 
 def test_what_is_no_session_is_refused(tmp_path: Path) -> None:

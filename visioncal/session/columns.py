@@ -61,11 +61,15 @@ def check_header(columns: Sequence[str], where: str) -> None:
     problems = list(_header_problems(columns))
     if not problems:
         return
-    semicolons = len(columns) == 1 and ";" in columns[0]
+    others = [
+        name
+        for mark, name in ((";", "semicolons"), ("\t", "tabs"))
+        if len(columns) == 1 and mark in columns[0]
+    ]
     raise DataError(
         f"{where}: {'; '.join(problems)}.",
         culprits=[where],
-        next_step="Separate the columns by commas, not semicolons." if semicolons else "",
+        next_step=f"Separate the columns by commas, not {others[0]}." if others else "",
     )
 
 
