@@ -102,3 +102,54 @@ def test_the_command_converts_and_refuses(folder: Path, tmp_path: Path) -> None:
     again = subprocess.run(command, check=False, capture_output=True, text=True, encoding="utf-8")
     assert again.returncode == 2
     assert "--force" in again.stderr
+
+
+def test_a_session_whose_poses_are_misread_is_mended(tmp_path: Path) -> None:
+    session = made_up(9, images=False).session
+    cells = [
+        [
+            repr(1e3 * view.numbers[name]) if name in ("x_m", "y_m", "z_m") else view.cell(name)
+            for name in session.columns
+        ]
+        for view in session.views
+    ]
+    Session.assemble(session.document, session.columns, cells, session.images).save(tmp_path / "mm")
+    command = [sys.executable, "-m", "visioncal", "convert", str(tmp_path / "mm")]
+    asked = subprocess.run(
+        [*command, str(tmp_path / "no"), "--guess"],
+        check=False,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+    )
+    assert asked.returncode == 2
+    assert "--yes" in asked.stderr
+    assert not (tmp_path / "no").exists()
+    done = subprocess.run(
+        [*command, str(tmp_path / "mended"), "--guess", "--yes"],
+        check=False,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+    )
+    assert done.returncode == 0, done.stderr
+    assert "positions in mm" in done.stderr
+    mended = Session.load(tmp_path / "mended")
+    for old, new in zip(session.views, mended.views, strict=True):
+        # Multiplied by 1000 and divided again, each rounded once.
+        for name in ("x_m", "y_m", "z_m", "qx", "qw", "cft_x_m"):
+            assert new.numbers[name] == pytest.approx(old.numbers[name], abs=1e-14)
+        assert new.text == old.text
+
+
+def test_what_describes_somebody_elses_poses_is_refused_for_a_session(
+    folder: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "visioncal", "convert", str(folder), str(tmp_path / "new")]
+    done = subprocess.run(
+        [*command, "--robot-unit", "mm"], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "is a session already" in done.stderr
+    assert not (tmp_path / "new").exists()

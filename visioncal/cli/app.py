@@ -10,9 +10,11 @@ from visioncal.cli.console import report_error
 from visioncal.cli.convert import convert_command
 from visioncal.cli.demo import demo_command
 from visioncal.cli.diff import diff_command
+from visioncal.cli.export import export_command
 from visioncal.cli.report import report_command
 from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
+from visioncal.cli.target import target_app
 from visioncal.errors import VisioncalError
 from visioncal.version import __version__
 
@@ -32,8 +34,10 @@ app.command("calibrate")(calibrate_command)
 app.command("report")(report_command)
 app.command("diff")(diff_command)
 app.command("convert")(convert_command)
+app.command("export")(export_command)
 app.command("review")(review_command)
 app.command("simulate")(simulate_command)
+app.add_typer(target_app, name="target")
 
 
 def _show_version(wanted: bool) -> None:

@@ -1,5 +1,37 @@
-"""The forms in which sessions are stored: one file a format, one entry in the registry."""
+"""The forms in which sessions are stored, ours and others': one file a format, one entry each.
 
-from visioncal.formats.registry import FORMATS, convert
+Somebody else's recording becomes a session in three steps: `read_foreign` gives its numbers as they
+are written, `assemble` the session that they mean, and `write_session` stores it. Between the first
+and the second, `guess_foreign` can look whether they mean something else.
+"""
 
-__all__ = ["FORMATS", "convert"]
+from visioncal.formats.assemble import assemble
+from visioncal.formats.foreign import Foreign
+from visioncal.formats.registry import (
+    FOREIGN_FORMATS,
+    FORMATS,
+    check_free,
+    convert,
+    is_session,
+    read_foreign,
+    write_session,
+)
+from visioncal.formats.rereading import guess_foreign, reread, reread_session
+from visioncal.formats.wishes import PoseWishes, Wishes
+
+__all__ = [
+    "FOREIGN_FORMATS",
+    "FORMATS",
+    "Foreign",
+    "PoseWishes",
+    "Wishes",
+    "assemble",
+    "check_free",
+    "convert",
+    "guess_foreign",
+    "is_session",
+    "read_foreign",
+    "reread",
+    "reread_session",
+    "write_session",
+]

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from visioncal.formats.foreign import Foreign
+from visioncal.formats.wishes import Wishes
 from visioncal.session import Session
 
 
@@ -24,3 +26,20 @@ class Format:
     recognises: Callable[[Path], bool]
     read: Callable[[Path], Session]
     write: Callable[[Session, Path], None]
+
+
+@dataclass(frozen=True)
+class ForeignFormat:
+    """A form in which others store what they recorded; it is read and never written.
+
+    Attributes:
+        name: As the command line has it.
+        words: What it is, for messages.
+        recognises: Whether a path that exists looks like it; it never raises DataError.
+        read: Reads the recording at a path, with what the user says of it.
+    """
+
+    name: str
+    words: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, Wishes], Foreign]

@@ -3,64 +3,121 @@
 from pathlib import Path
 
 from visioncal.errors import DataError
+from visioncal.files import did_you_mean
+from visioncal.formats.assemble import assemble, wished
+from visioncal.formats.columns import TABLE
+from visioncal.formats.finding import listed
 from visioncal.formats.folder import FOLDER
-from visioncal.formats.format import Format
+from visioncal.formats.foreign import Foreign
+from visioncal.formats.format import ForeignFormat, Format
+from visioncal.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.formats.recording import RECORDING
+from visioncal.formats.ros import EASY_HANDEYE, MOVEIT
+from visioncal.formats.views import VIEWS
+from visioncal.formats.visp import VISP
+from visioncal.formats.wishes import Wishes
+from visioncal.formats.zivid import ZIVID
 from visioncal.session import Session
 
 FORMATS: tuple[Format, ...] = (FOLDER, RECORDING)
 
+# The first that recognises a path reads it: those that look for less come last.
+FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
+    HAND_EYE,
+    KINEMATICS,
+    VISP,
+    ZIVID,
+    EASY_HANDEYE,
+    MOVEIT,
+    VIEWS,
+    TABLE,
+)
 
-def convert(source: Path, dest: Path, *, force: bool = False) -> Session:
-    """Writes a session in another form, without loss.
+
+def is_session(source: Path) -> bool:
+    """Tells whether a path is a session in a form of ours, which is converted without loss."""
+    return any(it.recognises(source) for it in FORMATS)
+
+
+def convert(
+    source: Path,
+    dest: Path,
+    *,
+    force: bool = False,
+    wishes: Wishes | None = None,
+    form: str | None = None,
+) -> Session:
+    """Writes a session, or somebody else's recording, as a session's folder or as a recording.
+
+    A session goes from one form of ours to another without loss.
 
     Args:
-        source: The session, in any of `FORMATS`.
+        source: The session, in any of `FORMATS`, or a recording in any of `FOREIGN_FORMATS`.
         dest: Where to; its suffix says in which form, and none of theirs means a folder.
         force: Whether a file that is there may be replaced; a folder never is.
+        wishes: What is to be known of somebody else's recording beyond what it says.
+        form: The name of its format, where it is not to be recognised.
 
     Returns:
         The session.
 
     Raises:
-        DataError: `source` is no session, `dest` is taken, cannot be written or, read again, is
+        DataError: `source` is neither, `dest` is taken, cannot be written or, read again, is
             another session.
     """
-    read, write = _format_of(source), _format_for(dest)
-    _check_free(source, dest, write, force=force)
-    session = read.read(source)
-    write.write(session, dest)
-    again = write.read(dest)
-    if again.digest() != session.digest():
-        raise DataError(
-            f"{dest} does not hold the session of {source}: their digests differ.",
-            culprits=[str(dest)],
-            next_step="Remove it, and report this with the session.",
-        )
+    check_free(source, dest, force=force)
+    if form is None and is_session(source):
+        session = next(it for it in FORMATS if it.recognises(source)).read(source)
+    else:
+        session = assemble(read_foreign(source, wishes or Wishes(), form))
+    write_session(session, dest)
     return session
 
 
-def _format_of(source: Path) -> Format:
-    for known in FORMATS:
-        if known.recognises(source):
-            return known
-    what = "is no session" if source.exists() else "does not exist"
-    raise DataError(
-        f"{source} {what}: {' or '.join(it.words for it in FORMATS)} is needed.",
-        culprits=[str(source)],
-    )
+def read_foreign(source: Path, wishes: Wishes, form: str | None = None) -> Foreign:
+    """Reads somebody else's recording, as the user says that it is to be read.
+
+    Args:
+        source: A file or folder in any of `FOREIGN_FORMATS`.
+        wishes: What the user says of it.
+        form: The name of its format; None to recognise it.
+
+    Raises:
+        DataError: It is of no known format, or something in it is wrong.
+    """
+    # Two files are two tables, whatever the first of them looks like.
+    form = form or (TABLE.name if wishes.camera_file is not None else None)
+    return wished(_foreign_format(source, form).read(source, wishes), wishes)
 
 
-def _format_for(dest: Path) -> Format:
-    by_suffix = {it.suffix: it for it in FORMATS}
-    return by_suffix.get(dest.suffix.lower(), FOLDER)
+def write_session(session: Session, dest: Path) -> None:
+    """Writes a session in the form that the suffix of `dest` tells, and reads it again.
+
+    Raises:
+        DataError: `dest` cannot be written, or does not hold the session.
+    """
+    form = _format_for(dest)
+    form.write(session, dest)
+    if form.read(dest).digest() != session.digest():
+        raise DataError(
+            f"{dest} does not hold the session {session.name}: their digests differ.",
+            culprits=[str(dest)],
+            next_step="Remove it, and report this with the session.",
+        )
 
 
-def _check_free(source: Path, dest: Path, write: Format, *, force: bool) -> None:
+def check_free(source: Path, dest: Path, *, force: bool) -> None:
+    """Checks that nothing is overwritten.
+
+    Raises:
+        DataError: `dest` is there, and is no file that may be replaced.
+    """
+    form = _format_for(dest)
     # An empty folder is free for a session's folder, which looks for itself.
-    if not dest.exists() or (dest.is_dir() and not write.suffix):
+    if not dest.exists() or (dest.is_dir() and not form.suffix):
         return
-    replaceable = dest.is_file() and bool(write.suffix) and not dest.samefile(source)
+    same = source.exists() and dest.samefile(source)
+    replaceable = dest.is_file() and bool(form.suffix) and not same
     if replaceable and force:
         return
     raise DataError(
@@ -70,3 +127,35 @@ def _check_free(source: Path, dest: Path, write: Format, *, force: bool) -> None
         if replaceable
         else "Choose another name.",
     )
+
+
+def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
+    if not source.exists():
+        raise DataError(
+            f"{source} does not exist.",
+            culprits=[str(source)],
+            next_step="Check the path and its spelling.",
+        )
+    names = [it.name for it in FOREIGN_FORMATS]
+    if form is not None and form not in names:
+        raise DataError(
+            f"There is no format named {form!r}; the names are {', '.join(names)}.",
+            culprits=[form],
+            next_step=did_you_mean(form, names),
+        )
+    for known in FOREIGN_FORMATS:
+        if known.name == form or (form is None and known.recognises(source)):
+            return known
+    words = "; ".join([it.words for it in FORMATS] + [it.words for it in FOREIGN_FORMATS])
+    inside = ", ".join(it.name for it in listed(source)[:8]) if source.is_dir() else ""
+    raise DataError(
+        f"{source} is no session and in no format that is known: {words}."
+        + (f" It holds {inside}." if inside else ""),
+        culprits=[str(source)],
+        next_step="Write the poses into a CSV with a header, a row a view.",
+    )
+
+
+def _format_for(dest: Path) -> Format:
+    by_suffix = {it.suffix: it for it in FORMATS}
+    return by_suffix.get(dest.suffix.lower(), FOLDER)

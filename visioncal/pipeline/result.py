@@ -1,6 +1,6 @@
 """Running the stages, and putting their results together as a Calibration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult,
 from visioncal.errors import DataError, VisioncalError
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
+from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.pipeline.views import view_evidence
@@ -74,6 +75,7 @@ def run(
         raise DataError(f"level {level!r} is not one of {', '.join(_LEVELS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
     known = Known(loaded, solver, progress)
+    seen: Known | None = None
     for at, stage in enumerate(STAGES):
         if progress is not None:
             progress(stage.name, at, len(STAGES))
@@ -82,8 +84,30 @@ def run(
         except VisioncalError as error:
             # Views that are out of the game are often why the rest does not suffice.
             more = [it for it in known.lost_views if it not in error.culprits]
-            raise error.with_culprits(more) from error
-    return Run(_calibration(known), view_evidence(known))
+            raise _with_hint(error.with_culprits(more), seen) from error
+        if stage.name == "pnp":
+            seen = known
+    return Run(_calibration(_with_reading(known, seen)), view_evidence(known))
+
+
+def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
+    """Adds to an error, once the target's poses are known, how the robot's should be read."""
+    hint = "" if seen is None else reading_hint(seen)
+    if not hint:
+        return error
+    return type(error)(
+        error.message, culprits=error.culprits, next_step=f"{hint} {error.next_step}".strip()
+    )
+
+
+def _with_reading(known: Known, seen: Known | None) -> Known:
+    """Adds to a poor verdict how the poses should be read, where that explains it."""
+    if known.verdict is None or seen is None or not is_suspect(known):
+        return known
+    hint = reading_hint(seen)
+    if not hint:
+        return known
+    return replace(known, verdict=replace(known.verdict, reasons=(hint, *known.verdict.reasons)))
 
 
 def _calibration(known: Known) -> Calibration:

@@ -120,6 +120,11 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
     return Verdict(status, tuple(doubt.sentence for doubt in ordered))
 
 
+def is_scattered(findings: Findings, options: JudgeOptions | None = None) -> bool:
+    """Whether views disagree with each other by more than a sound cell's do."""
+    return any(_scatter_doubts(findings, options or JudgeOptions()))
+
+
 def _praise(findings: Findings) -> str:
     used, worst = sum(view.used for view in findings.views), findings.hand_eye.worst[0]
     return (

@@ -1,0 +1,41 @@
+"""Boards on paper, as tests look at them."""
+
+import numpy as np
+import pypdfium2
+
+from visioncal.printing import Sheet, arrange, pages_named
+from visioncal.printing.drawing import to_pdf
+from visioncal.types import Image, Target
+
+MM_PER_INCH = 25.4
+
+
+def any_page(target: Target) -> Sheet:
+    """The target on A4, or on A3 where A4 is too small."""
+    return arrange(target, (*pages_named("A4", None), *pages_named("A3", None)))
+
+
+def raster(pdf: bytes, dpi: float) -> Image:
+    """The first page in grey."""
+    document = pypdfium2.PdfDocument(pdf)
+    try:
+        bitmap = document[0].render(scale=dpi / 72, grayscale=True)
+        return np.ascontiguousarray(bitmap.to_numpy()).squeeze()
+    finally:
+        document.close()
+
+
+def printed(target: Target, dpi: float) -> Image:
+    """The target's page in grey."""
+    return raster(to_pdf(any_page(target)), dpi)
+
+
+def charuco(columns: int, rows: int, dictionary: str = "DICT_5X5_100", **options) -> Target:
+    """A ChArUco board of squares of 30 mm with markers of 22 mm."""
+    measures = {"square_m": 0.03, "square_sigma_m": 1e-5, "marker_m": 0.022} | options
+    return Target("board", "charuco", columns, rows, dictionary=dictionary, **measures)
+
+
+def checkerboard(columns: int, rows: int, square_m: float = 0.025) -> Target:
+    """A checkerboard."""
+    return Target("board", "checkerboard", columns, rows, square_m, 1e-5)

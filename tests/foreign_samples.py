@@ -1,0 +1,306 @@
+"""Small recordings in the forms of others, all of the same poses."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.formats import PoseWishes, Wishes
+from visioncal.transforms import exp, invert
+
+COUNT = 9
+CHARUCO = "charuco_5x7_36.195mm_18.256mm_DICT_6X6_250"
+
+
+def _world():
+    rng = np.random.default_rng(3)
+    home = exp(np.array([2.0, 0.4, 0.3, 0.4, -0.2, 0.5]))
+    spread = rng.uniform(-1, 1, (COUNT, 6)) * [0.5, 0.5, 0.9, 0.1, 0.1, 0.1]
+    base_from_flange = home @ exp(spread)
+    flange_from_cam = exp(np.array([0.1, -0.2, 1.5, 0.05, 0.01, 0.08]))
+    base_from_target = home @ flange_from_cam @ exp(np.array([0.1, 0, 0, -0.1, -0.05, 0.6]))
+    return base_from_flange, invert(base_from_flange @ flange_from_cam) @ base_from_target
+
+
+BASE_FROM_FLANGE, CAM_FROM_TARGET = _world()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording that was written: where it lies, and what the user says of it."""
+
+    source: Path
+    wishes: Wishes
+
+
+def quaternions(poses):
+    """(n, 7) position and quaternion x, y, z, w."""
+    return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+
+
+def vectors(poses):
+    """(n, 6) position and rotation vector."""
+    return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()])
+
+
+def picture(path: Path, size=(64, 48)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((size[1], size[0]), 90, np.uint8))
+
+
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _keyed(row) -> str:
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    return "".join(f"{name}: {value!r}\n" for name, value in zip(names, row.tolist(), strict=True))
+
+
+def industrial(folder: Path) -> Recording:
+    rows = ""
+    for at, row in enumerate(quaternions(BASE_FROM_FLANGE)):
+        _write(folder / f"poses/{at}.yaml", _keyed(row))
+        picture(folder / f"images/{at}.png")
+        rows += f"  - image: images/{at}.png\n    pose: poses/{at}.yaml\n"
+    text = f"data:\n{rows}" + (
+        "target_finder:\n  type: CharucoGridTargetFinder\n  rows: 7\n  cols: 5\n"
+        "  chessboard_dim: 0.036195\n  aruco_marker_dim: 0.018256\n  dictionary: 10\n"
+        "intrinsics: {fx: 60.0, fy: 60.0, cx: 32.0, cy: 24.0}\nstatic_camera: false\n"
+    )
+    _write(folder / "cal_data.yaml", text)
+    return Recording(folder, Wishes())
+
+
+def kinematics(folder: Path) -> Recording:
+    text = ""
+    for at, row in enumerate(quaternions(CAM_FROM_TARGET)):
+        pose = _keyed(row).replace("\n", "\n    ")
+        text += f"'15937{at:03d}':\n  camera_joints: []\n  pose:\n    {pose}\n"
+        text += f"  target_joints:\n  - {0.1 * at}\n  - {0.2 * at}\n"
+    return Recording(_write(folder / "measurements.yaml", text), Wishes())
+
+
+def visp(folder: Path) -> Recording:
+    for at, row in enumerate(vectors(BASE_FROM_FLANGE), start=1):
+        data = "".join(f"  - [{value!r}]\n" for value in row.tolist())
+        _write(folder / f"arm_pose_rPe_{at}.yaml", f"rows: 6\ncols: 1\ndata:\n{data}")
+        picture(folder / f"arm_image-{at}.png")
+    _write(
+        folder / "arm_camera.xml",
+        '<?xml version="1.0"?>\n<root><!-- a camera --><camera><name>Camera</name>'
+        "<image_width>64</image_width><image_height>48</image_height><model>"
+        "<type>perspectiveProjWithDistortion</type><px>60.5</px><py>60.25</py><u0>32.5</u0>"
+        "<v0>24.5</v0><kud>-0.125</kud><kdu>0.13</kdu></model></camera></root>\n",
+    )
+    _write(folder / "chessboard-data.txt", "Chessboard\n9 x 6\nsquare size: 0.0236 m\n")
+    return Recording(folder, Wishes(mount="eye-in-hand"))
+
+
+def zivid(folder: Path) -> Recording:
+    for at, pose in enumerate(BASE_FROM_FLANGE, start=1):
+        rows = pose.copy()
+        rows[:3, 3] *= 1e3
+        data = ",\n".join(f"      {row}" for row in rows.tolist())
+        text = "__version__:\n  serializer: 1\n  data: 1\nFloatMatrix:\n  Data:\n    [\n"
+        _write(folder / f"pos{at:02d}.yaml", f"{text}{data}\n    ]\n")
+        picture(folder / f"img{at:02d}.png")
+    return Recording(folder, Wishes(mount="eye-in-hand", target="checkerboard_9x6_25mm"))
+
+
+def _ros_transform(row, indent: str) -> str:
+    x, y, z, qx, qy, qz, qw = row.tolist()
+    return (
+        f"{indent}translation: {{x: {x!r}, y: {y!r}, z: {z!r}}}\n"
+        f"{indent}rotation: {{x: {qx!r}, y: {qy!r}, z: {qz!r}, w: {qw!r}}}\n"
+    )
+
+
+def easy_handeye(folder: Path) -> Recording:
+    text = "samples:\n"
+    for robot, camera in zip(
+        quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True
+    ):
+        text += f"- robot:\n{_ros_transform(robot, '    ')}"
+        text += f"  tracking:\n{_ros_transform(camera, '    ')}"
+    return Recording(_write(folder / "cell.samples", text), Wishes(mount="eye-in-hand"))
+
+
+def moveit_yaml(folder: Path) -> Recording:
+    text = ""
+    for robot, camera in zip(BASE_FROM_FLANGE, CAM_FROM_TARGET, strict=True):
+        text += f"- effector_wrt_world: {robot.reshape(-1).tolist()}\n"
+        text += f"  object_wrt_sensor: {camera.reshape(-1).tolist()}\n"
+    return Recording(_write(folder / "samples.yaml", text), Wishes(mount="eye-in-hand"))
+
+
+def moveit_json(folder: Path) -> Recording:
+    pairs = np.stack([BASE_FROM_FLANGE, CAM_FROM_TARGET], axis=1).tolist()
+    return Recording(_write(folder / "pairs.json", json.dumps(pairs)), Wishes(mount="eye-in-hand"))
+
+
+def views_json(folder: Path) -> Recording:
+    """One file a view; the robot's matrix by columns, as libfranka has it."""
+    for at, (robot, camera) in enumerate(
+        zip(BASE_FROM_FLANGE, vectors(CAM_FROM_TARGET), strict=True)
+    ):
+        record = {
+            "O_T_EE": robot.T.reshape(-1).tolist(),
+            "board": {"rvec": camera[3:, None].tolist(), "tvec": camera[:3, None].tolist()},
+            "joint_pose": [0.1 * at] * 7,
+            "seen": True,
+        }
+        _write(folder / f"pose_{at:02d}.json", json.dumps(record))
+    return Recording(folder, Wishes(mount="eye-in-hand"))
+
+
+def views_npz(folder: Path) -> Recording:
+    folder.mkdir(parents=True, exist_ok=True)
+    for at, (robot, camera) in enumerate(
+        zip(BASE_FROM_FLANGE, vectors(CAM_FROM_TARGET), strict=True)
+    ):
+        millimetres = robot.copy()
+        millimetres[:3, 3] *= 1e3
+        np.savetxt(folder / f"pose_{at:03d}.txt", millimetres, fmt="%.17g")
+        np.savez(folder / f"boardpose_{at:03d}.npz", rvec=camera[3:, None], tvec=camera[:3, None])
+    return Recording(folder, Wishes(mount="eye-in-hand", robot=PoseWishes(unit="mm")))
+
+
+def opencv_matrices(folder: Path) -> Recording:
+    text = "%YAML:1.0\n---\n"
+    for at, poses in enumerate(zip(BASE_FROM_FLANGE, CAM_FROM_TARGET, strict=True)):
+        for name, pose in zip(("base_T_ee", "camera_T_target"), poses, strict=True):
+            data = ", ".join(map(repr, pose.reshape(-1).tolist()))
+            text += f"{name}_{at}: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n"
+            text += f"   data: [ {data} ]\n"
+    return Recording(_write(folder / "poses.yml", text), Wishes(mount="eye-in-hand"))
+
+
+def kuka_csv(folder: Path) -> Recording:
+    angles = Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("ZYX", degrees=True)
+    rows = np.hstack([1e3 * BASE_FROM_FLANGE[:, :3, 3], angles, quaternions(CAM_FROM_TARGET)])
+    names = "X,Y,Z,A,B,C,cam_x,cam_y,cam_z,cam_qx,cam_qy,cam_qz,cam_qw,operator"
+    text = names + "\n" + "".join(f"{','.join(map(repr, it))},Ann\n" for it in rows.tolist())
+    camera = tuple(names.split(",")[6:13])
+    return Recording(
+        _write(folder / "log.csv", text),
+        Wishes(
+            mount="eye-in-hand",
+            robot=PoseWishes(("X", "Y", "Z", "A", "B", "C"), form="kuka"),
+            camera=PoseWishes(camera),
+        ),
+    )
+
+
+def plain_table(folder: Path) -> Recording:
+    rows = np.hstack([quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET)])
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savetxt(folder / "poses.txt", rows, fmt="%.17g", header="robot, camera")
+    return Recording(folder / "poses.txt", Wishes(mount="eye-in-hand"))
+
+
+def stacked_npz(folder: Path) -> Recording:
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = vectors(CAM_FROM_TARGET)
+    np.savez_compressed(
+        folder / "all.npz",
+        R_gripper2base=BASE_FROM_FLANGE[:, :3, :3],
+        t_gripper2base=BASE_FROM_FLANGE[:, :3, 3, None],
+        rvecs=camera[:, 3:],
+        tvecs=camera[:, :3],
+    )
+    return Recording(folder / "all.npz", Wishes(mount="eye-in-hand"))
+
+
+def keyed_json(folder: Path) -> Recording:
+    rows = [
+        {"robot_pose": {"position": dict(zip("xyz", it[:3], strict=True)), "rpy": it[3:]}, "b": b}
+        for it, b in zip(
+            np.hstack(
+                [
+                    BASE_FROM_FLANGE[:, :3, 3],
+                    Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("xyz"),
+                ]
+            ).tolist(),
+            invert(CAM_FROM_TARGET).tolist(),
+            strict=True,
+        )
+    ]
+    names = tuple(f"robot_pose.position.{it}" for it in "xyz")
+    return Recording(
+        _write(folder / "log.json", json.dumps({"samples": rows})),
+        Wishes(
+            mount="eye-in-hand",
+            robot=PoseWishes((*names, "robot_pose.rpy"), form="rpy"),
+            camera=PoseWishes(("b",), inverse=True),
+        ),
+    )
+
+
+def images_and_table(folder: Path) -> Recording:
+    rows = quaternions(BASE_FROM_FLANGE).tolist()
+    text = "x;y;z;qw;qx;qy;qz;lamp\n"
+    for at, (x, y, z, qx, qy, qz, qw) in enumerate(rows):
+        cells = (x, y, z, qw, qx, qy, qz)
+        text += ";".join(repr(it).replace(".", ",") for it in cells) + ";on\n"
+        picture(folder / f"shot{at}.png")
+    _write(folder / "robot.csv", text)
+    names = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    wishes = Wishes(mount="eye-in-hand", target=CHARUCO, robot=PoseWishes(names))
+    return Recording(folder, wishes)
+
+
+def streams(folder: Path) -> Recording:
+    """Two streams of one motion, the camera's 0.1 s ahead."""
+    folder.mkdir(parents=True, exist_ok=True)
+    times_s = np.arange(0, 6, 0.05)
+    swing = np.sin(np.outer(times_s, [1.1, 1.7, 2.3, 0.7, 1.3, 1.9]) + np.arange(6)) * 0.3
+    for name, poses, ahead_s in (("robot", exp(swing), 0), ("camera", invert(exp(swing)), 0.1)):
+        rows = np.hstack([times_s[:, None] + ahead_s, quaternions(poses)])
+        np.savetxt(folder / f"{name}.csv", rows, "%.9f", delimiter=",")
+    wishes = Wishes(mount="eye-in-hand", camera_file=folder / "camera.csv")
+    return Recording(folder / "robot.csv", wishes)
+
+
+def separate_lens(folder: Path) -> Recording:
+    """Poses and images with intrinsics in a file of their own."""
+    recording = images_and_table(folder / "images")
+    text = "%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\n"
+    text += "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+    text += "   data: [ 60., 0., 32., 0., 60., 24., 0., 0., 1. ]\n"
+    text += "distortion_coefficients: [-0.25, 0.125, 0, 0, 0]\n"
+    lens = _write(folder / "lens.yml", text)
+    return replace(recording, wishes=replace(recording.wishes, intrinsics=str(lens)))
+
+
+RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
+    it.__name__: it
+    for it in (
+        industrial,
+        kinematics,
+        visp,
+        zivid,
+        easy_handeye,
+        moveit_yaml,
+        moveit_json,
+        views_json,
+        views_npz,
+        opencv_matrices,
+        kuka_csv,
+        plain_table,
+        stacked_npz,
+        keyed_json,
+        images_and_table,
+    )
+}
+
+# Those whose poses are not the world's, or are in several files.
+MORE_RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
+    it.__name__: it for it in (streams, separate_lens)
+}

@@ -1,0 +1,192 @@
+"""Reads what `visioncal export` writes, as others would: without visioncal and without ROS.
+
+Rotations are built from elementary matrices by hand, so that a wrong order of angles cannot hide
+by being wrong twice. Every reader takes a document and returns a (4, 4) transform in metres.
+"""
+
+import ast
+import re
+import xml.etree.ElementTree as ET
+
+import cv2
+import numpy as np
+import yaml
+
+NUMBER = r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?"
+
+
+def rx(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def ry(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def rz(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def of_quaternion(x, y, z, w):
+    """The rotation v -> q v q* of a unit quaternion."""
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def of_rotation_vector(x, y, z):
+    """Rodrigues' formula."""
+    angle = np.sqrt(x * x + y * y + z * z)
+    if angle == 0.0:
+        return np.eye(3)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / angle
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+
+
+def transform(rotation, position):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, position
+    return matrix
+
+
+def code(text, mark):
+    """The lines that are no comments."""
+    return "\n".join(it for it in text.splitlines() if not mark or not it.startswith(mark))
+
+
+def message(fields):
+    t, q = fields["translation"], fields["rotation"]
+    assert all(isinstance(it, float) for it in (*t.values(), *q.values()))
+    return transform(
+        of_quaternion(q["x"], q["y"], q["z"], q["w"]), np.array([t["x"], t["y"], t["z"]])
+    )
+
+
+def ros(text):
+    return message(yaml.safe_load(text)["transform"])
+
+
+def launch_arguments(text):
+    """The options that a launch file passes on, from its syntax tree."""
+    compile(text, "calibration.launch.py", "exec")
+    tree = ast.parse(text)
+    calls = [
+        it
+        for it in ast.walk(tree)
+        if isinstance(it, ast.Call) and isinstance(it.func, ast.Name) and it.func.id == "Node"
+    ]
+    assert len(calls) == 1
+    fields = {it.arg: ast.literal_eval(it.value) for it in calls[0].keywords}
+    assert fields["package"] == "tf2_ros"
+    assert fields["executable"] == "static_transform_publisher"
+    words = fields["arguments"]
+    return dict(zip(words[::2], words[1::2], strict=True))
+
+
+def launch(text):
+    options = launch_arguments(text)
+    x, y, z, *q = (float(options[f"--{it}"]) for it in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+    return transform(of_quaternion(*q), [x, y, z])
+
+
+def urdf(text):
+    origin = ET.fromstring(text).find("joint/origin")
+    roll, pitch, yaw = map(float, origin.get("rpy").split())
+    return transform(
+        rz(yaw) @ ry(pitch) @ rx(roll), [float(it) for it in origin.get("xyz").split()]
+    )
+
+
+def opencv(text):
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    matrix = storage.getNode("transform").mat()
+    assert np.array_equal(
+        matrix[:3], np.hstack([storage.getNode("R").mat(), storage.getNode("t").mat()])
+    )
+    return matrix
+
+
+def zivid(text):
+    document = yaml.safe_load(text)
+    assert document["__version__"] == {"serializer": 1, "data": 1}
+    matrix_mm = np.array(document["FloatMatrix"]["Data"])
+    return transform(matrix_mm[:3, :3], matrix_mm[:3, 3] / 1000)
+
+
+def plain(text):
+    return np.loadtxt(text.splitlines())
+
+
+def _numbers(text, pattern):
+    """The numbers of a document, which must have the shape of `pattern`; # stands for a number."""
+    wanted = re.escape(pattern).replace(r"\#", f"({NUMBER})")
+    found = re.fullmatch(wanted, text.strip())
+    assert found, text
+    assert "e" not in "".join(found.groups())
+    return [float(it) for it in found.groups()]
+
+
+def ur(text):
+    it = _numbers(code(text, "#"), "p[#, #, #, #, #, #]")
+    return transform(of_rotation_vector(*it[3:]), it[:3])
+
+
+def _angled(text, mark, pattern, rotation):
+    it = _numbers(code(text, mark), pattern)
+    return transform(rotation(*np.radians(it[3:])), np.array(it[:3]) / 1000)
+
+
+def kuka(text):
+    pattern = "{X #,Y #,Z #,A #,B #,C #}"
+    return _angled(text, ";", pattern, lambda a, b, c: rz(a) @ ry(b) @ rx(c))
+
+
+def fanuc(text):
+    pattern = "X = # mm, Y = # mm, Z = # mm,\nW = # deg, P = # deg, R = # deg"
+    return _angled(text, "", pattern, lambda w, p, r: rz(r) @ ry(p) @ rx(w))
+
+
+def yaskawa(text):
+    return _angled(text, "", "#,#,#,#,#,#", lambda x, y, z: rz(z) @ ry(y) @ rx(x))
+
+
+def staubli(text):
+    pattern = "{#, #, #, #, #, #}"
+    return _angled(text, "//", pattern, lambda x, y, z: rx(x) @ ry(y) @ rz(z))
+
+
+def doosan(text):
+    pattern = "posx(#, #, #, #, #, #)"
+    return _angled(text, "#", pattern, lambda a, b, c: rz(a) @ ry(b) @ rz(c))
+
+
+def abb(text):
+    x, y, z, q1, q2, q3, q4 = _numbers(code(text, "!"), "[[#,#,#],[#,#,#,#]]")
+    return transform(of_quaternion(q2, q3, q4, q1), np.array([x, y, z]) / 1000)
+
+
+# By the format's name: every format that holds a transform.
+READERS = {
+    "ros": ros,
+    "ros-launch": launch,
+    "moveit": launch,
+    "easy-handeye2": ros,
+    "urdf": urdf,
+    "opencv": opencv,
+    "zivid": zivid,
+    "text": plain,
+    "ur": ur,
+    "kuka": kuka,
+    "fanuc": fanuc,
+    "abb": abb,
+    "staubli": staubli,
+    "yaskawa": yaskawa,
+    "doosan": doosan,
+}

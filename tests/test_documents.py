@@ -1,0 +1,260 @@
+"""Reading files of others as data: what they hold is read, what they would do is not done."""
+
+import io
+import math
+import pickle
+import zipfile
+from contextlib import suppress
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from visioncal.documents import (
+    as_numbers,
+    read_bounded,
+    read_json,
+    read_npy,
+    read_npz,
+    read_opencv,
+    read_table,
+    read_xml,
+    read_yaml,
+)
+from visioncal.documents.jsons import parse_json
+from visioncal.documents.yamls import parse_yaml
+from visioncal.errors import DataError
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(name, content):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 1e-3),  # YAML 1.1 itself takes it for text
+        ("1.", 1.0),
+        ("-.5", -0.5),
+        ("010", 10),
+        ("1_000", "1_000"),
+        ("'1'", "1"),
+        ("~", None),
+        ("Yes", True),
+        (".Inf", math.inf),
+        ("12:30", "12:30"),
+        ("2026-11-20", "2026-11-20"),
+        ("9" * 30, float("9" * 30)),
+        ("{a: [1, {b: c}]}", {"a": [1, {"b": "c"}]}),
+        ("", None),
+    ],
+)
+def test_yaml_values(text, value):
+    assert parse_yaml(text, "it") == value
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a: 1\nb: !!python/object/apply:os.getcwd []", "line 2: the tag 'python/object/apply"),
+        ("a: !!python/name:os.system x", "the tag"),
+        ("a: !local x", "the tag"),
+        ("a: &x [1]\nb: *x", r"line 2: the alias \*x"),
+        ("a: 1\nb: 2\na: 3", "line 3: the key 'a' a second time"),
+        ("[" * 200, "nested deeper"),
+        ("- " * 200 + "1", "nested deeper"),
+        ("a: [1, 2", "no YAML"),
+        ("a: b: c", "line 1 is no YAML"),
+        ("? [1]\n: 2", "a list or mapping as a key"),
+        ("m: !!opencv-matrix {rows: 2, cols: 2, dt: d, data: [1, 2, 3]}", "3 numbers; 2 x 2"),
+        ("m: !!opencv-matrix {rows: 1, cols: 1, dt: x, data: [1]}", "OpenCV's types"),
+        ("a: \x01", "no YAML"),
+    ],
+)
+def test_yaml_that_is_refused(text, words):
+    with pytest.raises(DataError, match=words):
+        parse_yaml(text, "it")
+
+
+def test_aliases_cost_nothing(file):
+    lines = ["a: &a [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
+    lines += [f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}, *{a}]" for a, b in pairwise("abcdefghi")]
+    with pytest.raises(DataError, match="alias"):
+        read_yaml(file("laughs.yaml", "\n".join(lines)))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"a": 1, "a": 2}', "the key 'a' is there twice"),
+        ("[" * 100_000, "deep|no JSON"),
+        ("[" * 60 + "]" * 60, "nested deeper"),
+        ("[" + "1," * 1_200_000 + "1]", "more than 1,000,000 values"),
+        ("[1,\n2,\n}", "line 3"),
+        ("", "no JSON"),
+    ],
+)
+def test_json_that_is_refused(text, words):
+    with pytest.raises(DataError, match=words):
+        parse_json(text, "it")
+
+
+def test_json_numbers_that_are_none():
+    value = parse_json("[NaN, -Infinity, 1e999, %s, null]" % ("7" * 5000), "it")
+    assert math.isnan(value[0])
+    assert value[1:4] == [-math.inf, math.inf, math.inf]
+    assert math.isnan(as_numbers(value, "it")[4])
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_a_value_or_a_message(data):
+    text = data.decode("latin-1")
+    for parse in (parse_json, parse_yaml):
+        # Anything but a DataError fails the test.
+        with suppress(DataError):
+            parse(text, "it")
+
+
+def test_xml_has_no_document_type(file):
+    for inner in ('<!ENTITY a "b">', '<!ENTITY a SYSTEM "file:///etc/hostname">'):
+        path = file("a.xml", f"<!DOCTYPE r [{inner}]><r>&a;</r>")
+        with pytest.raises(DataError, match="document type"):
+            read_xml(path)
+    with pytest.raises(DataError, match="nested deeper"):
+        read_xml(file("deep.xml", "<a>" * 100 + "</a>" * 100))
+    with pytest.raises(DataError, match="line 2 is no XML"):
+        read_xml(file("cut.xml", "<a>\n<b>"))
+    root = read_xml(file("good.xml", "<a>x<!-- no --><b c='1'> 2 </b>y</a>"))
+    assert (root.text, root.child("b").text, root.child("b").attributes) == ("xy", "2", {"c": "1"})
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+def test_what_opencv_writes_is_read_without_it(tmp_path, suffix):
+    path = tmp_path / f"stored.{suffix}"
+    # OpenCV's JSON has no notation of its own for what is not finite.
+    odd = [1.0, 2.0] if suffix == "json" else [np.inf, np.nan]
+    matrix = np.array([[1.5, -2e-12, odd[0]], [1 / 3, odd[1], 7]])
+    image = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("matrix", matrix)
+    storage.write("image", image)
+    storage.write("count", 3)
+    storage.write("name", "a lens")
+    storage.release()
+    read = read_opencv(path)
+    np.testing.assert_array_equal(read["matrix"], matrix)
+    np.testing.assert_array_equal(read["image"], image)
+    assert (read["count"], read["name"]) == (3, "a lens")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f8", ">f4", "<i2", "|u1", "|b1", "<U5", "|S3"])
+def test_what_numpy_writes_is_read_without_it(tmp_path, dtype, order):
+    array = np.asarray(np.arange(6).reshape(2, 3) % 2, dtype=dtype, order=order)
+    np.save(tmp_path / "a.npy", array)
+    np.savez_compressed(tmp_path / "a.npz", array=array, scalar=array[0, 0])
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)
+    both = read_npz(tmp_path / "a.npz")
+    np.testing.assert_array_equal(both["array"], array)
+    assert both["scalar"].shape == ()
+
+
+class Executed:
+    """What must not be loaded."""
+
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('a pickle was executed')",))
+
+
+def test_pickles_are_not_opened(file, tmp_path):
+    np.save(tmp_path / "a.npy", np.array([Executed()], dtype=object), allow_pickle=True)
+    with pytest.raises(DataError, match="Python objects"):
+        read_npy(tmp_path / "a.npy")
+    np.savez(tmp_path / "a.npz", a=np.array([Executed()], dtype=object))
+    with pytest.raises(DataError, match="Python objects"):
+        read_npz(tmp_path / "a.npz")
+    with pytest.raises(DataError, match=r"no \.npz"):
+        read_npz(file("b.npz", pickle.dumps(Executed())))
+
+
+def test_an_array_that_lies_about_its_size_is_not_allocated(file):
+    stored = io.BytesIO()
+    np.save(stored, np.zeros(3))
+    data = stored.getvalue().replace(b"(3,), }" + b" " * 10, b"(3000000000000,), }"[:17])
+    with pytest.raises(DataError, match="bytes of content"):
+        read_npy(file("a.npy", stored.getvalue()[:-5]))
+    with pytest.raises(DataError):
+        read_npy(file("b.npy", data))
+
+
+def test_a_zip_bomb_is_not_unpacked(file):
+    stored = io.BytesIO()
+    with zipfile.ZipFile(stored, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", b"\0" * 60_000_000)
+    assert len(stored.getvalue()) < 100_000
+    with pytest.raises(DataError, match="unpacks to more than 50 MB"):
+        read_npz(file("bomb.npz", stored.getvalue()))
+
+
+TABLES = {
+    "comma": "a,b\n1,2\n3,4\n",
+    "semicolon with decimal comma": "a;b\n1,0;2,0\n3,0;4,0\n",
+    "tab": "a\tb\n1\t2\n3\t4\n",
+    "blanks": "a  b\n1   2\n 3 4\n",
+    "comment as header": "# a b\n1 2\n\n# in between\n3 4\n",
+    "mark and line ends of Windows": "\ufeffa,b\r\n1,2\r\n3,4\r\n",
+    "quoted": '"a", "b"\n"1", 2\n3,"4"\n',
+}
+
+
+@pytest.mark.parametrize("text", TABLES.values(), ids=TABLES.keys())
+def test_tables(file, text):
+    table = read_table(file("a.csv", text))
+    assert table.columns == ("a", "b")
+    assert [[float(it) for it in row] for row in table.rows] == [[1, 2], [3, 4]]
+
+
+def test_a_table_without_a_header_has_numbered_columns(file):
+    table = read_table(file("a.txt", "1 nan\n3 4\n"))
+    assert table.columns == ("1", "2")
+    assert table.place(1) == "a.txt, line 2"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a,b\n1,2,3\n", "line 2: 3 cells; 2 are needed"),
+        ("a,a\n1,2\n", "two columns are named 'a'"),
+        ("a,b\n", "a header and no rows"),
+        ("# only words\n", "has no rows"),
+        ("1," * 1_200_000, "more than 1,000,000 values"),
+    ],
+)
+def test_tables_that_are_refused(file, text, words):
+    with pytest.raises(DataError, match=words):
+        read_table(file("a.csv", text))
+
+
+def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
+    with pytest.raises(DataError, match="line 2: a NUL byte"):
+        read_json(file("a.json", b"[\n\0]"))
+    with pytest.raises(DataError, match="not UTF-8"):
+        read_table(file("a.csv", "größe\n1\n".encode("latin-1")))
+    with pytest.raises(DataError, match="is no file"):
+        read_yaml(tmp_path)
+    with pytest.raises(DataError, match="does not exist"):
+        read_yaml(tmp_path / "absent.yaml")
+    # A hole in the file: nothing is written to the disk.
+    with (tmp_path / "large.csv").open("wb") as large:
+        large.truncate(60_000_000)
+    with pytest.raises(DataError, match="more than 50 MB"):
+        read_bounded(tmp_path / "large.csv")

@@ -1,0 +1,206 @@
+"""`visioncal target make` and `visioncal target check`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import messages
+from visioncal.errors import DataError
+from visioncal.files import read_bytes, write_atomically
+from visioncal.finders.identify import identify
+from visioncal.finders.identify_text import describe, to_document, to_toml
+from visioncal.finders.imaging import decode_image
+from visioncal.printing import Page, Request, arrange, pages_named, requested_target, write_board
+from visioncal.targets import (
+    load_target,
+    target_document,
+    target_from_document,
+    target_names,
+)
+from visioncal.types import Image, Target, TargetKind
+
+target_app = typer.Typer(
+    help="Print a board at its exact size, or name the one in a photograph.",
+    no_args_is_help=True,
+)
+
+# The options that describe a board, by its kind.
+_USED: dict[TargetKind, tuple[str, ...]] = {
+    "charuco": (
+        "--columns",
+        "--rows",
+        "--square-mm",
+        "--marker-mm",
+        "--dictionary",
+        "--legacy",
+        "--name",
+    ),
+    "checkerboard": ("--columns", "--rows", "--square-mm", "--name"),
+    "marker": ("--id", "--size-mm", "--dictionary", "--name"),
+}
+# Where no page is named, the first of these that has room.
+_PAGES = ("A4", "A3", "A2", "A1", "A0")
+
+
+@target_app.command("make")
+def make_command(
+    target: Annotated[
+        str | None,
+        typer.Argument(
+            help="A board that comes with visioncal, or the path of a .toml; or describe one by "
+            "--kind and the options after it."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the files.")] = Path(),
+    page: Annotated[
+        str | None,
+        typer.Option(
+            help="A5 to A0, letter, legal, tabloid, or a size as 500x300 (width x height, mm). "
+            "Left out: A4, or the smallest larger one for a board of given size."
+        ),
+    ] = None,
+    landscape: Annotated[
+        bool | None,
+        typer.Option("--landscape/--portrait", help="Left out: as the board fits."),
+    ] = None,
+    dpi: Annotated[float, typer.Option(help="Pixels an inch of the PNG.")] = 300.0,
+    kind: Annotated[TargetKind | None, typer.Option(help="What to print.")] = None,
+    columns: Annotated[
+        int | None, typer.Option(help="Squares along x; inner corners of a checkerboard.")
+    ] = None,
+    rows: Annotated[int | None, typer.Option(help="The same along y.")] = None,
+    square_mm: Annotated[
+        float | None, typer.Option(help="Side of a square; left out: the largest that fits.")
+    ] = None,
+    marker_mm: Annotated[
+        float | None, typer.Option(help="Side of the markers of a ChArUco board.")
+    ] = None,
+    dictionary: Annotated[str, typer.Option(help="As DICT_5X5_100, DICT_APRILTAG_36h11.")] = "",
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="The ChArUco layout from before OpenCV 4.6.")
+    ] = False,
+    marker_id: Annotated[int | None, typer.Option("--id", help="Id of a single marker.")] = None,
+    size_mm: Annotated[
+        float | None, typer.Option(help="Side of a single marker; left out: the largest.")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Name of a board described by options.")] = "",
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+) -> None:
+    """Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its NAME.toml.
+
+    Rulers along both axes show whether the printer kept the size. Exit status 0: all files are
+    written; 2: none, because the board does not fit or files are there already.
+    """
+    if (target is None) == (kind is None):
+        raise DataError(
+            "Name a board, or describe one by --kind: one of both is needed.",
+            next_step=f"The boards are {', '.join(target_names())}.",
+        )
+    described = {
+        "--columns": columns,
+        "--rows": rows,
+        "--square-mm": square_mm,
+        "--marker-mm": marker_mm,
+        "--dictionary": dictionary or None,
+        "--legacy": legacy or None,
+        "--id": marker_id,
+        "--size-mm": size_mm,
+        "--name": name or None,
+    }
+    _refuse_unused(kind, [option for option, value in described.items() if value is not None])
+    request = None
+    if kind is not None:
+        side_mm = size_mm if kind == "marker" else square_mm
+        request = Request(
+            kind, columns, rows, side_mm, marker_mm, dictionary, legacy, marker_id, name
+        )
+    sized = request is None or request.square_mm is not None
+    pages = _pages(page, landscape, larger=sized)
+    chosen = requested_target(request, pages) if request else load_target(str(target), None)[0]
+    sheet = arrange(chosen, pages)
+    files = write_board(out, sheet, dpi=dpi, force=force)
+    for file in files:
+        messages().print(escape(f"wrote {file}"))
+    messages().print(escape(f"Print it on {sheet.page} at 100 %, and check both rulers."))
+
+
+def _refuse_unused(kind: TargetKind | None, given: list[str]) -> None:
+    """Refuses options that would change nothing."""
+    used = _USED[kind] if kind is not None else ()
+    unused = [option for option in given if option not in used]
+    if unused:
+        what = f"--kind {kind} takes {', '.join(used)}" if used else "A named board is as it is"
+        raise DataError(
+            f"{what}; {', '.join(unused)} would change nothing.",
+            culprits=unused,
+            next_step="" if used else "Describe another board by --kind.",
+        )
+
+
+def _pages(page: str | None, landscape: bool | None, *, larger: bool) -> tuple[Page, ...]:
+    if page is not None:
+        return pages_named(page, landscape)
+    names = _PAGES if larger else _PAGES[:1]
+    return tuple(it for name in names for it in pages_named(name, landscape))
+
+
+@target_app.command("check")
+def check_command(
+    image: Annotated[Path, typer.Argument(help="A photograph of the board: png, jpg or tif.")],
+    square_mm: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Measured side of a square; of the marker for a single one."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Write the description here.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what is seen as JSON.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a description that is there.")
+    ] = False,
+) -> None:
+    """Name the board in a photograph without being told, and print its description.
+
+    Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
+    """
+    square_m = None if square_mm is None else round(1e-3 * square_mm, 9)
+    if out is not None and square_m is None:
+        raise DataError(
+            "A description needs the size of the squares, which a photograph does not show.",
+            culprits=["--square-mm"],
+            next_step="Measure over many squares and give --square-mm.",
+        )
+    if out is not None and out.exists() and not force:
+        raise DataError(
+            f"{out} exists already.",
+            culprits=[str(out)],
+            next_step="Choose another file with -o, or replace it with --force.",
+        )
+    identity = identify(_decoded(image))
+    if square_m is not None:
+        _checked(identity.target(image.stem, square_m))
+    description = to_toml(identity, square_m, image.name)
+    if out is not None:
+        write_atomically(out, description)
+    messages().print(escape(describe(identity)))
+    if as_json:
+        typer.echo(json.dumps(to_document(identity, square_m), indent=2))
+    elif out is None:
+        typer.echo(description, nl=False)
+    else:
+        messages().print(escape(f"wrote {out}"))
+
+
+def _decoded(path: Path) -> Image:
+    image = decode_image(read_bytes(path))
+    if isinstance(image, str):
+        raise DataError(f"{path} is {image}.", culprits=[str(path)])
+    return image
+
+
+def _checked(target: Target) -> None:
+    """Refuses what a session could not load, such as a size in metres given as millimetres."""
+    target_from_document(target_document(target), target.name)

@@ -1,0 +1,125 @@
+"""NumPy's .npy and .npz: the header is checked before anything is allocated; no pickles."""
+
+import io
+import math
+import re
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from visioncal.documents.bounds import MAX_BYTES, read_bounded
+from visioncal.errors import DataError
+
+Array: TypeAlias = npt.NDArray[Any]
+
+_MAX_MEMBERS = 1000
+_MAGIC = b"\x93NUMPY"
+# Numbers and text of fixed width; an object array ("|O") is a pickle.
+_DTYPE = re.compile(r"[<>|=]([fiu][1248]|b1|[US][0-9]{1,4})")
+_HEADER = re.compile(
+    r"\{\s*'descr':\s*'(?P<descr>[^']*)',\s*'fortran_order':\s*(?P<fortran>True|False),"
+    r"\s*'shape':\s*\((?P<shape>[0-9, ]*)\),?\s*\}\s*"
+)
+
+
+def read_npy(path: Path) -> Array:
+    """Reads an array of numbers or text.
+
+    Raises:
+        DataError: It is missing, no .npy, holds Python objects, or is too large.
+    """
+    return _parse_npy(read_bounded(path), str(path))
+
+
+def read_npz(path: Path) -> Mapping[str, Array]:
+    """Reads the arrays of an .npz by their names.
+
+    Raises:
+        DataError: It is missing, no .npz, damaged, holds Python objects, or unpacks to more than
+            50 MB.
+    """
+    where = str(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_bounded(path))) as archive:
+            members = archive.infolist()
+            if len(members) > _MAX_MEMBERS:
+                raise DataError(
+                    f"{where} holds {len(members)} arrays; up to {_MAX_MEMBERS} are read.",
+                    culprits=[where],
+                )
+            return _read_members(archive, members, where)
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        OSError,
+        ValueError,
+        RuntimeError,
+        KeyError,
+        AttributeError,
+    ) as error:
+        raise DataError(
+            f"{where} is no .npz: {str(error)[:120]}.",
+            culprits=[where],
+            next_step="numpy.savez writes one.",
+        ) from error
+
+
+def _read_members(
+    archive: zipfile.ZipFile, members: list[zipfile.ZipInfo], where: str
+) -> dict[str, Array]:
+    arrays, room = {}, MAX_BYTES
+    for member in members:
+        # The stated size may lie; what is unpacked counts.
+        with archive.open(member) as file:
+            data = file.read(room + 1)
+        room -= len(data)
+        if room < 0:
+            raise DataError(
+                f"{where} unpacks to more than {MAX_BYTES / 1e6:.0f} MB.",
+                culprits=[where],
+                next_step="Keep the poses in a file of their own.",
+            )
+        name = member.filename.removesuffix(".npy")
+        if name in arrays:
+            raise DataError(f"{where}: the array {name!r} is there twice.", culprits=[where])
+        arrays[name] = _parse_npy(data, f"{where}: {name}")
+    return arrays
+
+
+def _parse_npy(data: bytes, where: str) -> Array:
+    """Parses the format of numpy.save, versions 1 and 2 (NumPy, "NEP 1")."""
+    width = {b"\x01\x00": 2, b"\x02\x00": 4}.get(data[6:8], 0)
+    if not data.startswith(_MAGIC) or not width:
+        raise DataError(f"{where} is no .npy array.", culprits=[where])
+    start = 8 + width
+    end = start + int.from_bytes(data[8:start], "little")
+    # Real headers have about a hundred bytes.
+    header = _HEADER.fullmatch(data[start : min(end, start + 2000)].decode("latin-1"))
+    if header is None:
+        raise DataError(f"{where} has no header of a plain array.", culprits=[where])
+    if _DTYPE.fullmatch(header["descr"]) is None:
+        raise DataError(
+            f"{where} holds {header['descr']!r}; numbers or text are needed.",
+            culprits=[where],
+            next_step="Arrays of Python objects are not read: they run code when they are loaded.",
+        )
+    sizes = [it.strip() for it in header["shape"].split(",") if it.strip()]
+    if any(len(it) > 12 or not it.isdecimal() for it in sizes) or len(sizes) > 8:
+        raise DataError(f"{where} has the shape ({header['shape'][:60]}).", culprits=[where])
+    shape = tuple(int(it) for it in sizes)
+    dtype = np.dtype(header["descr"])
+    needed = math.prod(shape) * dtype.itemsize
+    if needed != len(data) - end:
+        raise DataError(
+            f"{where} has {len(data) - end} bytes of content; the shape {shape} needs {needed}.",
+            culprits=[where],
+            next_step="The file is cut off or damaged; copy it again.",
+        )
+    flat = np.frombuffer(data, dtype, count=math.prod(shape), offset=end)
+    return flat.reshape(shape, order="F" if header["fortran"] == "True" else "C")

@@ -1,0 +1,72 @@
+"""How much of a file is read, and how deep it may go."""
+
+from pathlib import Path
+
+from visioncal.errors import DataError
+from visioncal.files import decode_text
+
+# Thousands of poses fill a few megabytes as text; more is another kind of file.
+MAX_BYTES = 50_000_000
+# Each value costs about a hundred bytes in memory once it is read.
+MAX_VALUES = 1_000_000
+# Matrices in lists in tables need six.
+MAX_DEPTH = 40
+
+
+def read_bounded(path: Path) -> bytes:
+    """Reads a file of at most 50 MB.
+
+    Raises:
+        DataError: It is missing, no file, cannot be read, or is larger.
+    """
+    try:
+        if not path.is_file():
+            what = "is no file" if path.exists() else "does not exist"
+            raise DataError(f"{path} {what}; a file is needed.", culprits=[str(path)])
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        words = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise DataError(f"{path} cannot be read: {words}.", culprits=[str(path)]) from error
+    if len(data) > MAX_BYTES:
+        raise DataError(
+            f"{path} has more than {MAX_BYTES / 1e6:.0f} MB; files of poses up to that size are "
+            "read.",
+            culprits=[str(path)],
+            next_step="Cut the recording into parts, or convert the poses alone.",
+        )
+    return data
+
+
+def read_plain_text(path: Path) -> str:
+    """Reads a bounded UTF-8 text file, with or without a byte-order mark.
+
+    Raises:
+        DataError: As `read_bounded`, or the bytes are not UTF-8 or hold NUL, as binary files do.
+    """
+    data = read_bounded(path)
+    if b"\0" in data:
+        line = data.count(b"\n", 0, data.index(b"\0")) + 1
+        raise DataError(
+            f"{path}, line {line}: a NUL byte; it is no text file in UTF-8.",
+            culprits=[str(path)],
+            next_step="Save the file as UTF-8.",
+        )
+    return decode_text(data, str(path))
+
+
+def too_many(where: str) -> DataError:
+    """Builds the error for a document with more values than are read."""
+    return DataError(
+        f"{where}: more than {MAX_VALUES:,} values; documents of poses up to that size are read.",
+        culprits=[where],
+        next_step="Cut the recording into parts.",
+    )
+
+
+def too_deep(where: str) -> DataError:
+    """Builds the error for a document that is nested deeper than any pose is."""
+    return DataError(
+        f"{where}: nested deeper than {MAX_DEPTH} levels, as no file of poses is.",
+        culprits=[where],
+    )

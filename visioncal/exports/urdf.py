@@ -1,0 +1,43 @@
+"""A transform as a fixed joint of a URDF."""
+
+import re
+
+from visioncal.conventions import POSE_FORMS, write_pose
+from visioncal.exports.content import Content
+from visioncal.exports.format import Format
+from visioncal.exports.frames import ROS_FRAMES, ros_notes
+from visioncal.exports.writing import numbers, one_line
+
+
+def _write(content: Content) -> str:
+    """Writes a document that `xacro:include` takes in, with the child's link and the joint.
+
+    `rpy` turns about the parent's fixed axes, x first, then y, then z: the rotation is Rz(yaw)
+    Ry(pitch) Rx(roll) (ROS wiki, urdf/XML/joint; urdfdom, Rotation::setFromRPY).
+    """
+    # XML ends a comment at two hyphens.
+    notes = "".join(
+        f"  <!-- {re.sub('-(?=-)', '- ', one_line(it))} -->\n" for it in ros_notes(content)
+    )
+    pose = [repr(it) for it in numbers(write_pose(content.matrix, POSE_FORMS["rpy"]))]
+    joint = f"{content.parent}-{content.child}".replace("/", "_")
+    return (
+        '<?xml version="1.0"?>\n'
+        '<robot name="visioncal">\n'
+        f"{notes}"
+        f'  <link name="{content.child}"/>\n'
+        f'  <joint name="{joint}" type="fixed">\n'
+        f'    <parent link="{content.parent}"/>\n'
+        f'    <child link="{content.child}"/>\n'
+        f'    <origin xyz="{" ".join(pose[:3])}" rpy="{" ".join(pose[3:])}"/>\n'
+        "  </joint>\n"
+        "</robot>\n"
+    )
+
+
+URDF = Format(
+    "urdf",
+    "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
+    _write,
+    frames=ROS_FRAMES,
+)

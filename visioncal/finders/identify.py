@@ -1,0 +1,245 @@
+"""Naming the target in a photograph of which nothing is known."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from visioncal.errors import DataError
+from visioncal.finders.charuco import find_charuco
+from visioncal.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
+from visioncal.finders.identify_checkerboard import find_squares
+from visioncal.finders.identify_markers import Marker, decode_markers, genuine, holding
+from visioncal.finders.imaging import why_hard_to_see
+from visioncal.finders.result import Seen
+from visioncal.targets import DEFAULT_RELATIVE_SIGMA
+from visioncal.types import Image, Target, TargetKind
+
+# Edges wider than this hide the bits of small markers [px].
+_MAX_BLUR_PX = 6.0
+_LISTED = 12
+# So many markers on one lattice are a board, even where its corners are not found.
+_SURE_MARKERS = 8
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a photograph shows, all but its size.
+
+    Attributes:
+        kind: What is printed.
+        columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
+        rows: The same along y.
+        whole: Whether the board is seen to end there; where not, it may have more.
+        dictionary: The smallest dictionary that holds the markers; empty without markers.
+        larger: Other dictionaries that hold the same markers.
+        legacy: Whether a ChArUco board has the layout that OpenCV printed before 4.6; with an odd
+            number of rows both layouts are the same.
+        marker_share: A marker's side over a square's; 0 except for ChArUco.
+        marker_share_sigma: Standard deviation of that.
+        marker_ids: The ids that were decoded, ascending; of single markers, the target's first.
+        corners_seen: Corners that the finder of that kind finds.
+        corners: Corners that the target has.
+        notes: What else there is to know, in sentences.
+    """
+
+    kind: TargetKind
+    columns: int
+    rows: int
+    whole: bool
+    corners_seen: int
+    corners: int
+    dictionary: str = ""
+    larger: tuple[str, ...] = ()
+    legacy: bool = False
+    marker_share: float = 0.0
+    marker_share_sigma: float = 0.0
+    marker_ids: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def target(self, name: str, square_m: float) -> Target:
+        """Builds the target.
+
+        Args:
+            name: Its name.
+            square_m: Measured side of a square, or of the marker for a single one [m].
+        """
+        return Target(
+            name,
+            self.kind,
+            self.columns,
+            self.rows,
+            square_m,
+            DEFAULT_RELATIVE_SIGMA * square_m,
+            marker_m=round(self.marker_share * square_m, 5),
+            dictionary=self.dictionary,
+            legacy=self.legacy,
+            marker_id=self.marker_ids[0] if self.kind == "marker" else -1,
+        )
+
+
+def identify(image: Image) -> Identity:
+    """Names the target in an image: ChArUco board, checkerboard or marker.
+
+    Args:
+        image: (h, w) grey image.
+
+    Returns:
+        The target whose corners are the most; others that are seen too are named in its notes.
+
+    Raises:
+        DataError: There is none; the message says what was looked for and what may help.
+    """
+    markers = decode_markers(image)
+    boards = _charucos(image, markers)
+    singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
+    found = list(boards.values()) or [*_checkerboards(image), *singles]
+    if found:
+        best = max(found, key=lambda it: it.corners_seen)
+        beside = (it for it in singles if it is not best)
+        return replace(best, notes=(*best.notes, *_notes_beside(beside)))
+    why = why_hard_to_see(image, _MAX_BLUR_PX)
+    height, width = image.shape
+    raise DataError(
+        f"No target is seen in this image of {width} x {height} pixels"
+        + (f": {why}." if why else ".")
+        + " Looked for were ChArUco boards and single markers of OpenCV's ArUco and AprilTag "
+        f"dictionaries, and checkerboards of 3 x 3 inner corners or more; {len(markers)} patterns "
+        "looked like a marker.",
+        next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
+        "nearer, and tilted by less than 60 degrees.",
+    )
+
+
+def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
+    for it in others:
+        yield f"Beside it, marker {it.marker_ids[0]} of {it.dictionary} is seen."
+
+
+def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
+    """The best board by its family."""
+    found = {}
+    for family in sorted({it.family for it in markers}):
+        members = [it for it in markers if it.family == family]
+        lattices = find_lattices(image, members) if len(members) >= LEAST_MARKERS else ()
+        named = [_charuco(image, family, it) for it in lattices]
+        boards = [it for it in named if it is not None]
+        if boards:
+            found[family] = _decided(boards)
+    return found
+
+
+def _decided(boards: list[Identity]) -> Identity:
+    """Of boards that the same markers may be of, the one with the most corners."""
+    best = max(boards, key=lambda it: it.corners_seen)
+    rivals = [it for it in boards if it is not best and it.corners_seen == best.corners_seen]
+    if not rivals:
+        return best
+    layouts = ", ".join(
+        f"{it.columns} x {it.rows}{' in the legacy layout' if it.legacy else ''}" for it in rivals
+    )
+    note = f"What is seen of it fits {layouts} as well: show more of the board."
+    return replace(best, whole=False, notes=(note, *best.notes))
+
+
+def _charuco(image: Image, family: str, lattice: Lattice) -> Identity | None:
+    """Names a board, and confirms it by the finder that calibrations use."""
+    ids = tuple(sorted({it.number for it in lattice.markers}))
+    names = holding(family, max(lattice.columns * lattice.rows // 2, ids[-1] + 1))
+    if not names:
+        return None
+    identity = Identity(
+        "charuco",
+        lattice.columns,
+        lattice.rows,
+        lattice.rows_certain,
+        corners_seen=0,
+        corners=(lattice.columns - 1) * (lattice.rows - 1),
+        dictionary=names[0],
+        larger=names[1:],
+        legacy=lattice.legacy,
+        marker_share=lattice.share,
+        marker_share_sigma=lattice.share_sigma,
+        marker_ids=ids,
+        notes=tuple(_charuco_notes(lattice, names)),
+    )
+    seen = find_charuco(image, identity.target("board", 1.0))
+    if isinstance(seen, Seen):
+        return replace(identity, corners_seen=len(seen.ids))
+    if len(lattice.markers) < _SURE_MARKERS:
+        return None
+    note = f"Its corners are not found in this image: {seen.reason}."
+    return replace(identity, notes=(note, *identity.notes))
+
+
+def _charuco_notes(lattice: Lattice, names: tuple[str, ...]) -> Iterator[str]:
+    if not lattice.rows_certain:
+        yield f"The board may go on below row {lattice.rows}: its end there is not in the image."
+    if len(names) > 1:
+        yield f"{_listed(names[1:])} hold the same markers: any of them finds this board."
+    if lattice.rows % 2 and lattice.rows_certain:
+        yield "With an odd number of rows the legacy layout is the same as the present one."
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _checkerboards(image: Image) -> list[Identity]:
+    squares = find_squares(image)
+    if squares is None:
+        return []
+    count = squares.columns * squares.rows
+    notes = []
+    if squares.cut:
+        notes.append("The board may go on outside the image.")
+    if not squares.found:
+        notes.append("The search for just this board fails in this image.")
+    if (squares.columns + squares.rows) % 2 == 0:
+        notes.append(
+            "This board looks the same upside down; one with an even and an odd number is better."
+        )
+    seen = count if squares.found else 0
+    whole = not squares.cut and squares.found
+    return [
+        Identity(
+            "checkerboard", squares.columns, squares.rows, whole, seen, count, notes=tuple(notes)
+        )
+    ]
+
+
+def _singles(markers: tuple[Marker, ...]) -> list[Identity]:
+    """The family of which the most markers are seen, and its largest marker."""
+    if not markers:
+        return []
+    members: list[Marker] = []
+    # The likest marker comes first; of two families with as many, its own is taken.
+    for family in dict.fromkeys(it.family for it in markers):
+        its = [it for it in markers if it.family == family]
+        members = its if len(its) > len(members) else members
+    largest = max(members, key=lambda it: it.side_px)
+    others = tuple(sorted(it.number for it in members if it is not largest))
+    ids = (largest.number, *others)
+    names = holding(largest.family, max(ids) + 1)
+    notes = []
+    if others:
+        listed = ", ".join(map(str, others[:_LISTED])) + (" ..." if len(others) > _LISTED else "")
+        notes.append(
+            f"Also seen: {listed}. A target is one marker, and the largest is taken; where they "
+            "are a board's, show more of it."
+        )
+    if len(names) > 1:
+        notes.append(f"{_listed(names[1:])} hold the same markers: any of them finds this one.")
+    return [
+        Identity(
+            "marker",
+            1,
+            1,
+            whole=True,
+            corners_seen=4,
+            corners=4,
+            dictionary=names[0],
+            larger=names[1:],
+            marker_ids=ids,
+            notes=tuple(notes),
+        )
+    ]

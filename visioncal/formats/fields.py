@@ -1,0 +1,221 @@
+"""Rows with named values, before it is known what they mean: tables, JSON, arrays."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.documents import TextTable, is_number
+from visioncal.documents.arrays import Array
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean
+from visioncal.types import FloatArray
+
+_TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
+# Columns of a table without a header, by their number: times, then poses of the robot and the
+# camera, each a position with a quaternion or a matrix by rows.
+_UNNAMED = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
+_UNNAMED |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
+_LISTED = 40
+# A pose and its covariance have fewer numbers; lists of corners and images have more.
+_MOST_NUMBERS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Named values of n rows.
+
+    Attributes:
+        name: What the recording is called.
+        folder: What the names of images are relative to.
+        places: (n,) where each row stands, for messages.
+        numbers: (n, ...) arrays by name; NaN where a row has none.
+        texts: (n,) texts by name, of every column of a table and of single numbers.
+        views: (n,) the rows' numbers, where their files' names have them.
+        ragged: What is wrong with fields whose rows differ in shape.
+    """
+
+    name: str
+    folder: Path
+    places: tuple[str, ...]
+    numbers: Mapping[str, FloatArray]
+    texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    views: tuple[int, ...] = ()
+    ragged: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def find(self, name: str) -> str:
+        """Finds the full name of a field, which may be given without what stands before its point.
+
+        Raises:
+            DataError: There is no such field; the message lists those that there are.
+        """
+        known = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
+        if name in known:
+            return name
+        ends = [it for it in known if it.endswith(f".{name}")]
+        if len(ends) == 1:
+            return ends[0]
+        raise DataError(
+            f"{self.name} has no column or key {name!r}; it has {self.listing()}.",
+            culprits=[name],
+            next_step=did_you_mean(name, known),
+        )
+
+    def column(self, name: str) -> FloatArray:
+        """Takes a field's numbers, (n, k).
+
+        Raises:
+            DataError: There is no such field, or it holds text.
+        """
+        full = self.find(name)
+        if full in self.ragged:
+            raise DataError(self.ragged[full], culprits=[full])
+        if full not in self.numbers:
+            text = next((it for it in self.texts[full] if it and not is_number(it)), "")
+            raise DataError(
+                f"{self.name}: {full} holds {text[:40]!r}; numbers are needed.", culprits=[full]
+            )
+        return self.numbers[full].reshape(len(self), -1)
+
+    def listing(self) -> str:
+        """Words the fields with the numbers that each has a row."""
+        names = list(dict.fromkeys([*self.numbers, *self.texts]))
+        words = [
+            f"{it} ({int(np.prod(self.numbers[it].shape[1:]))})"
+            if it in self.numbers and self.numbers[it].ndim > 1
+            else it
+            for it in names[:_LISTED]
+        ]
+        return ", ".join(words) + (f" and {len(names) - _LISTED} more" if names[_LISTED:] else "")
+
+
+def fields_of_table(table: TextTable) -> Fields:
+    """Takes the columns of a table; those in which every filled cell is a number become numbers."""
+    columns = list(zip(*table.rows, strict=True))
+    texts = dict(zip(table.columns, columns, strict=True))
+    numbers = {
+        name: np.array([float(it) if it else np.nan for it in cells])
+        for name, cells in texts.items()
+        if any(cells) and all(not it or is_number(it) for it in cells)
+    }
+    places = tuple(table.place(it) for it in range(len(table.rows)))
+    return Fields(table.path.stem, table.path.parent, places, numbers, texts)
+
+
+def fields_of_records(
+    records: Sequence[Mapping[str, object]],
+    places: Sequence[str],
+    name: str,
+    folder: Path,
+    views: tuple[int, ...] = (),
+) -> Fields:
+    """Takes the values of n records, as `flattened` gives them; one that rows lack is NaN there."""
+    numbers: dict[str, FloatArray] = {}
+    texts: dict[str, tuple[str, ...]] = {}
+    ragged: dict[str, str] = {}
+    for key in dict.fromkeys(name for it in records for name in it):
+        values = [it.get(key) for it in records]
+        if any(isinstance(it, str) for it in values):
+            texts[key] = tuple("" if it is None else str(it) for it in values)
+            continue
+        arrays = [it if isinstance(it, np.ndarray) else None for it in values]
+        shapes = Counter(it.shape for it in arrays if it is not None)
+        if not shapes:
+            continue
+        shape = shapes.most_common(1)[0][0]
+        odd = [at for at, it in enumerate(arrays) if it is not None and it.shape != shape]
+        if odd:
+            ragged[key] = (
+                f"{places[odd[0]]}: {key} has the shape {shapes.most_common()[-1][0]}; most rows "
+                f"have {shape}."
+            )
+            continue
+        rows = [np.full(shape, np.nan) if it is None else it for it in arrays]
+        numbers[key] = np.array(rows).reshape(len(rows), *shape)
+        if not shape:
+            texts[key] = _cells(numbers[key])
+    return Fields(name, folder, tuple(places), numbers, texts, views, ragged)
+
+
+def flattened(record: object, prefix: str = "") -> dict[str, object]:
+    """Joins the names of nested mappings by points; parsing has bounded their depth.
+
+    Returns:
+        Texts, and arrays of few numbers; what is larger or null is left out.
+    """
+    if isinstance(record, Mapping):
+        flat: dict[str, object] = {}
+        for name, value in record.items():
+            flat |= flattened(value, f"{prefix}{name}.")
+        return flat
+    name = prefix.rstrip(".") or "value"
+    if isinstance(record, str | bool):
+        return {name: str(record)}
+    try:
+        array = np.array(record, dtype=float)
+    except (ValueError, TypeError, OverflowError):
+        return {}
+    return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
+
+
+def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
+    """Takes arrays whose first axis counts the rows; others are left out.
+
+    Raises:
+        DataError: There is no array with rows.
+    """
+    lengths = Counter(len(it) for it in arrays.values() if it.ndim > 1)
+    lengths = lengths or Counter(len(it) for it in arrays.values() if it.ndim == 1)
+    if not lengths:
+        shapes = ", ".join(f"{name} {it.shape}" for name, it in arrays.items()) or "nothing"
+        raise DataError(
+            f"{path} holds {shapes}; arrays with one row a pose are needed.", culprits=[str(path)]
+        )
+    rows = lengths.most_common(1)[0][0]
+    fitting = {
+        name: it
+        for name, it in arrays.items()
+        if it.ndim and len(it) == rows and it.size <= _MOST_NUMBERS * max(rows, 1)
+    }
+    numbers = {name: it.astype(float) for name, it in fitting.items() if it.dtype.kind in "fiub"}
+    texts = {name: _cells(it) for name, it in numbers.items() if it.ndim == 1}
+    texts |= {
+        name: tuple(it.decode("latin-1") if isinstance(it, bytes) else str(it) for it in array)
+        for name, array in fitting.items()
+        if array.dtype.kind in "US" and array.ndim == 1
+    }
+    places = tuple(f"{path.name}, row {at}" for at in range(rows))
+    return Fields(path.stem, path.parent, places, numbers, texts)
+
+
+def _cells(numbers: FloatArray) -> tuple[str, ...]:
+    """Writes (n,) numbers as the cells of a table."""
+    return tuple("" if np.isnan(it) else repr(float(it)) for it in numbers)
+
+
+def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
+    """Tells what the columns of a table without a header are, by how many there are.
+
+    Returns:
+        The columns of `time`, `robot` and `camera`; empty where it has a header or another number.
+    """
+    names = [str(at) for at in range(1, len(fields.texts) + 1)]
+    if not names or list(fields.texts) != names:
+        return {"time": (), "robot": (), "camera": ()}
+    time, robot, camera = _UNNAMED.get(len(names), (0, 0, 0))
+    return {
+        "time": tuple(names[:time]),
+        "robot": tuple(names[time : time + robot]),
+        "camera": tuple(names[time + robot :]) if camera else (),
+    }
+
+
+def stamp_name(fields: Fields) -> str:
+    """Finds the field of the times; empty where there is none."""
+    named = next((it for it in fields.numbers if it.lower() in _TIME_NAMES), "")
+    return next(iter(unnamed_columns(fields)["time"]), named)

@@ -1,0 +1,149 @@
+"""Finding files: in natural order, by the number in their names, and images by their rows."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from visioncal.errors import DataError
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+# Enough to tell what a text file is about.
+_HEAD_BYTES = 16_384
+
+
+def natural(path: Path) -> tuple[object, ...]:
+    """Orders names as people do: `view2` before `view10`."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return tuple((int(it), "") if it.isdigit() else (-1, it) for it in parts)
+
+
+def number_in(name: str) -> int | None:
+    """Takes the last number in a name without its ending; None where there is none."""
+    digits = re.findall(r"[0-9]+", Path(name).stem)
+    return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
+
+
+def listed(folder: Path) -> tuple[Path, ...]:
+    """Lists the files of a folder in natural order; none where it cannot be listed."""
+    try:
+        return tuple(sorted((it for it in folder.iterdir() if it.is_file()), key=natural))
+    except OSError:
+        return ()
+
+
+def images_in(folder: Path) -> tuple[Path, ...]:
+    """Lists the images of a folder in natural order.
+
+    Raises:
+        DataError: There are none.
+    """
+    found = tuple(it for it in listed(folder) if it.suffix.lower() in IMAGE_ENDINGS)
+    if not found:
+        raise DataError(
+            f"{folder} has no images (png, jpg, tif).",
+            culprits=[str(folder)],
+            next_step="Name the folder of the images with --images.",
+        )
+    return found
+
+
+def head(path: Path) -> str:
+    """Reads the beginning of a text file; empty where it is none."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(_HEAD_BYTES)
+    except (OSError, ValueError):
+        return ""
+    return "" if b"\0" in data else data.decode("utf-8", "ignore")
+
+
+def images_named(
+    names: Sequence[str | None], base: Path, folder: Path | None
+) -> tuple[Path | None, ...]:
+    """Finds the images that rows name.
+
+    Args:
+        names: (n,) what each row says; None or empty in a row without an image.
+        base: What the names are relative to.
+        folder: Where the images lie now; they are matched by name, else by the number in it.
+
+    Returns:
+        (n,) paths; one that does not exist is where the source says that it should be.
+    """
+    if folder is None:
+        return tuple(below(base, name) if name else None for name in names)
+    there = images_in(folder)
+    by_name = {it.name: it for it in there}
+    by_number = _unique_numbers(there)
+    wanted = [number_in(it) for it in names if it]
+    numbers_tell = len(set(wanted)) == len(wanted) and None not in wanted
+    found: list[Path | None] = []
+    for name in names:
+        if not name:
+            found.append(None)
+            continue
+        plain = name.replace("\\", "/").rsplit("/", 1)[-1]
+        number = number_in(plain)
+        match = by_name.get(plain)
+        if match is None and numbers_tell and number is not None:
+            match = by_number.get(number)
+        found.append(match or folder / plain)
+    return tuple(found)
+
+
+def images_of(
+    folder: Path, views: Sequence[int], labels: Sequence[str], *, numbered: bool
+) -> tuple[Path | None, ...]:
+    """Pairs rows with the images of a folder, by number or in order.
+
+    Args:
+        folder: The folder.
+        views: (n,) the rows' numbers.
+        labels: (n,) the rows' places, for messages.
+        numbered: Whether these numbers stand in the source's names; else rows and images are paired
+            in natural order, and must be as many.
+
+    Returns:
+        (n,) paths; None in a row whose number no image has.
+
+    Raises:
+        DataError: Their numbers differ, with what is over.
+    """
+    there = images_in(folder)
+    by_number = _unique_numbers(there)
+    if numbered and len(by_number) == len(there) and by_number.keys() & set(views):
+        return tuple(by_number.get(it) for it in views)
+    if len(there) != len(views):
+        first, last = there[0].name, there[-1].name
+        raise DataError(
+            f"{folder} has {len(there)} images ({first} ... {last}), but there are {len(views)} "
+            f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
+            culprits=[str(folder)],
+            next_step="Remove what is over, or name each row's image with --image-column.",
+        )
+    return there
+
+
+def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
+    numbers = [(number_in(it.name), it) for it in paths]
+    counts = Counter(number for number, _ in numbers)
+    return {number: path for number, path in numbers if number is not None and counts[number] == 1}
+
+
+def below(base: Path, name: str) -> Path:
+    """Finds the file that a document names, relative to the document's folder.
+
+    Raises:
+        DataError: The path is absolute or leaves the folder.
+    """
+    path = Path(name.replace("\\", "/"))
+    too_long = any(len(it.encode("utf-8", "replace")) > 255 for it in path.parts)
+    if "\0" in name or too_long or path.is_absolute() or ".." in path.parts:
+        raise DataError(
+            f"{base}: the path {name[:80]!r} is too long or leaves the folder; a file inside it is "
+            "needed.",
+            culprits=[name[:80]],
+            next_step="Name the folder of the images with --images.",
+        )
+    return base / path

@@ -1,0 +1,199 @@
+"""Poses, joints and images out of named fields."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
+from visioncal.errors import DataError
+from visioncal.formats.fields import Fields
+from visioncal.formats.wishes import PoseWishes
+from visioncal.types import FloatArray
+
+# Names under which pose pairs are commonly stored, the most telling first.
+ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
+    ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+    ("effector_wrt_world",),
+    ("O_T_EE",),
+    ("base_from_flange",),
+    ("base_T_flange",),
+    ("base_T_tool",),
+    ("base_T_ee",),
+    ("T_base_ee",),
+    ("robot_pose",),
+    ("robot_poses",),
+    ("R_gripper2base", "t_gripper2base"),
+    ("x", "y", "z", "qx", "qy", "qz", "qw"),
+    ("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
+    ("x", "y", "z", "rx", "ry", "rz"),
+    ("X", "Y", "Z", "A", "B", "C"),
+    ("pose",),
+)
+CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
+    ("cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw"),
+    ("object_wrt_sensor",),
+    ("cam_from_target",),
+    ("T_cam_target_rvec", "T_cam_target_tvec"),
+    ("T_cam_target",),
+    ("camera_T_target",),
+    ("R_target2cam", "t_target2cam"),
+    ("camera_pose",),
+    ("camera_poses",),
+    ("rvec", "tvec"),
+    ("rvecs", "tvecs"),
+)
+JOINT_KEYS: tuple[str, ...] = ("joint_pose", "joints", "joint_angles", "joint_positions", "q")
+
+_ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
+_ANGLES_NAME = re.compile(r"rpy|roll|euler")
+
+
+def known_names(fields: Fields, candidates: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """Finds the first of several sets of names that are all there; empty where none is."""
+    known = {*fields.numbers, *(it.rsplit(".", 1)[-1] for it in fields.numbers)}
+    return next((it for it in candidates if known >= set(it)), ())
+
+
+def poses_from(
+    fields: Fields, names: Sequence[str], wishes: PoseWishes, whose: str
+) -> tuple[PoseNumbers, tuple[str, ...]]:
+    """Takes poses out of fields.
+
+    16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 its upper
+    three rows; else three of position and those of a rotation, in whichever order names such as
+    rvec and tvec tell.
+
+    Args:
+        fields: The fields.
+        names: Which of them hold the poses.
+        wishes: What the user says of them.
+        whose: `robot` or `camera`, for messages.
+
+    Returns:
+        The poses, and what was assumed of them.
+
+    Raises:
+        DataError: There are no such fields, or their numbers make up no pose.
+    """
+    blocks = [fields.column(it) for it in names]
+    sizes = [it.shape[1] for it in blocks]
+    places = fields.places
+    if sum(sizes) in (12, 16) and 9 not in sizes:
+        numbers = PoseNumbers(*_matrices(np.hstack(blocks)), Reading("matrix"), places)
+        return _checked(wishes.applied_to(numbers), wishes, whose, ())
+    positions, rotations, turned = _split(blocks, names)
+    if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
+        raise DataError(
+            f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
+            "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
+            culprits=list(names),
+            next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
+        )
+    rotation, notes = _likely_rotation(rotations.shape[1], turned, wishes, whose)
+    numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
+    if names[0].endswith("_m"):
+        wishes = replace(wishes, unit=wishes.unit or "m")
+    return _checked(wishes.applied_to(numbers), wishes, whose, notes)
+
+
+def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> FloatArray:
+    """Takes joint angles out of fields.
+
+    Returns:
+        (n, j) angles [rad].
+
+    Raises:
+        DataError: There are no such fields, or a row lacks some.
+    """
+    joints = np.hstack([fields.column(it) for it in names])
+    bad = ~np.isfinite(joints).all(axis=1)
+    if bad.any():
+        place = fields.places[int(np.argmax(bad))]
+        raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
+    return np.deg2rad(joints) if degrees else joints
+
+
+def matrix_numbers(matrices: FloatArray, places: Sequence[str], *, unit: str = "m") -> PoseNumbers:
+    """Takes (n, 4, 4) matrices as poses."""
+    flat = matrices.reshape(len(matrices), 16)
+    return PoseNumbers(*_matrices(flat), Reading("matrix", unit), tuple(places))
+
+
+def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Splits (n, 16) or (n, 12) numbers of matrices into (n, 3) positions and (n, 9) rotations."""
+    last = np.array([0.0, 0, 0, 1])
+    if flat.shape[1] == 12:
+        matrices = flat.reshape(-1, 3, 4)
+    else:
+        square = flat.reshape(-1, 4, 4)
+        by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
+        matrices = np.where(by_columns[:, None, None], np.swapaxes(square, 1, 2), square)
+        wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
+            np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
+        )
+        # A matrix with another last row is no rigid transform: its rotation is refused as such.
+        matrices = np.where(wrong[:, None, None], 0.0, matrices)
+    return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
+
+
+def _split(
+    blocks: Sequence[FloatArray], names: Sequence[str]
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Tells position from rotation: (positions, rotations, the rotation's names)."""
+    if len(blocks) == 2:
+        first, second = blocks
+        rotation_first = (
+            _ROTATION_NAME.search(names[0]) is not None
+            if first.shape[1] == second.shape[1]
+            else second.shape[1] == 3
+        )
+        if rotation_first:
+            return second, first, (names[0],)
+        return first, second, (names[1],)
+    flat = np.hstack(blocks)
+    return flat[:, :3], flat[:, 3:], tuple(names[3:])
+
+
+def _likely_rotation(
+    size: int, names: Sequence[str], wishes: PoseWishes, whose: str
+) -> tuple[str, tuple[str, ...]]:
+    if size == 9:
+        return "matrix", ()
+    if size == 4:
+        first = names[0].lower() if len(names) == 4 else ""
+        return f"quaternion-{'wxyz' if first.endswith('w') else 'xyzw'}", ()
+    joined = " ".join(names).lower()
+    if _ANGLES_NAME.search(joined):
+        return "euler-xyz-rad", ()
+    if wishes.form is None and "rvec" not in joined:
+        return "rotation-vector", (
+            f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
+            f"radians, as the source does not say; --{whose}-form names another form.",
+        )
+    return "rotation-vector", ()
+
+
+def _checked(
+    numbers: PoseNumbers, wishes: PoseWishes, whose: str, notes: tuple[str, ...]
+) -> tuple[PoseNumbers, tuple[str, ...]]:
+    infinite = np.isinf(numbers.positions).any(axis=1) | np.isinf(numbers.rotations).any(axis=1)
+    if infinite.any():
+        place = numbers.places[int(np.argmax(infinite))]
+        raise DataError(f"{place}: a number of the pose is infinite.", culprits=[place])
+    if wishes.unit is None and wishes.form not in POSE_FORMS:
+        notes = (
+            *notes,
+            f"The {whose}'s positions are taken for metres, as the source does not say; "
+            f"--{whose}-unit names another unit.",
+        )
+    form = ROTATION_FORMS[numbers.reading.rotation]
+    if form.size != numbers.rotations.shape[1]:
+        raise DataError(
+            f"{numbers.places[0]}: the {whose}'s rotation has {numbers.rotations.shape[1]} "
+            f"numbers; {form.words} has {form.size}.",
+            culprits=[numbers.places[0]],
+            next_step=f"Name the fields with --{whose}-columns and the form with --{whose}-form.",
+        )
+    return numbers, notes

@@ -1,0 +1,63 @@
+"""Zivid: a 4 x 4 matrix in millimetres a pose, as its SDK writes them."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.documents import as_numbers, mapping, read_yaml
+from visioncal.errors import DataError
+from visioncal.formats.finding import IMAGE_ENDINGS, head, images_of, listed, number_in
+from visioncal.formats.foreign import Foreign
+from visioncal.formats.format import ForeignFormat
+from visioncal.formats.poses import matrix_numbers
+from visioncal.formats.wishes import Wishes
+from visioncal.types import FloatArray
+
+_POSE_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
+
+
+def _pose_files(path: Path) -> tuple[Path, ...]:
+    if not path.is_dir():
+        return ()
+    named = tuple(it for it in listed(path) if _POSE_NAME.fullmatch(it.name))
+    return named if named and re.search("FloatMatrix|PoseState", head(named[0])) else ()
+
+
+def _read(path: Path, wishes: Wishes) -> Foreign:
+    """Reads pos01.yaml ... (Zivid SDK, Matrix4x4; older samples, OpenCV's `PoseState`)."""
+    files = _pose_files(path)
+    if not files:
+        raise DataError(f"{path} has no files like pos01.yaml.", culprits=[str(path)])
+    matrices = np.array([_matrix(it) for it in files])
+    numbers = [number_in(it.name) for it in files]
+    views = tuple(it for it in numbers if it is not None)
+    places = tuple(it.name for it in files)
+    images: tuple[Path | None, ...] = ()
+    if wishes.images is not None or any(it.suffix.lower() in IMAGE_ENDINGS for it in listed(path)):
+        images = images_of(wishes.images or path, views, places, numbered=True)
+    return Foreign(
+        name=path.resolve().name,
+        robot=matrix_numbers(matrices, places, unit="mm"),
+        images=images,
+        views=views,
+    )
+
+
+def _matrix(path: Path) -> FloatArray:
+    content = mapping(read_yaml(path), str(path))
+    value = content.get("PoseState")
+    if value is None:
+        value = mapping(content.get("FloatMatrix"), f"{path}: FloatMatrix").get("Data")
+    matrix = as_numbers(value, f"{path}: Data")
+    if matrix.size != 16 or not np.isfinite(matrix).all():
+        raise DataError(
+            f"{path} has {matrix.size} numbers; the 16 of a matrix are needed.",
+            culprits=[str(path)],
+        )
+    return matrix.reshape(4, 4)
+
+
+ZIVID = ForeignFormat(
+    "zivid", "Zivid's pos01.yaml ... in millimetres", lambda path: bool(_pose_files(path)), _read
+)

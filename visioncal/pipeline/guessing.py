@@ -1,0 +1,188 @@
+"""Which reading of a session's poses is right: measured from its images, without its robot."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.conventions import PoseNumbers, Reading
+from visioncal.errors import VisioncalError
+from visioncal.guess import Guess, guess_reading
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.steps import STAGES
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE
+from visioncal.stages.choose import choose_poses
+from visioncal.stages.handeye import robot_part
+from visioncal.stages.judge import is_scattered
+from visioncal.types import FloatArray, Progress
+
+# What the camera's poses need; the robot has no part in it, so that it can be wrong.
+_SEEING = ("detect", "intrinsics", "pnp")
+
+
+def guess_session(
+    session: Session, robot: PoseNumbers | None = None, *, progress: Progress | None = None
+) -> Guess:
+    """Tries every plausible reading of a session's poses.
+
+    Args:
+        session: The session, with images or measured poses of the target.
+        robot: The robot's numbers as they were before the session was made of them, one row a
+            view; left out, those of the session are taken.
+        progress: Told of long work.
+
+    Returns:
+        The readings, and whether one stands out.
+
+    Raises:
+        DataError: There is nothing to read, or the target is in no view.
+        DegenerateError: Too few views have both poses, or the lens cannot be estimated.
+        ConvergenceError: The intrinsics do not come to rest.
+    """
+    return guess_seen(_seen(Known(session, "joint", progress)), robot)
+
+
+def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
+    """Does what `guess_session` does once the camera's poses are known.
+
+    Args:
+        seen: What is known, the camera's poses with all their rivals.
+        robot: The robot's numbers; left out, those of the session are taken.
+
+    Raises:
+        DataError: There is nothing to read.
+        DegenerateError: Too few views have both poses.
+    """
+    chain = chain_poses(seen.session)
+    robot = _robot_numbers(seen.session, chain) if robot is None else robot
+    is_measured, mount = bool(seen.corners), seen.session.mount
+    for camera in _seen_ways(seen, robot):
+        guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
+        if not guess.stands_out and guess.declared.closes:
+            break
+    return guess
+
+
+def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNumbers:
+    """Measures `cam_from_target` of every view, without the robot; NaN where it was not seen.
+
+    Raises:
+        DataError: The target is in no view.
+        DegenerateError: The lens cannot be estimated.
+        ConvergenceError: The intrinsics do not come to rest.
+    """
+    return _camera_numbers(_seen(Known(session, "joint", progress)))
+
+
+def chain_poses(session: Session) -> FloatArray | None:
+    """Computes (n, 4, 4) `base_from_flange` of every view through the robot's model.
+
+    Returns:
+        The poses, NaN where there are no joint angles; None where the session names no known
+        robot, or no view has as many angles as it has joints.
+    """
+    if session.robot_document is None:
+        return None
+    robot = Robot.from_document(session.robot_document)
+    poses = np.full((len(session.views), 4, 4), np.nan)
+    for at, view in enumerate(session.views):
+        joints = view.joints_rad
+        if joints is not None and len(joints) == robot.joint_count:
+            poses[at] = robot.base_from_flange(joints[None])[0]
+    return poses if np.isfinite(poses).any() else None
+
+
+def reading_hint(seen: Known) -> str:
+    """Says which reading of the poses would explain a calibration that failed.
+
+    Args:
+        seen: What is known once the camera's poses are.
+
+    Returns:
+        A sentence with the command that applies it; empty where no reading stands out.
+    """
+    try:
+        guess = guess_seen(seen)
+    except VisioncalError:
+        # Too little to guess from: what failed has been said already.
+        return ""
+    if not guess.stands_out:
+        return ""
+    return f"{guess.sentence} To read it so: visioncal convert SESSION FIXED --guess."
+
+
+def is_suspect(known: Known) -> bool:
+    """Whether a finished calibration looks as if its poses had been misread."""
+    verdict, findings = known.verdict, known.findings
+    if verdict is None or findings is None or verdict.status == "good":
+        return False
+    return is_scattered(findings) or known.robot is not None
+
+
+def _seen(known: Known) -> Known:
+    for stage in STAGES:
+        if stage.name in _SEEING:
+            known = stage.run(known)
+    return known
+
+
+def _seen_ways(seen: Known, robot: PoseNumbers) -> Iterator[PoseNumbers]:
+    """The camera's poses as the declared robot would have them, and then by the images alone.
+
+    They differ where an image allows several poses: the wrong robot would choose wrong ones.
+    """
+    if any(len(it.cam_from_target) > 1 for it in seen.poses.values()):
+        # Where the declared robot cannot choose, the images alone are left.
+        with suppress(VisioncalError):
+            yield _camera_numbers(_chosen(seen, robot))
+    yield _camera_numbers(seen)
+
+
+def _chosen(seen: Known, robot: PoseNumbers) -> Known:
+    """Chooses among the poses that an image allows by the declared robot."""
+    base_from_flange = dict(
+        zip((it.number for it in seen.session.views), robot.poses(), strict=True)
+    )
+    both = [it for it in seen.poses.values() if np.isfinite(base_from_flange[it.view]).all()]
+    part = robot_part(
+        np.array([base_from_flange[it.view] for it in both]).reshape(-1, 4, 4), seen.session.mount
+    )
+    choice = choose_poses(both, part, seen.session.target)
+    return replace(seen, poses={it.view: it for it in choice.views})
+
+
+def _robot_numbers(session: Session, chain: FloatArray | None) -> PoseNumbers:
+    """The reported poses; those of the joints where nothing is reported."""
+    numbers = _columns(session, POSE)
+    if not np.isfinite(numbers.positions).any() and chain is not None:
+        return _matrices(session, chain)
+    return numbers
+
+
+def _camera_numbers(seen: Known) -> PoseNumbers:
+    """The target's poses, of each view the best by its image, or as the session gives them."""
+    if not seen.corners:
+        return _columns(seen.session, MEASURED_CAM_POSE)
+    poses = np.full((len(seen.session.views), 4, 4), np.nan)
+    for at, view in enumerate(seen.session.views):
+        if view.number in seen.poses:
+            poses[at] = seen.poses[view.number].cam_from_target[0]
+    return _matrices(seen.session, poses)
+
+
+def _columns(session: Session, names: tuple[str, ...]) -> PoseNumbers:
+    cells = [[view.numbers.get(name, np.nan) for name in names] for view in session.views]
+    numbers = np.array(cells, dtype=float)
+    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(session))
+
+
+def _matrices(session: Session, poses: FloatArray) -> PoseNumbers:
+    reading = Reading("matrix", "m")
+    return PoseNumbers(poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9), reading, _places(session))
+
+
+def _places(session: Session) -> tuple[str, ...]:
+    return tuple(f"view {view.number}" for view in session.views)

@@ -1,0 +1,18 @@
+"""Printable boards: a target's dark shapes, laid out on a page and written at their exact size."""
+
+from visioncal.printing.files import write_board
+from visioncal.printing.page import Page, Sheet, arrange, pages_named
+from visioncal.printing.pattern import Pattern, draw_pattern
+from visioncal.printing.request import Request, requested_target
+
+__all__ = [
+    "Page",
+    "Pattern",
+    "Request",
+    "Sheet",
+    "arrange",
+    "draw_pattern",
+    "pages_named",
+    "requested_target",
+    "write_board",
+]

@@ -1,0 +1,109 @@
+"""Writing a board's files."""
+
+from pathlib import Path
+
+import tomli_w
+
+from visioncal.errors import DataError
+from visioncal.files import named_errors, parse_toml, read_text, write_atomically
+from visioncal.printing.page import Sheet
+from visioncal.targets import target_document, target_from_document
+from visioncal.types import Target
+
+# Beyond this many pixels a page takes gigabytes to draw.
+_MOST_PIXELS = 2.5e8
+_LEAST_DPI = 50.0
+
+
+def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
+    """Writes a board as PDF, SVG, PNG and TOML, named after the target.
+
+    Everything is drawn before the first file appears. A `.toml` that is there and describes the
+    same target stays as it is, with its comments.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        sheet: The arranged board.
+        dpi: Pixels an inch of the PNG.
+        force: Whether files that are there may be replaced.
+
+    Returns:
+        The files, the PDF first.
+
+    Raises:
+        DataError: A file is there already, the folder cannot be written, or the PNG would be too
+            large.
+    """
+    # matplotlib takes half a second to import, which help and refusals need not wait for.
+    from visioncal.printing.drawing import to_pdf, to_png, to_svg
+
+    name = _checked_name(sheet.target.name)
+    _check_dpi(sheet, dpi)
+    files = {ending: folder / f"{name}.{ending}" for ending in ("pdf", "svg", "png", "toml")}
+    kept = _describes(files["toml"], sheet.target)
+    taken = [
+        path for ending, path in files.items() if path.exists() and not (ending == "toml" and kept)
+    ]
+    if taken and not force:
+        raise DataError(
+            f"{taken[0]} exists already.",
+            culprits=[str(path) for path in taken],
+            next_step="Choose another folder with -o, or replace the files with --force.",
+        )
+    drawn: dict[str, bytes | str] = {
+        "pdf": to_pdf(sheet),
+        "svg": to_svg(sheet),
+        "png": to_png(sheet, dpi),
+    }
+    if not kept:
+        drawn["toml"] = _description(sheet)
+    with named_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for ending, content in drawn.items():
+        write_atomically(files[ending], content)
+    return tuple(files.values())
+
+
+def _checked_name(name: str) -> str:
+    if not name.strip() or name.startswith(".") or any(it in name for it in '/\\:*?"<>|\0'):
+        raise DataError(
+            f"{name!r} cannot be the name of files.",
+            culprits=[name],
+            next_step="Use letters, digits, _ and -.",
+        )
+    return name
+
+
+def _check_dpi(sheet: Sheet, dpi: float) -> None:
+    area_inch2 = sheet.page.width_mm * sheet.page.height_mm / 25.4**2
+    most = (_MOST_PIXELS / area_inch2) ** 0.5
+    if not _LEAST_DPI <= dpi <= most:
+        raise DataError(
+            f"--dpi is {dpi:g}; {_LEAST_DPI:g} to {most:.0f} are possible on {sheet.page}.",
+            culprits=["--dpi"],
+            next_step="The PDF and the SVG are exact at any magnification.",
+        )
+
+
+def _describes(path: Path, target: Target) -> bool:
+    """Whether a file is there and describes this very target."""
+    if not path.is_file():
+        return False
+    try:
+        there = target_from_document(parse_toml(read_text(path), path.name), target.name)
+    except DataError:
+        return False
+    return there == target
+
+
+def _description(sheet: Sheet) -> str:
+    left, top, right, bottom = sheet.pattern.box
+    page = sheet.page
+    lying = "landscape" if page.width_mm > page.height_mm else "portrait"
+    size = "size_m" if sheet.target.kind == "marker" else "square_m"
+    return (
+        f"# {1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, for {page.name}, {lying}.\n"
+        f"# {size} is what was meant to be printed: replace it by what you measure on paper,\n"
+        "# and square_sigma_m by how well you measured it.\n"
+        + tomli_w.dumps(target_document(sheet.target))
+    )

@@ -1,0 +1,126 @@
+"""The dark shapes of a target, in its own frame."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from visioncal.targets import charuco_board
+from visioncal.types import FloatArray, Mask, Target
+
+# White that finders need around squares; markers need one of their own modules.
+_QUIET_M = 0.0025
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """What is printed of a target.
+
+    Attributes:
+        loops: Closed outlines, (n, 2) each, in the target's frame [m]; the last point joins the
+            first. Dark is what they wind around once; a hole's outline runs the other way. No two
+            of them share more than a point, so that no renderer can leave a seam.
+        box: Left, top, right and bottom of the print in the target's frame [m].
+        quiet_m: White that has to stay around the print [m].
+    """
+
+    loops: tuple[FloatArray, ...]
+    box: tuple[float, float, float, float]
+    quiet_m: float
+
+
+def draw_pattern(target: Target) -> Pattern:
+    """Draws a target: its corners are where `targets.corner_positions` has them."""
+    side = target.square_m
+    match target.kind:
+        case "marker":
+            dark = _marker_cells(target.dictionary, target.marker_id)
+            module_m = side / len(dark)
+            loops = _placed(dark, np.full(2, -0.5 * side), module_m)
+            return Pattern(loops, (-side / 2, -side / 2, side / 2, side / 2), module_m)
+        case "checkerboard":
+            # The square diagonally outside corner 0 is dark.
+            row, column = np.indices((target.rows + 1, target.columns + 1))
+            loops = _placed((row + column) % 2 == 0, np.full(2, -side), side)
+            box = (-side, -side, target.columns * side, target.rows * side)
+            return Pattern(loops, box, _QUIET_M)
+        case "charuco":
+            box = (0.0, 0.0, target.columns * side, target.rows * side)
+            return Pattern(_charuco_loops(target), box, _QUIET_M)
+
+
+def outlines(dark: Mask) -> tuple[FloatArray, ...]:
+    """Traces the borders of the dark cells of a grid.
+
+    Every dark cell has four directed sides, with the cell on their right as seen on the page. Sides
+    between two dark cells cancel; what is left joins to loops.
+
+    Args:
+        dark: (rows, columns) cells.
+
+    Returns:
+        (n, 2) loops of the corners (x, y), in cells; (0, 0) is the outer corner of the first cell.
+    """
+    sides: set[tuple[tuple[int, int], tuple[int, int]]] = set()
+    for y, x in np.argwhere(dark).tolist():
+        corners = ((x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1))
+        for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+            if (end, start) in sides:
+                sides.remove((end, start))
+            else:
+                sides.add((start, end))
+    onward: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for start, end in sorted(sides):
+        onward.setdefault(start, []).append(end)
+    loops = []
+    while onward:
+        at = first = next(iter(onward))
+        loop: list[tuple[int, int]] = []
+        while not loop or at != first:
+            loop.append(at)
+            # Where two cells touch in a point, either way closes a loop of the same windings.
+            ends = onward[at]
+            following = ends.pop()
+            if not ends:
+                del onward[at]
+            at = following
+        loops.append(_without_straight(np.array(loop, dtype=float)))
+    return tuple(loops)
+
+
+def _without_straight(loop: FloatArray) -> FloatArray:
+    """Drops the points of a loop at which it does not turn."""
+    before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
+    turns = before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]
+    return np.asarray(loop[turns])
+
+
+def _placed(dark: Mask, corner_m: FloatArray, cell_m: float) -> tuple[FloatArray, ...]:
+    """Outlines of a grid whose first cell's outer corner and cell side are given [m]."""
+    return tuple(corner_m + cell_m * loop for loop in outlines(dark))
+
+
+def _marker_cells(dictionary_name: str, marker_id: int) -> Mask:
+    """The dark cells of a marker, its border of one cell included."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary_name))
+    size = dictionary.markerSize
+    code = dictionary.bytesList[marker_id : marker_id + 1]
+    bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
+    return np.pad(bits == 0, 1, constant_values=True)
+
+
+def _charuco_loops(target: Target) -> tuple[FloatArray, ...]:
+    board = charuco_board(target)
+    ids = np.ravel(np.asarray(board.getIds())).tolist()
+    # OpenCV says where the markers lie; the squares between them are dark.
+    places = np.asarray(board.getObjPoints(), dtype=float)[..., :2]
+    light = np.floor(places.mean(axis=1) / target.square_m).astype(int)
+    dark = np.ones((target.rows, target.columns), dtype=bool)
+    dark[light[:, 1], light[:, 0]] = False
+    loops = list(_placed(dark, np.zeros(2), target.square_m))
+    inset = (target.square_m - target.marker_m) / 2
+    for marker_id, square in zip(ids, light, strict=True):
+        cells = _marker_cells(target.dictionary, marker_id)
+        corner_m = target.square_m * square + inset
+        loops += _placed(cells, corner_m, target.marker_m / len(cells))
+    return tuple(loops)

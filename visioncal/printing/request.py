@@ -1,0 +1,115 @@
+"""From a few wishes to a target: sizes that are left open become the largest that fit."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+
+from visioncal.printing.page import Page, arrange, largest_side_mm
+from visioncal.targets import target_from_document
+from visioncal.types import Target, TargetKind
+
+# A marker's share of its square: it leaves at least one module of white on every side.
+_MARKER_SHARE = 0.75
+# Smaller squares are lost to the printer's dots.
+_LEAST_MM = 5
+_USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
+
+
+@dataclass(frozen=True)
+class Request:
+    """A board that somebody wants; None and empty texts are chosen.
+
+    Attributes:
+        kind: What is printed.
+        columns: Squares (ChArUco) or inner corners (checkerboard) along x.
+        rows: The same along y.
+        square_mm: Side of a square; of the marker itself for a single marker [mm].
+        marker_mm: Side of the markers in a ChArUco board [mm].
+        dictionary: ArUco dictionary by OpenCV's name.
+        legacy: Whether a ChArUco board gets the layout that OpenCV printed before 4.6.
+        marker_id: The id of a single marker.
+        name: The target's name.
+    """
+
+    kind: TargetKind
+    columns: int | None = None
+    rows: int | None = None
+    square_mm: float | None = None
+    marker_mm: float | None = None
+    dictionary: str = ""
+    legacy: bool = False
+    marker_id: int | None = None
+    name: str = ""
+
+
+def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
+    """Builds the target that is wished for.
+
+    Args:
+        request: The wishes. A side left out becomes the largest in whole millimetres that fits one
+            of the pages, a marker's side three quarters of its square's, in whole millimetres.
+        pages: The pages that it may be printed on.
+
+    Raises:
+        DataError: A wish is missing or cannot be met.
+    """
+    if request.square_mm is not None:
+        return _target(request, request.square_mm)
+    smallest = _target(request, _LEAST_MM)
+    largest = largest_side_mm(smallest, pages)
+    if largest < _LEAST_MM:
+        # Says what would be needed.
+        arrange(smallest, pages)
+    return _target(request, largest)
+
+
+def _target(request: Request, square_mm: float) -> Target:
+    document: dict[str, Any] = {"kind": request.kind}
+    side_m = _metres(square_mm)
+    if request.kind == "marker":
+        document |= {"size_m": side_m, "dictionary": request.dictionary or "DICT_APRILTAG_36h11"}
+        wishes: dict[str, int | None] = {"id": request.marker_id}
+    else:
+        document |= {"square_m": side_m}
+        wishes = {"columns": request.columns, "rows": request.rows}
+    document |= {key: value for key, value in wishes.items() if value is not None}
+    if request.kind == "charuco":
+        marker_mm = request.marker_mm
+        if marker_mm is None:
+            marker_mm = _MARKER_SHARE * square_mm
+            # Under ten millimetres a whole number would be too far from the share.
+            marker_mm = float(int(marker_mm)) if square_mm >= 2 * _LEAST_MM else marker_mm
+        document |= {
+            "marker_m": _metres(marker_mm),
+            "dictionary": request.dictionary or _enough(request),
+            "legacy": request.legacy,
+        }
+    label = request.name or request.kind
+    target = target_from_document(document, label)
+    return target if request.name else target_from_document(document, _name(target))
+
+
+def _metres(millimetres: float) -> float:
+    # Rounded to a nanometre, so that the file reads 0.03 where 30 mm was meant.
+    return round(1e-3 * millimetres, 9)
+
+
+def _enough(request: Request) -> str:
+    """The first of the usual dictionaries that has enough markers."""
+    needed = (request.columns or 0) * (request.rows or 0) // 2
+    for name in _USUAL:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        if len(dictionary.bytesList) >= needed:
+            return name
+    return _USUAL[-1]
+
+
+def _name(target: Target) -> str:
+    side = f"{1e3 * target.square_m:g}mm"
+    if target.kind == "marker":
+        family = target.dictionary.removeprefix("DICT_").lower()
+        family = family if family.startswith("a") else f"aruco_{family}"
+        return f"{family}_id{target.marker_id}_{side}"
+    legacy = "_legacy" if target.legacy else ""
+    return f"{target.kind}_{target.columns}x{target.rows}_{side}{legacy}"
