@@ -21,7 +21,7 @@ from visioncal.types import FloatArray, IntArray, Target
 DEFAULT_RELATIVE_SIGMA = 1e-3
 
 # No printed square is larger; a larger number is in millimetres.
-_LARGEST_M = 1.0
+LARGEST_M = 1.0
 
 # Fewer do not determine a pose robustly; more do not fit a printable board.
 _MIN_SQUARES, _MAX_SQUARES = 3, 100
@@ -103,7 +103,7 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
 
 def _size(table: Table, key: str) -> float:
     size_m = table.number(key, positive=True)
-    if size_m > _LARGEST_M:
+    if size_m > LARGEST_M:
         raise table.refuse(key, size_m, f"metres, such as {1e-3 * size_m:g} for {size_m:g} mm")
     return size_m
 

@@ -20,6 +20,7 @@ from visioncal.formats import (
     convert,
     guess_foreign,
     is_session,
+    load_in_doubt,
     read_foreign,
     reread,
     reread_session,
@@ -218,7 +219,7 @@ def convert_command(
     else:
         check_free(source, dest, force=force)
         if is_own:
-            session = _reread_session(Session.load(source), yes=yes)
+            session = _reread_session(load_in_doubt(source), yes=yes)
         else:
             foreign = read_foreign(source, wishes, form)
             session = assemble(_reread(foreign, yes=yes) if guess else foreign)

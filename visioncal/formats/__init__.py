@@ -16,7 +16,7 @@ from visioncal.formats.registry import (
     read_foreign,
     write_session,
 )
-from visioncal.formats.rereading import guess_foreign, reread, reread_session
+from visioncal.formats.rereading import guess_foreign, load_in_doubt, reread, reread_session
 from visioncal.formats.wishes import PoseWishes, Wishes
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "convert",
     "guess_foreign",
     "is_session",
+    "load_in_doubt",
     "read_foreign",
     "reread",
     "reread_session",

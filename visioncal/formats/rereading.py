@@ -2,20 +2,27 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from visioncal.conventions import PoseNumbers, Reading
+from visioncal.files import parse_toml, read_text
 from visioncal.formats.assemble import assemble, pose_cells, spoken
 from visioncal.formats.foreign import Foreign
 from visioncal.guess import Candidate, Guess, guess_reading
-from visioncal.pipeline.guessing import chain_poses, seen_poses
+from visioncal.pipeline.guessing import chain_poses, numbers_in, seen_poses
 from visioncal.session import Session
-from visioncal.session.columns import MEASURED_CAM_POSE, POSE
-from visioncal.types import FloatArray, Mount, Progress
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
+from visioncal.targets import LARGEST_M
+from visioncal.types import FloatArray, IntArray, Mount, Progress
 
 _MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
+# Distances between consecutive rows of one log go up and down together.
+_FEWEST_STEPS, _SAME_LOG = 4, 0.9
+# No printed square is larger.
+_LARGEST_MM = 1e3 * LARGEST_M
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
@@ -65,6 +72,25 @@ def reread(foreign: Foreign, candidate: Candidate) -> Foreign:
     )
 
 
+def load_in_doubt(path: Path) -> Session:
+    """Loads a session that is to be read anew: a board larger than any is taken for millimetres.
+
+    Raises:
+        DataError: It is no session.
+    """
+    file = path / "session.toml"
+    name = parse_toml(read_text(file), file.name).get("target") if file.is_file() else None
+    if not isinstance(name, str) or not name.endswith(".toml"):
+        return Session.load(path)
+    stated = parse_toml(read_text(path / name), name)
+    sides = [stated[it] for it in ("square_m", "size_m") if isinstance(stated.get(it), int | float)]
+    if not sides or not LARGEST_M < sides[0] < _LARGEST_MM:
+        return Session.load(path)
+    session = Session.load(path, target_document=_scaled(stated, 1e-3))
+    note = f"{name} can only be in millimetres: a side of {sides[0]:g} is read as {sides[0]:g} mm."
+    return replace(session, warnings=(note, *session.warnings))
+
+
 def reread_session(session: Session, candidate: Candidate) -> Session:
     """Reads a session's poses as a candidate has it; everything else stays as it is.
 
@@ -72,10 +98,12 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
         DataError: The session that comes out is wrong.
     """
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    robot, camera = _numbers(session, POSE), _numbers(session, MEASURED_CAM_POSE)
-    if robot is not None:
+    robot, camera = numbers_in(session, POSE), numbers_in(session, MEASURED_CAM_POSE)
+    if _any(robot):
+        if _go_together(session, robot):
+            _reorder(cells, candidate.hypothesis.rows(len(cells)), joint_columns(session.columns))
         _replace(cells, pose_cells(candidate.robot_numbers(robot), POSE), POSE)
-    if camera is not None:
+    if _any(camera):
         corrected = candidate.camera_numbers(camera)
         _replace(cells, pose_cells(corrected, MEASURED_CAM_POSE), MEASURED_CAM_POSE)
     document = {**session.document, "mount": candidate.mount}
@@ -91,7 +119,8 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
         target_document=target,
         robot_document=session.robot_document,
     )
-    return replace(reread, warnings=(*_note(candidate), *reread.warnings))
+    said = dict.fromkeys((*_note(candidate), *session.warnings, *reread.warnings))
+    return replace(reread, warnings=tuple(said))
 
 
 def _note(candidate: Candidate) -> tuple[str, ...]:
@@ -110,13 +139,32 @@ def _of_chain(foreign: Foreign, chain: FloatArray) -> PoseNumbers:
     return PoseNumbers(chain[:, :3, 3], rotations, Reading("matrix"), foreign.robot.places)
 
 
-def _numbers(session: Session, names: Sequence[str]) -> PoseNumbers | None:
-    rows = [[view.numbers.get(name, np.nan) for name in names] for view in session.views]
-    numbers = np.array(rows, dtype=float)
-    if not np.isfinite(numbers).any():
-        return None
-    places = tuple(f"view {view.number}" for view in session.views)
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
+def _any(numbers: PoseNumbers) -> bool:
+    return bool(np.isfinite(numbers.positions).any())
+
+
+def _go_together(session: Session, robot: PoseNumbers) -> bool:
+    """Whether each row's joint angles are of its pose: they then change rows with it.
+
+    Without a model of the robot nobody can tell, and one log is the likelier.
+    """
+    chain = chain_poses(session)
+    if chain is None:
+        return True
+    # Other units or frames move all rows alike: what differs from row to row tells.
+    steps = [
+        np.linalg.norm(np.diff(it, axis=0), axis=1) for it in (chain[:, :3, 3], robot.positions)
+    ]
+    both = np.isfinite(steps).all(axis=0)
+    if both.sum() < _FEWEST_STEPS:
+        return True
+    return bool(np.corrcoef(steps[0][both], steps[1][both])[0, 1] > _SAME_LOG)
+
+
+def _reorder(rows: Sequence[dict[str, str]], order: IntArray, names: Sequence[str]) -> None:
+    before = [{name: row[name] for name in names} for row in rows]
+    for row, at in zip(rows, order, strict=True):
+        row.update(before[at] if at >= 0 else dict.fromkeys(names, ""))
 
 
 def _replace(
@@ -129,4 +177,7 @@ def _replace(
 def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
     if factor == 1.0:
         return target
-    return {it: factor * value if it in _LENGTHS else value for it, value in target.items()}
+    return {
+        it: factor * value if it in _LENGTHS and isinstance(value, int | float) else value
+        for it, value in target.items()
+    }

@@ -95,6 +95,13 @@ def chain_poses(session: Session) -> FloatArray | None:
     return poses if np.isfinite(poses).any() else None
 
 
+def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
+    """The numbers of a group of pose columns, one row a view; NaN where they are empty."""
+    cells = [[view.numbers.get(name, np.nan) for name in columns] for view in session.views]
+    numbers = np.array(cells, dtype=float)
+    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(session))
+
+
 def reading_hint(seen: Known) -> str:
     """Says which reading of the poses would explain a calibration that failed.
 
@@ -156,7 +163,7 @@ def _chosen(seen: Known, robot: PoseNumbers) -> Known:
 
 def _robot_numbers(session: Session, chain: FloatArray | None) -> PoseNumbers:
     """The reported poses; those of the joints where nothing is reported."""
-    numbers = _columns(session, POSE)
+    numbers = numbers_in(session, POSE)
     if not np.isfinite(numbers.positions).any() and chain is not None:
         return _matrices(session, chain)
     return numbers
@@ -165,18 +172,12 @@ def _robot_numbers(session: Session, chain: FloatArray | None) -> PoseNumbers:
 def _camera_numbers(seen: Known) -> PoseNumbers:
     """The target's poses, of each view the best by its image, or as the session gives them."""
     if not seen.corners:
-        return _columns(seen.session, MEASURED_CAM_POSE)
+        return numbers_in(seen.session, MEASURED_CAM_POSE)
     poses = np.full((len(seen.session.views), 4, 4), np.nan)
     for at, view in enumerate(seen.session.views):
         if view.number in seen.poses:
             poses[at] = seen.poses[view.number].cam_from_target[0]
     return _matrices(seen.session, poses)
-
-
-def _columns(session: Session, names: tuple[str, ...]) -> PoseNumbers:
-    cells = [[view.numbers.get(name, np.nan) for name in names] for view in session.views]
-    numbers = np.array(cells, dtype=float)
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(session))
 
 
 def _matrices(session: Session, poses: FloatArray) -> PoseNumbers:

@@ -58,8 +58,6 @@ def _not_used(session: Session) -> Iterator[str]:
         yield f"[prior.{next(iter(declared.prior))}] was not used: this version knows no priors."
     if declared.camera is not None and declared.camera.intrinsics == "refine":
         yield 'intrinsics = "refine" was not done: this version holds given intrinsics.'
-    if declared.clock.camera_minus_robot_s:
-        yield "[clock] was not used: this version pairs images and poses by their rows."
     if any(name.startswith("meas_") for view in session.views for name in view.numbers):
         yield "The instrument's readings (meas_ columns) were not used by this version."
 

@@ -50,10 +50,16 @@ class Session:
     robot_document: Mapping[str, Any] | None = None
 
     @classmethod
-    def load(cls, path: Path | str) -> "Session":
+    def load(
+        cls, path: Path | str, *, target_document: Mapping[str, Any] | None = None
+    ) -> "Session":
         """Loads a session's folder, or the `.rrd` recording of one.
 
         An image that is missing is no error here: the view that needs it is named later.
+
+        Args:
+            path: The folder or the recording.
+            target_document: Taken in the place of a folder's own target.
 
         Raises:
             DataError: A file is missing, or a field, row or column of one is wrong.
@@ -72,7 +78,14 @@ class Session:
             )
         document = parse_toml(read_text(path / "session.toml"), "session.toml")
         columns, rows = parse_csv(read_text(path / "views.csv"), "views.csv")
-        session = _build(document, columns, rows, FolderImages(path), folder=path)
+        session = _build(
+            document,
+            columns,
+            rows,
+            FolderImages(path),
+            folder=path,
+            target_document=target_document,
+        )
         return replace(session, warnings=(*session.warnings, *stream_warnings(path)))
 
     @classmethod
