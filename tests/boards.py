@@ -1,5 +1,7 @@
 """Boards on paper, as tests look at them."""
 
+from functools import lru_cache
+
 import numpy as np
 import pypdfium2
 
@@ -25,8 +27,9 @@ def raster(pdf: bytes, dpi: float) -> Image:
         document.close()
 
 
+@lru_cache(maxsize=64)
 def printed(target: Target, dpi: float) -> Image:
-    """The target's page in grey."""
+    """The target's page in grey. Read only."""
     return raster(to_pdf(any_page(target)), dpi)
 
 

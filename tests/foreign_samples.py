@@ -122,14 +122,17 @@ def _ros_transform(row, indent: str) -> str:
     )
 
 
-def easy_handeye(folder: Path) -> Recording:
+def easy_handeye_file(path: Path, robot_poses, camera_poses) -> Path:
     text = "samples:\n"
-    for robot, camera in zip(
-        quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True
-    ):
+    for robot, camera in zip(quaternions(robot_poses), quaternions(camera_poses), strict=True):
         text += f"- robot:\n{_ros_transform(robot, '    ')}"
         text += f"  tracking:\n{_ros_transform(camera, '    ')}"
-    return Recording(_write(folder / "cell.samples", text), Wishes(mount="eye-in-hand"))
+    return _write(path, text)
+
+
+def easy_handeye(folder: Path) -> Recording:
+    source = easy_handeye_file(folder / "cell.samples", BASE_FROM_FLANGE, CAM_FROM_TARGET)
+    return Recording(source, Wishes(mount="eye-in-hand"))
 
 
 def moveit_yaml(folder: Path) -> Recording:

@@ -95,11 +95,11 @@ def is_named(guess: Guess, poses: Poses) -> bool:
     They may differ by half turns of both frames where an axis was mirrored: no view tells which.
     """
     best = guess.best
-    if not guess.stands_out or best.mount != poses.true_mount:
+    if not guess.stands_out or best.hypothesis.mount != poses.true_mount:
         return False
     if not np.isclose(best.board_scale, poses.true_scale):
         return False
-    found, true = best.robot_numbers(poses.robot).poses(), poses.true_robot
+    found, true = best.hypothesis.robot_numbers(poses.robot).poses(), poses.true_robot
     there = np.isfinite(true).all(axis=(1, 2))
     turns = HALF_TURNS if best.hypothesis.robot.signs == "mirror" else HALF_TURNS[:1]
     # Numbers are rewritten without loss, but for the rounding of a few conversions.

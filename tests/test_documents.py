@@ -258,3 +258,105 @@ def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
         large.truncate(60_000_000)
     with pytest.raises(DataError, match="more than 50 MB"):
         read_bounded(tmp_path / "large.csv")
+
+
+def npy(descr, shape, data=b""):
+    """An array with this header, in the format's first version."""
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
+
+
+def npz(data, packing=zipfile.ZIP_STORED, name="a.npy"):
+    stored = io.BytesIO()
+    with zipfile.ZipFile(stored, "w", packing) as archive:
+        archive.writestr(name, data)
+    return stored.getvalue()
+
+
+def changed(data, mark, offset, value):
+    """The bytes with one of them replaced, so far behind the last occurrence of a mark."""
+    at = data.rindex(mark) + offset
+    return data[:at] + bytes([value]) + data[at + 1 :]
+
+
+WHOLE = npz(npy("<f8", "(2,)", bytes(16)))
+HOSTILE = {
+    "one-byte float.npy": (npy("<f1", "(3,)", b"abc"), "numbers or text are needed"),
+    "text of no width.npy": (npy("<U0", "(3,)"), "numbers or text are needed"),
+    "bytes of no width.npy": (npy("|S0", "(2,)"), "numbers or text are needed"),
+    "hidden size.npy": (npy("<f8", f"({10**11}, {10**11}, 0)"), "entries are read"),
+    "nine axes.npy": (npy("<f8", "(1,1,1,1,1,1,1,1,1)", bytes(8)), "has the shape"),
+    "open shape.npy": (npy("<i8", "(3"), "no header"),
+    "lzma.npz": (npz(npy("<f8", "(2,)", bytes(16)), zipfile.ZIP_LZMA), "another way"),
+    "bzip2.npz": (npz(npy("<f8", "(2,)", bytes(16)), zipfile.ZIP_BZIP2), "another way"),
+    # Fields of the entry in the archive's directory: flags, packing, and where the file begins.
+    "encrypted.npz": (changed(WHOLE, b"PK\x01\x02", 8, 1), "encrypted"),
+    "unknown packing.npz": (changed(WHOLE, b"PK\x01\x02", 10, 77), "another way"),
+    "newer.npz": (changed(WHOLE, b"PK\x01\x02", 6, 99), "no .npz"),
+    "beyond its end.npz": (changed(WHOLE, b"PK\x01\x02", 45, 9), "no .npz"),
+    "before its beginning.npz": (changed(WHOLE, b"PK\x05\x06", 17, 127), "no .npz"),
+    "wrong sum.npz": (changed(WHOLE, b"PK\x01\x02", 16, 1), "no .npz"),
+    "cut.npz": (WHOLE[:-30], "no .npz"),
+    "array inside.npz": (npz(npy("<f1", "(3,)", b"abc")), "numbers or text are needed"),
+    "endless rows.yml": (
+        "a: !!opencv-matrix {rows: 1e300, cols: 0, dt: d, data: []}",
+        "none that is read",
+    ),
+    "half a row.yml": (
+        "a: !!opencv-matrix {rows: 1.5, cols: 2, dt: d, data: [1, 2, 3]}",
+        "none that is read",
+    ),
+    "hundred sizes.yml": (
+        f"a: !!opencv-nd-matrix {{sizes: [{'1,' * 99}1], dt: d, data: [1]}}",
+        "none that is read",
+    ),
+    "hidden sizes.yml": (
+        f"a: !!opencv-nd-matrix {{sizes: [{10**12}, {10**12}, 0], dt: d, data: []}}",
+        "none that is read",
+    ),
+    "many hidden sizes.yml": (
+        f"a: !!opencv-nd-matrix {{sizes: [{'999999,' * 6}0], dt: d, data: []}}",
+        "none that is read",
+    ),
+    "many channels.yml": (
+        "a: !!opencv-matrix {rows: 9999, cols: 0, dt: 999d, data: []}",
+        "none that is read",
+    ),
+    "twice.xml": ("<s><a>1</a><a>2</a></s>", "line 1: <a> is there twice"),
+    "rows twice.xml": (
+        "<s><a type_id='opencv-matrix'><rows>1</rows><rows>2</rows></a></s>",
+        "<rows> is there twice",
+    ),
+    "odd number.xml": (
+        "<s><a type_id='opencv-matrix'><rows>1</rows><cols>1</cols><data>1_0</data></a></s>",
+        "'1_0'; numbers are needed",
+    ),
+    "numbers.xml": (b"<s><a>" + b"1 " * 1_200_000 + b"</a></s>", "more than 1,000,000 values"),
+    "numbers in parts.xml": (
+        b"<s>" + (b"<a>" + b"1\n" * 300_000 + b"</a>") * 4 + b"</s>",
+        "more than 1,000,000 values",
+    ),
+}
+READERS = {".npy": read_npy, ".npz": read_npz, ".yml": read_opencv, ".xml": read_opencv}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_documents_that_were_made_to_break_a_reader(file, name):
+    content, words = HOSTILE[name]
+    path = file(name.replace(" ", "_"), content)
+    with pytest.raises(DataError, match=words):
+        READERS[path.suffix](path)
+
+
+def test_numbers_of_an_xml_are_those_of_a_table(file):
+    read = read_opencv(file("a.xml", "<s><a>1_0</a><b>.Nan 1e2 -.Inf</b><c>x</c></s>"))
+    assert (read["a"], read["c"]) == ("1_0", "x")
+    np.testing.assert_array_equal(read["b"], [np.nan, 100, -np.inf])
+
+
+def test_only_line_ends_end_a_row(file):
+    cells = ["a\x0bb", "a\x0cb", "a\x1cb", "a\x85b", "a\u2028b"]
+    text = "note,number\n" + "".join(f"{it},{at}\r" for at, it in enumerate(cells))
+    table = read_table(file("a.csv", text))
+    assert [row[0] for row in table.rows] == cells
+    assert table.place(4) == "a.csv, line 6"

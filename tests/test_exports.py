@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import CameraResult, Edge, Verdict
 from visioncal.errors import DataError
-from visioncal.exports import FORMATS, Selection, export
+from visioncal.exports import EXPORT_FORMATS, Selection, export
 from visioncal.transforms import compose, exp, invert, log
 from visioncal.types import Camera
 
-NAMES = [it.name for it in FORMATS]
+NAMES = [it.name for it in EXPORT_FORMATS]
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
 LENSES = {"camera-info", "kalibr"}
 RNG = np.random.default_rng(3)

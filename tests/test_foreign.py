@@ -26,8 +26,9 @@ from foreign_samples import (
     visp,
 )
 
+from visioncal.conventions import Reading
 from visioncal.errors import DataError
-from visioncal.formats import PoseWishes, Wishes, convert
+from visioncal.formats import PoseWishes, Wishes, convert, read_foreign
 from visioncal.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
 from visioncal.session.columns import POSE
@@ -234,6 +235,22 @@ def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
         convert(recording.source, tmp_path / "out", wishes=recording.wishes)
 
 
+@pytest.mark.parametrize("make", RECORDINGS.values(), ids=RECORDINGS.keys())
+def test_what_the_user_says_of_poses_is_applied_in_every_form(make, tmp_path):
+    recording = make(tmp_path / "in")
+    plain = read_foreign(recording.source, recording.wishes)
+    said = {
+        whose: replace(getattr(recording.wishes, whose), unit="cm", inverse=whose == "robot")
+        for whose in ("robot", "camera")
+    }
+    read = read_foreign(recording.source, replace(recording.wishes, **said))
+    for whose, wishes in said.items():
+        before, after = getattr(plain, whose), getattr(read, whose)
+        if before is not None and before.there.any():
+            assert after.reading == Reading(before.reading.rotation, "cm", wishes.inverse)
+            np.testing.assert_array_equal(after.positions, before.positions)
+
+
 @pytest.mark.parametrize("ahead_s", [0.0, 0.337, -1.25])
 def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
     robot_s, camera_s = np.arange(0, 30, 0.01), np.arange(0.5, 29.5, 1 / 30)
@@ -306,7 +323,8 @@ LENSES = {
 @pytest.mark.parametrize("name", LENSES)
 def test_intrinsics_of_others(tmp_path, name):
     (tmp_path / name).write_text(LENSES[name])
-    lens = read_intrinsics(tmp_path / name)
+    lens, notes = read_intrinsics(tmp_path / name)
+    assert not notes
     assert lens["model"] == "brown"
     assert lens["matrix"] == [500.5, 501, 320, 240]
     assert lens["distortion"][:4] == [-0.25, 0.125, 0, 0]
@@ -317,10 +335,10 @@ def test_intrinsics_of_others(tmp_path, name):
 def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
     matrix = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
     np.savez(tmp_path / "lens.npz", cameraMatrix=matrix, distCoeffs=[[-0.25, 0.125, 0, 0, 0.5]])
-    assert read_intrinsics(tmp_path / "lens.npz")["distortion"] == [-0.25, 0.125, 0, 0, 0.5]
+    assert read_intrinsics(tmp_path / "lens.npz")[0]["distortion"] == [-0.25, 0.125, 0, 0, 0.5]
     text = LENSES["kalibr.yaml"].replace("radtan", "equidistant")
     (tmp_path / "fisheye.yaml").write_text(text)
-    assert read_intrinsics(tmp_path / "fisheye.yaml")["model"] == "fisheye"
+    assert read_intrinsics(tmp_path / "fisheye.yaml")[0]["model"] == "fisheye"
     (tmp_path / "omni.yaml").write_text(text.replace("pinhole", "omni"))
     with pytest.raises(DataError, match="pinhole is needed"):
         read_intrinsics(tmp_path / "omni.yaml")

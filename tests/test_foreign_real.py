@@ -250,16 +250,19 @@ def test_touches_alone_are_no_session_of_a_camera(real_data, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
-@pytest.mark.parametrize(
-    ("source", "wanted"),
-    [
-        ("doosan_a0509_charuco", "positions in mm"),
-        ("pose_pairs_small/moveit_eye_to_hand_50.json", "eye-to-hand"),
-    ],
-)
-def test_a_guess_finds_what_was_not_said(real_data, tmp_path, source, wanted):
-    pytest.importorskip("visioncal.cli.guessed")
-    done = convert(real_data / source, tmp_path / "s", "--guess", "--yes")
+def test_a_guess_finds_what_was_not_said(real_data, tmp_path):
+    done = convert(real_data / "doosan_a0509_charuco", tmp_path / "s", "--guess", "--yes")
     assert done.returncode == 0, done.stderr
-    assert wanted in done.stderr
+    assert "positions in mm" in done.stderr
+    assert "eye-in-hand" in done.stderr
     assert visioncal.calibrate(tmp_path / "s").rms.mm < 5
+
+
+def test_a_mount_that_poses_cannot_tell_is_asked_for(real_data, tmp_path):
+    # Its target faces the camera, so that the inverse of the camera's poses is a cell as well.
+    source = real_data / "pose_pairs_small/moveit_eye_to_hand_50.json"
+    done = convert(source, tmp_path / "s", "--guess", "--yes")
+    assert done.returncode == 2
+    assert "eye-to-hand (as declared)" in done.stderr
+    assert "--mount" in done.stderr
+    assert not (tmp_path / "s").exists()

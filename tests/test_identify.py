@@ -3,6 +3,7 @@
 import json
 import tomllib
 from collections import Counter
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -37,6 +38,12 @@ ODD = {
 }
 
 
+@lru_cache(maxsize=64)
+def print_named(target):
+    """The identity of a print at 4 pixels a millimetre."""
+    return identify(printed(target, 100))
+
+
 def assert_named(identity, target):
     assert identity.kind == target.kind
     assert identity.whole
@@ -55,7 +62,7 @@ def assert_named(identity, target):
 
 @pytest.mark.parametrize("target", (SHIPPED | ODD).values(), ids=SHIPPED | ODD)
 def test_a_print_is_named(target):
-    identity = identify(printed(target, 100))
+    identity = print_named(target)
     assert_named(identity, target)
     assert identity.corners_seen == identity.corners
     if target.kind == "charuco":
@@ -148,7 +155,7 @@ def test_a_uniform_image_is_called_so():
 @pytest.mark.parametrize("name", target_names())
 def test_a_description_loads_once_the_size_is_known(name):
     target = SHIPPED[name]
-    identity = identify(printed(target, 100))
+    identity = print_named(target)
     document = tomllib.loads(to_toml(identity, target.square_m, "photo.png"))
     described = target_from_document(document, name)
     assert (described.kind, described.square_m) == (target.kind, target.square_m)

@@ -12,11 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DataError
+from visioncal.files import some_of
 from visioncal.transforms import compose, invert, nearest_rotation
-from visioncal.types import FloatArray, Mask
+from visioncal.types import FloatArray, IntArray, Mask
 
-# Four written digits leave a unit quaternion or a rotation matrix within this of being one.
-_NORM_TOLERANCE = 1e-2
+# Three written digits leave a quaternion's length within 9e-4 of 1 and a matrix within 8e-4 of a
+# rotation; views.csv has the same limit. What is farther off is read in the wrong form or order.
+_NORM_TOLERANCE = 1e-3
 
 UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 0.0254}
 
@@ -49,7 +51,7 @@ def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
         off = np.abs(np.linalg.norm(numbers, axis=1) - 1.0) > _NORM_TOLERANCE
         unit = np.where(off[:, None] | ~np.isfinite(numbers), 0.5, numbers)
         rotations = Rotation.from_quat(unit[:, to_xyzw]).as_matrix()
-        return _without(rotations, np.asarray(off) | ~_whole(numbers))
+        return _without(rotations, np.asarray(off) | ~_finite_rows(numbers))
 
     def write(rotations: FloatArray) -> FloatArray:
         # A quaternion and its negative are one rotation; robots' makers write w >= 0.
@@ -97,11 +99,11 @@ def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
 
     def read(numbers: FloatArray) -> FloatArray:
         rotations = turned(numbers.reshape(-1, 3, 3))
-        whole = _whole(rotations.reshape(-1, 9))
-        safe = np.where(whole[:, None, None], rotations, np.eye(3))
+        there = _finite_rows(rotations.reshape(-1, 9))
+        safe = np.where(there[:, None, None], rotations, np.eye(3))
         nearest = nearest_rotation(safe)
         off = np.abs(nearest - safe).max(axis=(1, 2)) > _NORM_TOLERANCE
-        return _without(nearest, np.asarray(off) | ~whole)
+        return _without(nearest, np.asarray(off) | ~there)
 
     return RotationForm(
         name, words, 9, read, lambda rotations: turned(rotations).reshape(-1, 9).copy()
@@ -109,11 +111,11 @@ def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
 
 
 def _finite(numbers: FloatArray, build: Callable[[FloatArray], Rotation]) -> FloatArray:
-    whole = _whole(numbers)
-    return _without(build(np.where(whole[:, None], numbers, 0.0)).as_matrix(), ~whole)
+    there = _finite_rows(numbers)
+    return _without(build(np.where(there[:, None], numbers, 0.0)).as_matrix(), ~there)
 
 
-def _whole(numbers: FloatArray) -> Mask:
+def _finite_rows(numbers: FloatArray) -> Mask:
     return np.asarray(np.isfinite(numbers).all(axis=1))
 
 
@@ -216,6 +218,32 @@ class PoseNumbers:
     def __len__(self) -> int:
         return len(self.positions)
 
+    @classmethod
+    def of_poses(cls, poses: FloatArray, places: Sequence[str]) -> "PoseNumbers":
+        """Takes (n, 4, 4) transforms [m], NaN in a row without one."""
+        rotations = poses[:, :3, :3].reshape(-1, 9)
+        return cls(poses[:, :3, 3], rotations, Reading("matrix"), tuple(places))
+
+    @classmethod
+    def nowhere(cls, places: Sequence[str]) -> "PoseNumbers":
+        """Rows without poses."""
+        none = np.full((len(places), 7), np.nan)
+        return cls(none[:, :3], none[:, 3:], Reading(), tuple(places))
+
+    @property
+    def there(self) -> Mask:
+        """(n,) which rows have a pose, readable or not."""
+        return _finite_rows(self.positions) & _finite_rows(self.rotations)
+
+    def rows(self, rows: IntArray) -> "PoseNumbers":
+        """Takes some rows, in the order that is given."""
+        return replace(
+            self,
+            positions=self.positions[rows],
+            rotations=self.rotations[rows],
+            places=tuple(self.places[it] for it in rows),
+        )
+
     def read_as(self, reading: Reading) -> "PoseNumbers":
         """Returns the same numbers under another reading."""
         return replace(self, reading=reading)
@@ -227,7 +255,7 @@ class PoseNumbers:
             (n, 4, 4) transforms [m]; NaN in a row without a pose.
 
         Raises:
-            DataError: Rows are no rotations in this form; they are named.
+            DataError: Rows have a part of a pose, or are no rotations in this form; they are named.
         """
         form = ROTATION_FORMS[self.reading.rotation]
         if self.rotations.shape[1] != form.size:
@@ -236,23 +264,29 @@ class PoseNumbers:
                 f"{form.words} has {form.size}.",
                 culprits=[self.places[0]],
             )
+        there = self.there
+        known = np.isfinite(np.hstack([self.positions, self.rotations]))
+        partly = self._places_of(known.any(axis=1) & ~there)
+        if partly:
+            raise DataError(
+                f"{some_of(partly)}: a part of the pose's numbers is missing; all or none are "
+                "needed.",
+                culprits=partly,
+            )
         rotations = form.read(self.rotations)
-        there = _whole(self.positions) & _whole(self.rotations)
-        wrong = [
-            place
-            for place, row, is_pose in zip(self.places, rotations, there, strict=True)
-            if is_pose and not np.isfinite(row).all()
-        ]
+        wrong = self._places_of(there & ~np.isfinite(rotations).all(axis=(1, 2)))
         if wrong:
             raise DataError(
-                f"{wrong[0]}: the numbers are not {form.words}"
-                + (f", nor are those of {len(wrong) - 1} more." if len(wrong) > 1 else "."),
+                f"{some_of(wrong)}: the numbers are not {form.words}.",
                 culprits=wrong,
-                next_step="Name another form of rotation, or let convert --guess try them.",
+                next_step="Name another form of rotation, or other numbers.",
             )
         poses = compose(rotations, UNITS_M[self.reading.unit] * self.positions)
         poses[~there] = np.nan
         return invert(poses) if self.reading.inverse else poses
+
+    def _places_of(self, rows: Mask) -> list[str]:
+        return [self.places[it] for it in np.flatnonzero(rows)]
 
 
 def write_pose(pose: FloatArray, form: PoseForm) -> FloatArray:

@@ -5,7 +5,7 @@ import hashlib
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +65,29 @@ def named_errors(path: Path) -> Iterator[None]:
             culprits=[str(path)],
             next_step="Choose a folder that exists, can be written, and has room.",
         ) from error
+
+
+def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
+    """Checks that nothing is overwritten without a word of the user.
+
+    Args:
+        path: What is to be written.
+        force: Whether the user allows that a file is replaced; a folder never is.
+        replaceable: Whether it could be allowed.
+
+    Raises:
+        DataError: `path` is there.
+    """
+    replaceable = replaceable and path.is_file()
+    if not path.exists() or (force and replaceable):
+        return
+    raise DataError(
+        f"{path} exists, and nothing is overwritten.",
+        culprits=[str(path)],
+        next_step="Choose another name, or replace the file with --force."
+        if replaceable
+        else "Choose another name.",
+    )
 
 
 def read_bytes(path: Path | str) -> bytes:
@@ -132,6 +155,17 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Words a hint at the known names nearest to `word`; empty where none is near."""
     near = difflib.get_close_matches(word.lower(), sorted(known), n=3, cutoff=0.6)
     return f"Did you mean {' or '.join(near)}?" if near else ""
+
+
+def one_line(text: str) -> str:
+    """Replaces by spaces what does not print, such as line ends."""
+    return "".join(it if it.isprintable() else " " for it in text)
+
+
+def some_of(names: Sequence[str], most: int = 8) -> str:
+    """Words a list, cut short: `a, b and 3 more`."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def find_described(

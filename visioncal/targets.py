@@ -6,6 +6,7 @@ checkerboard inner corner 0, for a single marker its centre; x runs along column
 """
 
 from collections.abc import Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,17 @@ def _dictionary_size(table: Table, name: str) -> int:
             next_step=did_you_mean(name.upper(), known)
             or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
         )
-    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+    return len(aruco_dictionary(name).bytesList)
+
+
+def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """Gives one of OpenCV's dictionaries, by a name that a target has."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def metres(millimetres: float) -> float:
+    """Turns millimetres into metres without rounding twice: 23.6 becomes 0.0236."""
+    return float(Decimal(str(millimetres)) / 1000)
 
 
 def target_document(target: Target) -> dict[str, Any]:
@@ -179,9 +190,11 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     """
     if target.kind != "charuco":
         raise DataError(f"target {target.name} is a {target.kind}; a charuco board is needed.")
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
     board = cv2.aruco.CharucoBoard(
-        (target.columns, target.rows), target.square_m, target.marker_m, dictionary
+        (target.columns, target.rows),
+        target.square_m,
+        target.marker_m,
+        aruco_dictionary(target.dictionary),
     )
     board.setLegacyPattern(target.legacy)
     return board

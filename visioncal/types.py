@@ -13,6 +13,7 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 Image: TypeAlias = npt.NDArray[np.uint8]
 
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
+MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
 TargetKind: TypeAlias = Literal["charuco", "checkerboard", "marker"]
 

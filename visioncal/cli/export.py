@@ -7,16 +7,15 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.errors import DataError
-from visioncal.exports import FORMATS, Selection, export
-from visioncal.files import write_atomically
+from visioncal.exports import EXPORT_FORMATS, Selection, export
+from visioncal.files import check_free, write_atomically
 from visioncal.stored import load_calibration
 
 
 def _show_formats(wanted: bool) -> None:
     if wanted:
-        width = max(len(it.name) for it in FORMATS)
-        for it in FORMATS:
+        width = max(len(it.name) for it in EXPORT_FORMATS)
+        for it in EXPORT_FORMATS:
             typer.echo(f"{it.name:<{width}}  {it.words}")
         raise typer.Exit
 
@@ -61,11 +60,6 @@ def export_command(
     if out is None:
         typer.echo(document, nl=False)
         return
-    if out.exists() and not force:
-        raise DataError(
-            f"{out} exists, and nothing is overwritten.",
-            culprits=[str(out)],
-            next_step="Choose another name, or replace the file with --force.",
-        )
+    check_free(out, force=force)
     write_atomically(out, document)
     messages().print(escape(f"wrote {out}"))

@@ -9,13 +9,14 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.errors import DataError
-from visioncal.files import read_bytes, write_atomically
+from visioncal.files import check_free, read_bytes, write_atomically
 from visioncal.finders.identify import identify
 from visioncal.finders.identify_text import describe, to_document, to_toml
 from visioncal.finders.imaging import decode_image
 from visioncal.printing import Page, Request, arrange, pages_named, requested_target, write_board
 from visioncal.targets import (
     load_target,
+    metres,
     target_document,
     target_from_document,
     target_names,
@@ -166,19 +167,15 @@ def check_command(
 
     Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
     """
-    square_m = None if square_mm is None else round(1e-3 * square_mm, 9)
+    square_m = None if square_mm is None else metres(square_mm)
     if out is not None and square_m is None:
         raise DataError(
             "A description needs the size of the squares, which a photograph does not show.",
             culprits=["--square-mm"],
             next_step="Measure over many squares and give --square-mm.",
         )
-    if out is not None and out.exists() and not force:
-        raise DataError(
-            f"{out} exists already.",
-            culprits=[str(out)],
-            next_step="Choose another file with -o, or replace it with --force.",
-        )
+    if out is not None:
+        check_free(out, force=force)
     identity = identify(_decoded(image))
     if square_m is not None:
         _checked(identity.target(image.stem, square_m))

@@ -17,10 +17,12 @@ from visioncal.errors import DataError
 
 Array: TypeAlias = npt.NDArray[Any]
 
-_MAX_MEMBERS = 1000
+_MAX_MEMBERS, _MOST_AXES = 1000, 8
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 1  # a bit of a member's flags
 _MAGIC = b"\x93NUMPY"
 # Numbers and text of fixed width; an object array ("|O") is a pickle.
-_DTYPE = re.compile(r"[<>|=]([fiu][1248]|b1|[US][0-9]{1,4})")
+_DTYPE = re.compile(r"[<>|=](f[248]|[iu][1248]|b1|[US][1-9][0-9]{0,3})")
 _HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[^']*)',\s*'fortran_order':\s*(?P<fortran>True|False),"
     r"\s*'shape':\s*\((?P<shape>[0-9, ]*)\),?\s*\}\s*"
@@ -43,52 +45,47 @@ def read_npz(path: Path) -> Mapping[str, Array]:
         DataError: It is missing, no .npz, damaged, holds Python objects, or unpacks to more than
             50 MB.
     """
-    where = str(path)
+    where, stored = str(path), io.BytesIO(read_bounded(path))
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bounded(path))) as archive:
-            members = archive.infolist()
-            if len(members) > _MAX_MEMBERS:
-                raise DataError(
-                    f"{where} holds {len(members)} arrays; up to {_MAX_MEMBERS} are read.",
-                    culprits=[where],
-                )
-            return _read_members(archive, members, where)
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        OSError,
-        ValueError,
-        RuntimeError,
-        KeyError,
-        AttributeError,
-    ) as error:
+        with zipfile.ZipFile(stored) as archive:
+            unpacked = _unpacked(archive, where)
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:
+        # ValueError: names that are no UTF-8, offsets before the beginning.
         raise DataError(
             f"{where} is no .npz: {str(error)[:120]}.",
             culprits=[where],
             next_step="numpy.savez writes one.",
         ) from error
+    return {name: _parse_npy(data, f"{where}: {name}") for name, data in unpacked.items()}
 
 
-def _read_members(
-    archive: zipfile.ZipFile, members: list[zipfile.ZipInfo], where: str
-) -> dict[str, Array]:
+def _unpacked(archive: zipfile.ZipFile, where: str) -> dict[str, bytes]:
+    members = archive.infolist()
+    if len(members) > _MAX_MEMBERS:
+        raise DataError(
+            f"{where} holds {len(members)} arrays; up to {_MAX_MEMBERS} are read.", culprits=[where]
+        )
     arrays, room = {}, MAX_BYTES
     for member in members:
+        name = member.filename.removesuffix(".npy")
+        if name in arrays:
+            raise DataError(f"{where}: the array {name!r} is there twice.", culprits=[where])
+        # numpy.savez and savez_compressed write nothing else.
+        if member.compress_type not in _PACKINGS or member.flag_bits & _ENCRYPTED:
+            raise DataError(
+                f"{where}: {name[:60]} is encrypted or packed in another way than numpy's.",
+                culprits=[where],
+            )
         # The stated size may lie; what is unpacked counts.
         with archive.open(member) as file:
-            data = file.read(room + 1)
-        room -= len(data)
+            arrays[name] = file.read(room + 1)
+        room -= len(arrays[name])
         if room < 0:
             raise DataError(
                 f"{where} unpacks to more than {MAX_BYTES / 1e6:.0f} MB.",
                 culprits=[where],
                 next_step="Keep the poses in a file of their own.",
             )
-        name = member.filename.removesuffix(".npy")
-        if name in arrays:
-            raise DataError(f"{where}: the array {name!r} is there twice.", culprits=[where])
-        arrays[name] = _parse_npy(data, f"{where}: {name}")
     return arrays
 
 
@@ -110,9 +107,15 @@ def _parse_npy(data: bytes, where: str) -> Array:
             next_step="Arrays of Python objects are not read: they run code when they are loaded.",
         )
     sizes = [it.strip() for it in header["shape"].split(",") if it.strip()]
-    if any(len(it) > 12 or not it.isdecimal() for it in sizes) or len(sizes) > 8:
-        raise DataError(f"{where} has the shape ({header['shape'][:60]}).", culprits=[where])
-    shape = tuple(int(it) for it in sizes)
+    plain = len(sizes) <= _MOST_AXES and all(len(it) <= 12 and it.isdecimal() for it in sizes)
+    shape = tuple(int(it) for it in sizes) if plain else ()
+    # An axis of none hides the others from the count of bytes.
+    if not plain or math.prod(max(it, 1) for it in shape) > MAX_BYTES:
+        raise DataError(
+            f"{where} has the shape ({header['shape'][:60]}); up to {_MOST_AXES} axes and "
+            f"{MAX_BYTES:,} entries are read.",
+            culprits=[where],
+        )
     dtype = np.dtype(header["descr"])
     needed = math.prod(shape) * dtype.itemsize
     if needed != len(data) - end:

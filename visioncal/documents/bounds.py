@@ -13,8 +13,8 @@ MAX_VALUES = 1_000_000
 MAX_DEPTH = 40
 
 
-def read_bounded(path: Path) -> bytes:
-    """Reads a file of at most 50 MB.
+def read_bounded(path: Path, most: int = MAX_BYTES) -> bytes:
+    """Reads a file of at most so many bytes, 50 MB where nothing is said.
 
     Raises:
         DataError: It is missing, no file, cannot be read, or is larger.
@@ -24,14 +24,13 @@ def read_bounded(path: Path) -> bytes:
             what = "is no file" if path.exists() else "does not exist"
             raise DataError(f"{path} {what}; a file is needed.", culprits=[str(path)])
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            data = file.read(most + 1)
     except (OSError, ValueError) as error:
         words = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise DataError(f"{path} cannot be read: {words}.", culprits=[str(path)]) from error
-    if len(data) > MAX_BYTES:
+    if len(data) > most:
         raise DataError(
-            f"{path} has more than {MAX_BYTES / 1e6:.0f} MB; files of poses up to that size are "
-            "read.",
+            f"{path} has more than {most / 1e6:.0f} MB; up to that size is read.",
             culprits=[str(path)],
             next_step="Cut the recording into parts, or convert the poses alone.",
         )

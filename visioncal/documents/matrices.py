@@ -1,12 +1,14 @@
 """OpenCV's matrices, from the mapping that its three text formats have in common."""
 
+import math
 import re
 
-import numpy as np
-
+from visioncal.documents.bounds import MAX_VALUES
 from visioncal.documents.values import as_numbers, mapping, number
 from visioncal.errors import DataError
 from visioncal.types import FloatArray
+
+_MOST_AXES = 8
 
 
 def matrix_from(value: object, where: str) -> FloatArray:
@@ -26,9 +28,9 @@ def matrix_from(value: object, where: str) -> FloatArray:
     content = mapping(value, where)
     data = as_numbers(content.get("data"), f"{where}: data").reshape(-1)
     if "sizes" in content:
-        shape = [number(it, f"{where}: sizes") for it in _list(content["sizes"])]
+        sides = as_numbers(content["sizes"], f"{where}: sizes").reshape(-1).tolist()
     else:
-        shape = [number(content.get(it), f"{where}: {it}") for it in ("rows", "cols")]
+        sides = [number(content.get(it), f"{where}: {it}") for it in ("rows", "cols")]
     kind = re.fullmatch(r"([0-9]*)[ucwsifdh]", str(content.get("dt", "d")))
     if kind is None:
         raise DataError(
@@ -36,14 +38,16 @@ def matrix_from(value: object, where: str) -> FloatArray:
             culprits=[where],
         )
     if kind[1] and int(kind[1][:3]) > 1:
-        shape.append(float(kind[1][:3]))
-    if float(np.prod(shape)) != len(data) or any(it < 0 or it % 1 for it in shape):
-        words = " x ".join(f"{it:g}" for it in shape)
+        sides.append(float(kind[1][:3]))
+    whole = len(sides) <= _MOST_AXES and all(0 <= it <= MAX_VALUES and it % 1 == 0 for it in sides)
+    shape = [int(it) for it in sides] if whole else []
+    # A side of none hides the others from the count.
+    if not whole or math.prod(max(it, 1) for it in shape) > MAX_VALUES:
+        words = " x ".join(f"{it:g}" for it in sides[:_MOST_AXES])
+        raise DataError(f"{where}: a matrix of {words} is none that is read.", culprits=[where])
+    if math.prod(shape) != len(data):
+        words = " x ".join(map(str, shape))
         raise DataError(
             f"{where}: the matrix has {len(data)} numbers; {words} are needed.", culprits=[where]
         )
-    return data.reshape([int(it) for it in shape])
-
-
-def _list(value: object) -> list[object]:
-    return value if isinstance(value, list) else [value]
+    return data.reshape(shape)

@@ -6,6 +6,7 @@ from typing import Any
 
 from visioncal.documents.jsons import read_json
 from visioncal.documents.matrices import matrix_from
+from visioncal.documents.tables import is_number
 from visioncal.documents.xmls import Element, read_xml
 from visioncal.documents.yamls import read_yaml
 from visioncal.errors import DataError
@@ -50,14 +51,14 @@ def _from_xml(element: Element, where: str) -> object:
     place = f"{where}, line {element.line}"
     if element.attributes.get("type_id") in _MATRICES:
         content = {
-            it.tag: it.text.strip('"') if it.tag == "dt" else _numbers(it.text, place)
-            for it in element.children
+            tag: it.text.strip('"') if tag == "dt" else _numbers(it.text, place)
+            for tag, it in _by_tag(element, where).items()
         }
         return matrix_from(content, place)
     if element.children and all(it.tag == "_" for it in element.children):
         return [_from_xml(it, where) for it in element.children]
     if element.children:
-        return {it.tag: _from_xml(it, where) for it in element.children}
+        return {tag: _from_xml(it, where) for tag, it in _by_tag(element, where).items()}
     try:
         numbers = _numbers(element.text, place)
     except DataError:
@@ -65,9 +66,20 @@ def _from_xml(element: Element, where: str) -> object:
     return numbers[0] if len(numbers) == 1 else numbers or ""
 
 
+def _by_tag(element: Element, where: str) -> dict[str, Element]:
+    by_tag: dict[str, Element] = {}
+    for it in element.children:
+        if by_tag.setdefault(it.tag, it) is not it:
+            place = f"{where}, line {it.line}"
+            raise DataError(
+                f"{place}: <{it.tag[:60]}> is there twice; once is needed.", culprits=[place]
+            )
+    return by_tag
+
+
 def _numbers(text: str, where: str) -> list[float]:
     """Reads numbers between blanks; OpenCV writes `.Nan` and `-.Inf`."""
-    try:
-        return [float(it.replace(".N", "N").replace(".I", "I")) for it in text.split()]
-    except ValueError as error:
-        raise DataError(f"{where}: {text[:60]!r}; numbers are needed.", culprits=[where]) from error
+    words = text.replace(".N", "N").replace(".I", "I").split()
+    if not all(is_number(it) for it in words):
+        raise DataError(f"{where}: {text[:60]!r}; numbers are needed.", culprits=[where])
+    return [float(it) for it in words]

@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +13,8 @@ from visioncal.errors import DataError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
+# What else str.splitlines splits at may stand inside a cell.
+_LINE_END = re.compile(r"\r\n|\r|\n")
 _COMMENTS = ("#", "%", "//")
 
 
@@ -56,9 +59,10 @@ def read_table(path: Path) -> TextTable:
     text, where = read_plain_text(path), str(path)
     if text.count("\n") + text.count("\r") > MAX_VALUES:
         raise too_many(where)
+    every = _LINE_END.split(text)
     lines = [
         (at, line)
-        for at, line in enumerate(text.splitlines(), start=1)
+        for at, line in enumerate(every, start=1)
         if line.strip() and not line.strip().startswith(_COMMENTS)
     ]
     if not lines:
@@ -72,7 +76,7 @@ def read_table(path: Path) -> TextTable:
     if columns is not None:
         rows, numbers = rows[1:], numbers[1:]
     else:
-        columns = _header_in_comments(text, numbers[0], separator, len(rows[0]))
+        columns = _header_in_comments(every[: numbers[0] - 1], separator, len(rows[0]))
     if not rows:
         raise DataError(f"{where} has a header and no rows.", culprits=[where])
     width = len(columns or rows[0])
@@ -102,9 +106,8 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
 
 
 def _header_in_comments(
-    text: str, first: int, separator: str, width: int
+    before: Sequence[str], separator: str, width: int
 ) -> tuple[str, ...] | None:
-    before = text.splitlines()[: first - 1]
     comment = next((it.strip() for it in reversed(before) if it.strip()), "")
     if not comment.startswith(_COMMENTS):
         return None

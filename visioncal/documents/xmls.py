@@ -47,11 +47,14 @@ def read_xml(path: Path) -> Element:
     stack, texts = [root], [[""]]
     count = 0
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
+    def counted(values: int) -> None:
         nonlocal count
-        count += 1
-        if count > MAX_VALUES // 5:
+        count += values
+        if count > MAX_VALUES:
             raise too_many(where)
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        counted(5)  # values' worth of memory
         if len(stack) > MAX_DEPTH:
             raise too_deep(f"{where}, line {parser.CurrentLineNumber}")
         element = Element(tag, parser.CurrentLineNumber, attributes)
@@ -63,6 +66,8 @@ def read_xml(path: Path) -> Element:
         stack.pop().text = "".join(texts.pop()).strip()
 
     def text(part: str) -> None:
+        # Parts are a few kilobytes each: their words are counted before all are split.
+        counted(len(part.split()))
         texts[-1].append(part)
 
     def doctype(*_: object) -> None:

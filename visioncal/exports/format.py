@@ -11,7 +11,7 @@ Holds: TypeAlias = Literal["any edge", "hand-eye", "lens"]
 
 
 @dataclass(frozen=True)
-class Format:
+class ExportFormat:
     """A form in which others read a result.
 
     Attributes:

@@ -2,7 +2,7 @@
 
 from visioncal.conventions import POSE_FORMS, write_pose
 from visioncal.exports.content import Content
-from visioncal.exports.format import Format
+from visioncal.exports.format import ExportFormat
 from visioncal.exports.frames import ROS_FRAMES, ros_notes
 from visioncal.exports.writing import comments, numbers
 
@@ -57,13 +57,13 @@ def _write_moveit(content: Content) -> str:
     return mount + comments("#", ros_notes(content)) + _program(content)
 
 
-ROS_LAUNCH = Format(
+ROS_LAUNCH = ExportFormat(
     "ros-launch",
     "a ROS 2 launch file with a static_transform_publisher [m, quaternion]",
     _write_launch,
     frames=ROS_FRAMES,
 )
-MOVEIT = Format(
+MOVEIT = ExportFormat(
     "moveit",
     "the same laid out as MoveIt 2's hand-eye calibration writes it [m, quaternion]",
     _write_moveit,

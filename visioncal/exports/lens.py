@@ -2,21 +2,16 @@
 
 import numpy as np
 
+from visioncal.camera import matrix_3x3
 from visioncal.errors import DataError
 from visioncal.exports.content import Content
-from visioncal.exports.format import Format
+from visioncal.exports.format import ExportFormat
 from visioncal.exports.writing import comments, numbers, yaml_text
 from visioncal.types import Camera, FloatArray
 
 _CAMERA = {"cam": "camera"}
 # By the number of coefficients: OpenCV's five, eight, and the fisheye's four.
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
-
-
-def matrix_of(camera: Camera) -> FloatArray:
-    """Builds the (3, 3) camera matrix [px]."""
-    fx, fy, cx, cy = camera.matrix
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _camera_of(content: Content) -> Camera:
@@ -54,7 +49,7 @@ def _write_camera_info(content: Content) -> str:
     identity, and P repeats the camera matrix.
     """
     camera = _camera_of(content)
-    matrix = matrix_of(camera)
+    matrix = matrix_3x3(camera)
     document = {
         "image_width": camera.resolution[0],
         "image_height": camera.resolution[1],
@@ -104,7 +99,9 @@ def _radtan(coefficients: list[float]) -> list[float]:
     )
 
 
-CAMERA_INFO = Format(
+CAMERA_INFO = ExportFormat(
     "camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info, "lens", _CAMERA
 )
-KALIBR = Format("kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr, "lens", _CAMERA)
+KALIBR = ExportFormat(
+    "kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr, "lens", _CAMERA
+)

@@ -2,10 +2,11 @@
 
 import cv2
 
+from visioncal.camera import matrix_3x3
 from visioncal.exports.content import Content
-from visioncal.exports.format import Format
-from visioncal.exports.lens import matrix_of
-from visioncal.exports.writing import comments, one_line, rows, yaml_text
+from visioncal.exports.format import ExportFormat
+from visioncal.exports.writing import comments, rows, yaml_text
+from visioncal.files import one_line
 from visioncal.types import FloatArray
 
 
@@ -33,7 +34,7 @@ def _write_opencv(content: Content) -> str:
         storage.write("image_width", camera.resolution[0])
         storage.write("image_height", camera.resolution[1])
         storage.write("distortion_model", camera.model)
-        storage.write("camera_matrix", matrix_of(camera))
+        storage.write("camera_matrix", matrix_3x3(camera))
         storage.write("distortion_coefficients", camera.distortion.reshape(1, -1).copy())
     return storage.releaseAndGetString()
 
@@ -50,10 +51,10 @@ def _write_zivid(content: Content) -> str:
     return version + yaml_text({"FloatMatrix": {"Data": rows(matrix_mm)}}, short_lists=True)
 
 
-TEXT = Format("text", "the 4x4 matrix as text, as numpy.loadtxt reads it [m]", _write_text)
-OPENCV = Format(
+TEXT = ExportFormat("text", "the 4x4 matrix as text, as numpy.loadtxt reads it [m]", _write_text)
+OPENCV = ExportFormat(
     "opencv",
     "OpenCV's FileStorage: transform, R, t and any lens [m]",
     _write_opencv,
 )
-ZIVID = Format("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid)
+ZIVID = ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid)

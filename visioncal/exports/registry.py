@@ -3,7 +3,7 @@
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.exports.content import HAND_EYE, Selection, select
-from visioncal.exports.format import Format
+from visioncal.exports.format import ExportFormat
 from visioncal.exports.launch import MOVEIT, ROS_LAUNCH
 from visioncal.exports.lens import CAMERA_INFO, KALIBR
 from visioncal.exports.matrices import OPENCV, TEXT, ZIVID
@@ -12,7 +12,7 @@ from visioncal.exports.ros import EASY_HANDEYE2, ROS
 from visioncal.exports.urdf import URDF
 from visioncal.files import did_you_mean
 
-FORMATS: tuple[Format, ...] = (
+EXPORT_FORMATS: tuple[ExportFormat, ...] = (
     ROS,
     ROS_LAUNCH,
     MOVEIT,
@@ -33,7 +33,7 @@ def export(calibration: Calibration, to: str, selection: Selection = _EVERYTHING
 
     Args:
         calibration: The result.
-        to: The name of a format among `FORMATS`.
+        to: The name of a format among `EXPORT_FORMATS`.
         selection: Which transform, in which direction, and what its frames are to be called.
 
     Returns:
@@ -48,8 +48,8 @@ def export(calibration: Calibration, to: str, selection: Selection = _EVERYTHING
     return form.write(select(calibration, selection, form.frames))
 
 
-def _find(name: str) -> Format:
-    by_name = {it.name: it for it in FORMATS}
+def _find(name: str) -> ExportFormat:
+    by_name = {it.name: it for it in EXPORT_FORMATS}
     if name in by_name:
         return by_name[name]
     hint = did_you_mean(name, by_name)
@@ -60,7 +60,7 @@ def _find(name: str) -> Format:
     )
 
 
-def _check_holds(form: Format, selection: Selection) -> None:
+def _check_holds(form: ExportFormat, selection: Selection) -> None:
     if form.holds == "lens" and (selection.edge or selection.inverse or selection.parent):
         raise DataError(
             f"{form.name} holds the lens and no transform: --edge, --inverse and --parent do not "

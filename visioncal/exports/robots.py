@@ -8,7 +8,7 @@ from functools import partial
 
 from visioncal.conventions import POSE_FORMS, PoseForm, write_pose
 from visioncal.exports.content import Content
-from visioncal.exports.format import Format
+from visioncal.exports.format import ExportFormat
 from visioncal.exports.writing import comments, fixed
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
@@ -42,9 +42,9 @@ def _write(form: PoseForm, mark: str, shape: Callable[[list[str]], str], content
     return (comments(mark, notes) if mark else "") + shape(texts) + "\n"
 
 
-def _robot(name: str, words: str, mark: str, shape: Callable[[list[str]], str]) -> Format:
+def _robot(name: str, words: str, mark: str, shape: Callable[[list[str]], str]) -> ExportFormat:
     """Builds a format; `mark` starts a comment in the controller's language."""
-    return Format(name, words, partial(_write, POSE_FORMS[name], mark, shape))
+    return ExportFormat(name, words, partial(_write, POSE_FORMS[name], mark, shape))
 
 
 UR = _robot(

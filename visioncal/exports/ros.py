@@ -2,7 +2,7 @@
 
 from visioncal.conventions import POSE_FORMS, write_pose
 from visioncal.exports.content import Content
-from visioncal.exports.format import Format
+from visioncal.exports.format import ExportFormat
 from visioncal.exports.frames import ROS_FRAMES, ros_notes
 from visioncal.exports.writing import comments, numbers, yaml_text
 
@@ -52,13 +52,13 @@ def _write_easy_handeye2(content: Content) -> str:
     return comments("#", [*ros_notes(content), use]) + yaml_text(document)
 
 
-ROS = Format(
+ROS = ExportFormat(
     "ros",
     "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
     _write_transform,
     frames=ROS_FRAMES,
 )
-EASY_HANDEYE2 = Format(
+EASY_HANDEYE2 = ExportFormat(
     "easy-handeye2",
     "a .calib of easy_handeye2 [m, quaternion x, y, z, w]",
     _write_easy_handeye2,

@@ -4,9 +4,10 @@ import re
 
 from visioncal.conventions import POSE_FORMS, write_pose
 from visioncal.exports.content import Content
-from visioncal.exports.format import Format
+from visioncal.exports.format import ExportFormat
 from visioncal.exports.frames import ROS_FRAMES, ros_notes
-from visioncal.exports.writing import numbers, one_line
+from visioncal.exports.writing import numbers
+from visioncal.files import one_line
 
 
 def _write(content: Content) -> str:
@@ -35,7 +36,7 @@ def _write(content: Content) -> str:
     )
 
 
-URDF = Format(
+URDF = ExportFormat(
     "urdf",
     "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
     _write,

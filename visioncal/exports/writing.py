@@ -5,6 +5,7 @@ from typing import Any
 
 import yaml
 
+from visioncal.files import one_line
 from visioncal.types import FloatArray
 
 
@@ -28,11 +29,6 @@ def fixed(value: float, decimals: int) -> str:
 def comments(mark: str, lines: Iterable[str]) -> str:
     """Writes lines as comments, each behind `mark`; no text can end its comment early."""
     return "".join(f"{mark} {one_line(it)}\n" for it in lines)
-
-
-def one_line(text: str) -> str:
-    """Replaces by spaces what does not print, such as line ends."""
-    return "".join(it if it.isprintable() else " " for it in text)
 
 
 def yaml_text(document: dict[str, Any], *, short_lists: bool = False) -> str:

@@ -1,10 +1,12 @@
 """Decoding markers of every family at once, and telling real ones from look-alikes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
+from visioncal.targets import aruco_dictionary
 from visioncal.types import FloatArray, Image
 
 # By family: its dictionaries from the smallest on. Each holds the markers of those before it under
@@ -47,7 +49,7 @@ class Marker:
     px: FloatArray
     likeness: float
 
-    @property
+    @cached_property
     def centre(self) -> FloatArray:
         """Where its diagonals meet, (2,), which perspective keeps [px]."""
         a, b, c, d = self.px
@@ -58,7 +60,7 @@ class Marker:
         share = ((b - a)[0] * along[1] - (b - a)[1] * along[0]) / turn
         return np.asarray(a + share * across)
 
-    @property
+    @cached_property
     def side_px(self) -> float:
         """Mean length of its sides [px]."""
         return float(np.linalg.norm(self.px - np.roll(self.px, 1, axis=0), axis=1).mean())
@@ -75,7 +77,7 @@ def decode_markers(image: Image) -> tuple[Marker, ...]:
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    dictionaries = [_dictionary(names[-1]) for names in FAMILIES.values()]
+    dictionaries = [aruco_dictionary(names[-1]) for names in FAMILIES.values()]
     detector = cv2.aruco.ArucoDetector(dictionaries, parameters)
     corners, ids, _, which = detector.detectMarkersMultiDict(image)
     if not corners:
@@ -107,20 +109,16 @@ def genuine(markers: tuple[Marker, ...]) -> tuple[Marker, ...]:
 def holding(family: str, count: int) -> tuple[str, ...]:
     """Lists the dictionaries of a family that have at least so many markers, smallest first."""
     names = FAMILIES[family]
-    return tuple(it for it in names if len(_dictionary(it).bytesList) >= count)
+    return tuple(it for it in names if len(aruco_dictionary(it).bytesList) >= count)
 
 
 def modules_along(family: str) -> int:
     """Counts the modules along a marker's side, its dark border included."""
-    return int(_dictionary(FAMILIES[family][0]).markerSize) + 2
-
-
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    return int(aruco_dictionary(FAMILIES[family][0]).markerSize) + 2
 
 
 def _likeness(image: Image, px: FloatArray, family: str, number: int) -> float:
-    dictionary = _dictionary(FAMILIES[family][-1])
+    dictionary = aruco_dictionary(FAMILIES[family][-1])
     side = modules_along(family) * _MODULE_PX
     ring = round(_RING * _MODULE_PX)
     ideal = cv2.aruco.generateImageMarker(dictionary, number, side)

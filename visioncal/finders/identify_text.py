@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from visioncal.files import one_line
 from visioncal.finders.identify import Identity
 from visioncal.targets import target_document
 
@@ -55,7 +56,7 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
     size = "size_m" if identity.kind == "marker" else "square_m"
     what = "side of the dark square" if identity.kind == "marker" else "side of a square"
     where = "measured" if identity.kind == "marker" else "measured over many squares"
-    lines = [f"# Seen in {_one_line(source)}: {describe(identity)}."]
+    lines = [f"# Seen in {one_line(source)}: {describe(identity)}."]
     lines += [f"# {note}" for note in identity.notes]
     if square_m is None:
         lines.append(
@@ -110,7 +111,3 @@ def _literal(value: object) -> str:
             return f"{value:.9g}"
         case _:
             return str(value)
-
-
-def _one_line(text: str) -> str:
-    return "".join(letter if letter.isprintable() else "?" for letter in text)

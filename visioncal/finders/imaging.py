@@ -14,8 +14,14 @@ from visioncal.types import FloatArray, Image
 _REACH_PX = (4, 12)
 # Corners measured in an image: the median of these is stable to some percent.
 _SAMPLE = 12
+_SIGNATURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM")
 # Under this many grey levels a picture shows nothing that a detector could use.
 _LEAST_CONTRAST = 12
+
+
+def looks_like_image(data: bytes) -> bool:
+    """Tells whether a file begins as png, jpg, tif or bmp do; damage further on does not matter."""
+    return data.startswith(_SIGNATURES)
 
 
 def decode_image(data: bytes, *, colour: bool = False) -> Image | str:

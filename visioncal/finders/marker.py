@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from visioncal.finders.result import NotFound, Seen
+from visioncal.targets import aruco_dictionary
 from visioncal.types import Image, Target
 
 
@@ -17,7 +18,7 @@ def find_marker(image: Image, target: Target) -> Seen | NotFound:
     Returns:
         The corners, or why there are none.
     """
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    dictionary = aruco_dictionary(target.dictionary)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     px, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)

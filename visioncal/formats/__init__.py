@@ -2,17 +2,19 @@
 
 Somebody else's recording becomes a session in three steps: `read_foreign` gives its numbers as they
 are written, `assemble` the session that they mean, and `write_session` stores it. Between the first
-and the second, `guess_foreign` can look whether they mean something else.
+and the second, `guess_foreign` can look whether they mean something else. `convert` does them all.
+
+A new format is a file with a `ForeignFormat` and its entry in `registry.FOREIGN_FORMATS`. Another
+usual name of a field needs no format: it is added to the keys in `poses`, `fields` (times),
+`columns` (images) or `intrinsics`, and a recording with it to the samples of the tests.
 """
 
 from visioncal.formats.assemble import assemble
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.registry import (
     FOREIGN_FORMATS,
-    FORMATS,
-    check_free,
+    OWN_FORMATS,
     convert,
-    is_session,
     read_foreign,
     write_session,
 )
@@ -21,15 +23,13 @@ from visioncal.formats.wishes import PoseWishes, Wishes
 
 __all__ = [
     "FOREIGN_FORMATS",
-    "FORMATS",
+    "OWN_FORMATS",
     "Foreign",
     "PoseWishes",
     "Wishes",
     "assemble",
-    "check_free",
     "convert",
     "guess_foreign",
-    "is_session",
     "load_in_doubt",
     "read_foreign",
     "reread",

@@ -1,19 +1,19 @@
 """A session out of what someone else recorded."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.conventions import PoseNumbers, Reading
-from visioncal.documents import is_number
+from visioncal.documents import is_number, read_bounded
 from visioncal.errors import DataError
-from visioncal.files import read_bytes
+from visioncal.files import some_of
+from visioncal.finders.imaging import decode_image, looks_like_image
 from visioncal.formats.boards import described_target, target_name
 from visioncal.formats.foreign import Foreign, rows_of
 from visioncal.formats.intrinsics import read_intrinsics
@@ -21,10 +21,10 @@ from visioncal.formats.wishes import Wishes
 from visioncal.robot import read_robot_document
 from visioncal.session import MemoryImages, Session
 from visioncal.session import columns as known
-from visioncal.types import Mask, Mount
+from visioncal.types import Mount
 
-# Quaternions nearer to unit length than this are kept as they are written.
-_UNIT_NORM = 1e-3
+# The largest sensors have 150 million pixels, of 16 bits each where nothing packs them.
+_MOST_IMAGE_BYTES = 300_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class FileImages:
         """Reads the bytes of one image file."""
         if path not in self.files:
             raise DataError(f"The session has no image {path}.", culprits=[path])
-        return read_bytes(self.files[path])
+        return _image_bytes(self.files[path])
 
     def exists(self, path: str) -> bool:
         """Tells whether there is such an image."""
@@ -45,37 +45,33 @@ class FileImages:
 
 
 def wished(foreign: Foreign, wishes: Wishes) -> Foreign:
-    """Changes a recording into what the user says of it.
+    """Adds to a recording what the user says of it besides how its poses are written.
 
     Raises:
         DataError: A name that the user gives is not known, or a file that he names is wrong.
     """
-    foreign = replace(foreign, robot=wishes.robot.applied_to(foreign.robot))
-    if foreign.camera is not None:
-        foreign = replace(foreign, camera=wishes.camera.applied_to(foreign.camera))
     if wishes.mount is not None:
         foreign = replace(foreign, mount=wishes.mount)
     if wishes.target is not None:
         foreign = replace(foreign, target=described_target(wishes.target))
-    if wishes.robot_model is not None or wishes.tip is not None:
-        arm = dict(foreign.arm or {})
-        arm |= {"model": wishes.robot_model} if wishes.robot_model is not None else {}
-        arm |= {"tip": wishes.tip} if wishes.tip is not None else {}
-        if "model" not in arm:
-            raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
-        foreign = replace(foreign, arm=arm)
-    return replace(foreign, lens=_lens(foreign, wishes))
+    if wishes.tip is not None and wishes.robot_model is None:
+        raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
+    if wishes.robot_model is not None:
+        tip = {} if wishes.tip is None else {"tip": wishes.tip}
+        foreign = replace(foreign, arm={"model": wishes.robot_model} | tip)
+    return _with_lens(foreign, wishes)
 
 
-def _lens(foreign: Foreign, wishes: Wishes) -> Mapping[str, Any] | None:
-    lens = dict(foreign.lens or {})
+def _with_lens(foreign: Foreign, wishes: Wishes) -> Foreign:
+    lens, notes = dict(foreign.lens or {}), foreign.notes
     if wishes.intrinsics == "estimate":
         lens = {it: lens[it] for it in ("name", "model", "resolution") if it in lens}
     elif wishes.intrinsics is not None:
-        lens = read_intrinsics(Path(wishes.intrinsics))
+        lens, more = read_intrinsics(Path(wishes.intrinsics))
+        notes = (*notes, *more)
     if wishes.resolution is not None:
         lens["resolution"] = list(wishes.resolution)
-    return lens or None
+    return replace(foreign, lens=lens or None, notes=notes)
 
 
 def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
@@ -123,7 +119,7 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     notes = list(foreign.notes)
     missing = [file.name for path, file in files.items() if not session.images.exists(path)]
     if missing:
-        notes.append(f"{len(missing)} of {len(files)} images are missing: {_some(missing)}.")
+        notes.append(f"{len(missing)} of {len(files)} images are missing: {some_of(missing)}.")
     return replace(session, warnings=(*notes, *session.warnings))
 
 
@@ -148,8 +144,7 @@ def spoken(foreign: Foreign) -> Foreign:
     for cells in (foreign.images, points):
         saw |= np.array([bool(it) for it in cells] or [False])
     if foreign.camera is not None:
-        numbers = np.hstack([foreign.camera.positions, foreign.camera.rotations])
-        saw |= np.isfinite(numbers).all(axis=1)
+        saw |= foreign.camera.there
     silent = [foreign.robot.places[it] for it in np.flatnonzero(~saw)]
     if len(silent) == len(saw):
         raise DataError(
@@ -162,7 +157,7 @@ def spoken(foreign: Foreign) -> Foreign:
     if silent:
         notes.append(
             f"{len(silent)} of {len(saw)} rows are left out, as they have neither an image nor a "
-            f"pose of the target: {_some(silent)}."
+            f"pose of the target: {some_of(silent)}."
         )
     return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
 
@@ -189,15 +184,14 @@ def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
 
 
 def _written(foreign: Foreign) -> list[_Row]:
-    count = len(foreign.robot)
     images = _image_paths(foreign)
     robot = pose_cells(foreign.robot, known.POSE)
-    camera: list[dict[str, str]] = [{}] * count
+    camera: list[dict[str, str]] = [{}] * len(foreign.robot)
     if foreign.camera is not None:
         camera = pose_cells(foreign.camera, known.MEASURED_CAM_POSE)
     extra = _extra_columns(foreign)
     rows = []
-    for at in range(count):
+    for at in range(len(foreign.robot)):
         image = images[at]
         cells = {"view": str(foreign.views[at] if foreign.views else at)}
         if foreign.images:
@@ -213,27 +207,25 @@ def _scalars(foreign: Foreign, at: int) -> dict[str, str]:
     if foreign.stamps_s is not None and np.isfinite(foreign.stamps_s[at]):
         cells["stamp_s"] = repr(float(foreign.stamps_s[at]))
     if foreign.joints_rad is not None:
-        for number, angle in enumerate(foreign.joints_rad[at], start=1):
-            cells[f"q{number}_rad"] = repr(float(angle))
+        angles = foreign.joints_rad[at].tolist()
+        names = [f"q{number}_rad" for number in range(1, len(angles) + 1)]
+        cells |= {it: "" if np.isnan(a) else repr(a) for it, a in zip(names, angles, strict=True)}
     return cells
 
 
 def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str]]:
     """Writes poses so that reading them gives the same numbers; nothing for a row without one."""
     poses = numbers.poses()
-    values = np.full((len(numbers), 7), np.nan)
-    there: Mask = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    if there.any():
+    values = np.hstack([numbers.positions, numbers.rotations])
+    there = numbers.there
+    # Where they are written as our own are, nothing is computed.
+    if numbers.reading != Reading() and there.any():
+        values = np.full((len(numbers), 7), np.nan)
         transforms = RigidTransform.from_matrix(poses[there])
         values[there] = np.hstack([transforms.translation, transforms.rotation.as_quat()])
-    if numbers.reading == Reading():
-        # Written as our own are: nothing is computed where the numbers can stay as they are.
-        norms = np.linalg.norm(numbers.rotations, axis=1, keepdims=True)
-        stated = np.hstack([numbers.positions, numbers.rotations])
-        values = np.where(np.abs(norms - 1.0) < _UNIT_NORM, stated, values)
     return [
-        dict(zip(names, (repr(float(it)) for it in row), strict=True)) if is_pose else {}
-        for row, is_pose in zip(values, there, strict=True)
+        dict(zip(names, map(repr, row), strict=True)) if is_pose else {}
+        for row, is_pose in zip(values.tolist(), there, strict=True)
     ]
 
 
@@ -241,10 +233,13 @@ def _extra_columns(foreign: Foreign) -> dict[str, tuple[str, ...]]:
     """Names the other columns so that none is taken for one of ours that it is not."""
     written = {"view", "image", "stamp_s", *known.POSE, *known.MEASURED_CAM_POSE}
     written |= set(known.joint_columns(tuple(foreign.columns)))
-    return {
-        name if name not in written and _is_meant(name, cells) else f"source_{name}": cells
-        for name, cells in foreign.columns.items()
-    }
+    columns: dict[str, tuple[str, ...]] = {}
+    for name, cells in foreign.columns.items():
+        own = name if _is_meant(name, cells) else f"source_{name}"
+        while own in written or own in columns:
+            own = f"source_{own}"
+        columns[own] = cells
+    return columns
 
 
 def _is_meant(name: str, cells: Sequence[str]) -> bool:
@@ -261,18 +256,19 @@ def _is_meant(name: str, cells: Sequence[str]) -> bool:
 
 
 def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
-    """Names the images in the session; images of one name from several folders get a number."""
+    """Names the images in the session; where a name is taken it gets a number before it."""
     if not foreign.images:
         return [None] * len(foreign.robot)
-    names = Counter(it.name for it in set(foreign.images) if it is not None)
-    paths: list[tuple[str, Path] | None] = []
+    paths: dict[Path, str] = {}
+    taken: set[str] = set()
     for at, file in enumerate(foreign.images):
-        if file is None:
-            paths.append(None)
+        if file is None or file in paths:
             continue
-        name = file.name if names[file.name] == 1 else f"{at}_{file.name}"
-        paths.append((f"images/{name}", file))
-    return paths
+        names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
+        # Not every file system tells capitals from small letters.
+        paths[file] = next(it for it in names if it.casefold() not in taken)
+        taken.add(paths[file].casefold())
+    return [None if it is None else (f"images/{paths[it]}", it) for it in foreign.images]
 
 
 def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
@@ -292,11 +288,20 @@ def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
 
 
 def _image_size(file: Path) -> tuple[int, int] | None:
-    if not file.is_file():
-        return None
-    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(read_bytes(file), np.uint8), flags)
-    return None if image is None else (int(image.shape[1]), int(image.shape[0]))
+    image = decode_image(_image_bytes(file)) if file.is_file() else ""
+    return None if isinstance(image, str) else (image.shape[1], image.shape[0])
+
+
+def _image_bytes(file: Path) -> bytes:
+    data = read_bounded(file, _MOST_IMAGE_BYTES)
+    # A camera that failed leaves empty files; what else is no image is not to be handed on.
+    if data and not looks_like_image(data):
+        raise DataError(
+            f"{file} is no image (png, jpg, tif, bmp).",
+            culprits=[str(file)],
+            next_step="Name each row's image with --image-column, or the folder with --images.",
+        )
+    return data
 
 
 def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
@@ -308,7 +313,3 @@ def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
     suffix = Path(arm["model"]).suffix.lower()
     document["robot"] = arm | ({"model": f"robot{suffix}"} if suffix in (".toml", ".urdf") else {})
     return robot
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")

@@ -2,11 +2,10 @@
 
 import re
 from collections.abc import Mapping
-from decimal import Decimal
 from typing import Any
 
 from visioncal.errors import DataError
-from visioncal.targets import load_target, target_from_document, target_names
+from visioncal.targets import load_target, metres, target_from_document, target_names
 
 _MM = r"([0-9]{1,5}(?:\.[0-9]{1,9})?)mm"
 _CHARUCO = re.compile(rf"charuco_([0-9]{{1,3}})x([0-9]{{1,3}})_{_MM}_{_MM}_(DICT_\w+?)(_legacy)?")
@@ -50,8 +49,8 @@ def _in_one_word(words: str) -> dict[str, Any] | None:
             "kind": "charuco",
             "columns": int(match[1]),
             "rows": int(match[2]),
-            "square_m": metres(match[3]),
-            "marker_m": metres(match[4]),
+            "square_m": metres(float(match[3])),
+            "marker_m": metres(float(match[4])),
             "dictionary": match[5],
             "legacy": match[6] is not None,
         }
@@ -60,21 +59,16 @@ def _in_one_word(words: str) -> dict[str, Any] | None:
             "kind": "checkerboard",
             "columns": int(match[1]),
             "rows": int(match[2]),
-            "square_m": metres(match[3]),
+            "square_m": metres(float(match[3])),
         }
     if match := _MARKER.fullmatch(words):
         return {
             "kind": "marker",
             "dictionary": match[1],
             "id": int(match[2]),
-            "size_m": metres(match[3]),
+            "size_m": metres(float(match[3])),
         }
     return None
-
-
-def metres(millimetres: str) -> float:
-    """Turns written millimetres into metres without rounding twice."""
-    return float(Decimal(millimetres) / 1000)
 
 
 def target_name(document: Mapping[str, Any]) -> str | None:

@@ -2,12 +2,12 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from visioncal.conventions import PoseNumbers, Reading
+from visioncal.conventions import PoseNumbers
 from visioncal.documents import (
     read_json,
     read_npy,
@@ -26,12 +26,7 @@ from visioncal.formats.fields import (
     stamp_name,
     unnamed_columns,
 )
-from visioncal.formats.finding import (
-    IMAGE_ENDINGS,
-    images_named,
-    images_of,
-    listed,
-)
+from visioncal.formats.finding import IMAGE_ENDINGS, images_beside, images_named, listed
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
 from visioncal.formats.pairing import with_camera_file
@@ -41,6 +36,7 @@ from visioncal.formats.poses import (
     ROBOT_KEYS,
     joints_from,
     known_names,
+    pose_names,
     poses_from,
 )
 from visioncal.formats.streams import in_seconds
@@ -160,9 +156,14 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
         DataError: There are no poses and no joints in it.
     """
     unnamed = unnamed_columns(fields)
-    robot_names = wishes.robot.names or unnamed["robot"] or known_names(fields, ROBOT_KEYS)
-    camera_names = wishes.camera.names or unnamed["camera"] or known_names(fields, CAMERA_KEYS)
-    joint_names = wishes.joints or _joint_names(fields)
+    given = (*wishes.robot.names, *wishes.camera.names, *wishes.joints)
+    used = {fields.find(it) for it in given}
+    robot_names = pose_names(fields, wishes.robot.names, unnamed["robot"], ROBOT_KEYS, used)
+    used.update(robot_names)
+    camera_names = pose_names(fields, wishes.camera.names, unnamed["camera"], CAMERA_KEYS, used)
+    used.update(camera_names)
+    joint_names = wishes.joints or _joint_names(fields, used)
+    used.update(joint_names)
     if not robot_names and not joint_names:
         raise DataError(
             f"{fields.name}: which of its fields are the robot's poses is not known; it has "
@@ -171,15 +172,14 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
             next_step="Name them with --robot-columns, or the joint angles with --joint-columns.",
         )
     notes: tuple[str, ...] = ()
-    robot, camera = _nowhere(fields), None
+    robot, camera = PoseNumbers.nowhere(fields.places), None
     if robot_names:
         robot, notes = poses_from(fields, robot_names, wishes.robot, "robot")
     if camera_names:
         camera, more = poses_from(fields, camera_names, wishes.camera, "camera")
         notes = (*notes, *more)
-    stamps = stamp_name(fields)
-    used = {fields.find(it) for it in (*robot_names, *camera_names, *joint_names)} | {stamps}
-    used |= {"view"} if _view_numbers(fields) else set()
+    stamps = stamp_name(fields, used)
+    used |= {stamps, "view"} if _view_numbers(fields) else {stamps}
     paths, image_name = _images(fields, wishes, images)
     return Foreign(
         name=fields.name,
@@ -196,11 +196,6 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
     )
 
 
-def _nowhere(fields: Fields) -> PoseNumbers:
-    none = np.full((len(fields), 7), np.nan)
-    return PoseNumbers(none[:, :3], none[:, 3:], Reading(), fields.places)
-
-
 def _view_numbers(fields: Fields) -> tuple[int, ...]:
     """The numbers in a column `view`, where they are whole and each is there once."""
     cells = fields.texts.get("view", ())
@@ -208,9 +203,9 @@ def _view_numbers(fields: Fields) -> tuple[int, ...]:
     return tuple(int(it) for it in cells) if whole and len(set(cells)) == len(cells) else ()
 
 
-def _joint_names(fields: Fields) -> tuple[str, ...]:
+def _joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
     ours = joint_columns(tuple(fields.numbers))
-    return ours or known_names(fields, [(it,) for it in JOINT_KEYS])
+    return ours or known_names(fields, [(it,) for it in JOINT_KEYS], taken)
 
 
 def _images(
@@ -223,15 +218,11 @@ def _images(
         it.lower().endswith(IMAGE_ENDINGS) or wishes.image for it in fields.texts[name]
     ):
         return images_named(fields.texts[name], fields.folder, wishes.images), name
-    where = wishes.images or folder
-    if where is None or (folder is not None and wishes.images is None and not _has_images(where)):
+    beside = folder or wishes.images
+    if beside is None:
         return (), ""
-    views = fields.views or tuple(range(len(fields)))
-    return images_of(where, views, fields.places, numbered=bool(fields.views)), ""
-
-
-def _has_images(folder: Path) -> bool:
-    return any(it.suffix.lower() in IMAGE_ENDINGS for it in listed(folder))
+    views, numbered = fields.views or tuple(range(len(fields))), bool(fields.views)
+    return images_beside(beside, wishes.images, views, fields.places, numbered=numbered), ""
 
 
 TABLE = ForeignFormat(

@@ -1,7 +1,7 @@
 """Rows with named values, before it is known what they mean: tables, JSON, arrays."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.documents import TextTable, is_number
 from visioncal.documents.arrays import Array
 from visioncal.errors import DataError
-from visioncal.files import did_you_mean
+from visioncal.files import did_you_mean, some_of
 from visioncal.types import FloatArray
 
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
@@ -60,6 +60,11 @@ class Fields:
         ends = [it for it in known if it.endswith(f".{name}")]
         if len(ends) == 1:
             return ends[0]
+        if ends:
+            raise DataError(
+                f"{self.name}: {name!r} may be {some_of(ends)}; the full name is needed.",
+                culprits=ends,
+            )
         raise DataError(
             f"{self.name} has no column or key {name!r}; it has {self.listing()}.",
             culprits=[name],
@@ -89,9 +94,9 @@ class Fields:
             f"{it} ({int(np.prod(self.numbers[it].shape[1:]))})"
             if it in self.numbers and self.numbers[it].ndim > 1
             else it
-            for it in names[:_LISTED]
+            for it in names
         ]
-        return ", ".join(words) + (f" and {len(names) - _LISTED} more" if names[_LISTED:] else "")
+        return some_of(words, _LISTED)
 
 
 def fields_of_table(table: TextTable) -> Fields:
@@ -194,8 +199,10 @@ def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
 
 
 def _cells(numbers: FloatArray) -> tuple[str, ...]:
-    """Writes (n,) numbers as the cells of a table."""
-    return tuple("" if np.isnan(it) else repr(float(it)) for it in numbers)
+    """Writes (n,) numbers as the cells of a table, whole ones as counts are written."""
+    return tuple(
+        "" if np.isnan(it) else str(int(it)) if it % 1 == 0 else repr(it) for it in numbers.tolist()
+    )
 
 
 def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
@@ -215,7 +222,11 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     }
 
 
-def stamp_name(fields: Fields) -> str:
-    """Finds the field of the times; empty where there is none."""
-    named = next((it for it in fields.numbers if it.lower() in _TIME_NAMES), "")
-    return next(iter(unnamed_columns(fields)["time"]), named)
+def stamp_name(fields: Fields, taken: Collection[str]) -> str:
+    """Finds the field of the times, one number a row and none of those `taken`; else empty."""
+    named = (
+        name
+        for name, numbers in fields.numbers.items()
+        if name.lower() in _TIME_NAMES and name not in taken and numbers.size == len(fields)
+    )
+    return next(iter(unnamed_columns(fields)["time"]), next(named, ""))

@@ -15,7 +15,7 @@ _HEAD_BYTES = 16_384
 def natural(path: Path) -> tuple[object, ...]:
     """Orders names as people do: `view2` before `view10`."""
     parts = re.split(r"([0-9]+)", path.name)
-    return tuple((int(it), "") if it.isdigit() else (-1, it) for it in parts)
+    return tuple((int(it), "") if it.isascii() and it.isdecimal() else (-1, it) for it in parts)
 
 
 def number_in(name: str) -> int | None:
@@ -25,11 +25,25 @@ def number_in(name: str) -> int | None:
 
 
 def listed(folder: Path) -> tuple[Path, ...]:
-    """Lists the files of a folder in natural order; none where it cannot be listed."""
+    """Lists the files of a folder in natural order; none where it cannot be listed.
+
+    Links that lead out of it are left out.
+    """
     try:
-        return tuple(sorted((it for it in folder.iterdir() if it.is_file()), key=natural))
+        files = [it for it in folder.iterdir() if it.is_file()]
     except OSError:
         return ()
+    own = (it for it in files if not it.is_symlink() or is_inside(it, folder))
+    return tuple(sorted(own, key=natural))
+
+
+def is_inside(path: Path, base: Path) -> bool:
+    """Tells whether a path that need not exist lies in a folder, wherever links lead."""
+    try:
+        path.exists()  # raises where a part of it is too long
+        return path.resolve().is_relative_to(base.resolve())
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: links in a circle
+        return False
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:
@@ -88,7 +102,7 @@ def images_named(
         match = by_name.get(plain)
         if match is None and numbers_tell and number is not None:
             match = by_number.get(number)
-        found.append(match or folder / plain)
+        found.append(match or below(folder, plain))
     return tuple(found)
 
 
@@ -125,6 +139,25 @@ def images_of(
     return there
 
 
+def images_beside(
+    folder: Path,
+    chosen: Path | None,
+    views: Sequence[int],
+    labels: Sequence[str],
+    *,
+    numbered: bool,
+) -> tuple[Path | None, ...]:
+    """Pairs rows, as `images_of` does, with the images of `chosen`, else with any in the folder.
+
+    Raises:
+        DataError: As `images_of`; `chosen` has no images.
+    """
+    beside = any(it.suffix.lower() in IMAGE_ENDINGS for it in listed(folder))
+    if chosen is None and not beside:
+        return ()
+    return images_of(chosen or folder, views, labels, numbered=numbered)
+
+
 def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
     numbers = [(number_in(it.name), it) for it in paths]
     counts = Counter(number for number, _ in numbers)
@@ -135,15 +168,14 @@ def below(base: Path, name: str) -> Path:
     """Finds the file that a document names, relative to the document's folder.
 
     Raises:
-        DataError: The path is absolute or leaves the folder.
+        DataError: The path leaves the folder, itself or by a link, or can be none.
     """
-    path = Path(name.replace("\\", "/"))
-    too_long = any(len(it.encode("utf-8", "replace")) > 255 for it in path.parts)
-    if "\0" in name or too_long or path.is_absolute() or ".." in path.parts:
+    path = base / name.replace("\\", "/")
+    if not is_inside(path, base):
         raise DataError(
             f"{base}: the path {name[:80]!r} is too long or leaves the folder; a file inside it is "
             "needed.",
             culprits=[name[:80]],
             next_step="Name the folder of the images with --images.",
         )
-    return base / path
+    return path

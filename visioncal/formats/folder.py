@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from visioncal.formats.format import Format
+from visioncal.formats.format import OwnFormat
 from visioncal.session import Session
 
 
@@ -14,4 +14,4 @@ def _write(session: Session, path: Path) -> None:
     session.save(path)
 
 
-FOLDER = Format("a session's folder", "", _recognises, Session.load, _write)
+FOLDER = OwnFormat("a session's folder", "", _recognises, Session.load, _write)

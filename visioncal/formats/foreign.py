@@ -18,12 +18,13 @@ class Foreign:
         robot: `base_from_flange` of each row.
         camera: `cam_from_target` of each row; None where images stand for it.
         images: (n,) the image of each row; None in a row without one, empty where there are none.
-        joints_rad: (n, j) joint angles [rad]; None where they were not recorded.
+        joints_rad: (n, j) joint angles [rad], NaN in a row without; None where they were not
+            recorded.
         stamps_s: (n,) times [s]; None where they were not recorded.
         mount: How the camera is mounted, where the source says so.
         target: The content of a target's `.toml`, where the source describes one.
         lens: The fields of `[camera]` in session.toml, where the source has intrinsics.
-        arm: The fields of `[robot]` in session.toml, where the source names one.
+        arm: The fields of `[robot]` in session.toml, where the user names one.
         views: (n,) the rows' numbers in the source; 0, 1, ... where empty.
         camera_minus_robot_s: What the camera's stamps are ahead of the robot's [s]; None where the
             source has one clock.
@@ -47,23 +48,13 @@ class Foreign:
     notes: tuple[str, ...] = ()
 
 
-def numbers_of(numbers: PoseNumbers, rows: IntArray) -> PoseNumbers:
-    """Takes some rows of poses, in the order that is given."""
-    return replace(
-        numbers,
-        positions=numbers.positions[rows],
-        rotations=numbers.rotations[rows],
-        places=tuple(numbers.places[it] for it in rows),
-    )
-
-
 def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
     """Takes some rows of a recording, in the order that is given."""
     count = len(foreign.robot)
     return replace(
         foreign,
-        robot=numbers_of(foreign.robot, rows),
-        camera=None if foreign.camera is None else numbers_of(foreign.camera, rows),
+        robot=foreign.robot.rows(rows),
+        camera=None if foreign.camera is None else foreign.camera.rows(rows),
         images=tuple(foreign.images[it] for it in rows) if foreign.images else (),
         joints_rad=None if foreign.joints_rad is None else foreign.joints_rad[rows],
         stamps_s=None if foreign.stamps_s is None else foreign.stamps_s[rows],

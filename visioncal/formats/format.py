@@ -10,7 +10,7 @@ from visioncal.session import Session
 
 
 @dataclass(frozen=True)
-class Format:
+class OwnFormat:
     """A form in which sessions are stored.
 
     Attributes:
@@ -36,7 +36,8 @@ class ForeignFormat:
         name: As the command line has it.
         words: What it is, for messages.
         recognises: Whether a path that exists looks like it; it never raises DataError.
-        read: Reads the recording at a path, with what the user says of it.
+        read: Reads the recording at a path; how its poses are written is already taken as the
+            user says, so that whoever gets them need not ask.
     """
 
     name: str

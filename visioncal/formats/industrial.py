@@ -1,5 +1,6 @@
 """ROS-Industrial: industrial_calibration, and robot_cal_tools before it."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from visioncal.formats.intrinsics import intrinsics_from
 from visioncal.formats.wishes import Wishes
 from visioncal.types import FloatArray
 
+# Others keep the pose itself there.
+_NAMED_POSE = re.compile(r"\bpose: *[\"']?[^\n\"'\[{,]+\.ya?ml\b", re.IGNORECASE)
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -25,7 +28,7 @@ def _hand_eye_file(path: Path) -> Path | None:
     for file in files:
         if file.suffix.lower() in (".yaml", ".yml"):
             words = head(file)
-            if "data:" in words and "pose:" in words and "image:" in words:
+            if "data:" in words and "image:" in words and _NAMED_POSE.search(words):
                 return file
     return None
 
@@ -68,7 +71,9 @@ def _read_hand_eye(path: Path, wishes: Wishes) -> Foreign:
     views = tuple(it for it in numbered if it is not None)
     return Foreign(
         name=file.parent.name,
-        robot=PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), tuple(places)),
+        robot=wishes.robot.applied_to(
+            PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), tuple(places))
+        ),
         images=images_named(names, file.parent, wishes.images),
         mount=None if static is None else "eye-to-hand" if static else "eye-in-hand",
         target=target,
@@ -91,7 +96,7 @@ def _lens(document: Mapping[str, Any], where: str, notes: list[str]) -> dict[str
         "The intrinsics of the source have no distortion; it is taken for zero. "
         "--intrinsics estimate leaves them out."
     )
-    return intrinsics_from(document, where)
+    return intrinsics_from(document, where)[0]
 
 
 def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | None:
@@ -105,8 +110,8 @@ def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | N
     where = "target_finder"
     return {
         "kind": "charuco",
-        "columns": _whole(finder.get("cols"), f"{where}: cols"),
-        "rows": _whole(finder.get("rows"), f"{where}: rows"),
+        "columns": _integer(finder.get("cols"), f"{where}: cols"),
+        "rows": _integer(finder.get("rows"), f"{where}: rows"),
         "square_m": number(finder.get("chessboard_dim"), f"{where}: chessboard_dim"),
         "marker_m": number(finder.get("aruco_marker_dim"), f"{where}: aruco_marker_dim"),
         "dictionary": _dictionary(finder.get("dictionary"), f"{where}: dictionary"),
@@ -118,7 +123,7 @@ def _dictionary(value: object, where: str) -> str:
     """Names OpenCV's dictionary of a number."""
     if isinstance(value, str):
         return value
-    wanted = _whole(value, where)
+    wanted = _integer(value, where)
     names = [it for it in dir(cv2.aruco) if it.startswith("DICT_")]
     found = [it for it in names if getattr(cv2.aruco, it) == wanted]
     if not found:
@@ -126,14 +131,14 @@ def _dictionary(value: object, where: str) -> str:
     return found[0]
 
 
-def _whole(value: object, where: str) -> int:
+def _integer(value: object, where: str) -> int:
     found = number(value, where)
     if found % 1:
         raise DataError(f"{where} is {found}; a whole number is needed.", culprits=[where])
     return int(found)
 
 
-def _read_kinematics(path: Path, _: Wishes) -> Foreign:
+def _read_kinematics(path: Path, wishes: Wishes) -> Foreign:
     """Reads kinematic measurements: cam_from_target with the joints of either chain."""
     file = _required(_kinematic_file(path), path, "a file with camera_joints and target_joints")
     document = mapping(read_yaml(file), str(file))
@@ -153,12 +158,12 @@ def _read_kinematics(path: Path, _: Wishes) -> Foreign:
             culprits=[str(file)],
         )
     numbers = np.array(poses)
-    count, places = len(numbers), tuple(f"{file.name}: {it}" for it in document)
-    nowhere = np.full((count, 7), np.nan)
+    places = tuple(f"{file.name}: {it}" for it in document)
+    camera = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
     return Foreign(
         name=file.stem,
-        robot=PoseNumbers(nowhere[:, :3], nowhere[:, 3:], Reading(), places),
-        camera=PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places),
+        robot=PoseNumbers.nowhere(places),
+        camera=wishes.camera.applied_to(camera),
         joints_rad=np.array(joints[moving[0]]),
         mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",
         columns={"source_row": tuple(str(it) for it in document)},

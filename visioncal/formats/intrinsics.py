@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.documents import (
     Element,
     as_numbers,
+    is_number,
     mapping,
     number,
     read_npz,
@@ -23,6 +24,7 @@ _MATRIX_KEYS: tuple[str, ...] = (
     "cameraMatrix",
     "camera_intrinsics",
     "intrinsic_matrix",
+    "IntrinsicMatrix",
     "K",
     "k",
     "mtx",
@@ -40,11 +42,13 @@ _DISTORTION_KEYS: tuple[str, ...] = (
     "D1",
 )
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
+# Pixels are square to a millionth of their size, or the model is another.
+_MOST_SKEW = 1e-6
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
 _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
 
 
-def read_intrinsics(path: Path) -> dict[str, Any]:
+def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics of a camera.
 
     Known are ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
@@ -52,7 +56,7 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     the usual names.
 
     Returns:
-        model, matrix, distortion, and resolution where the file has it.
+        model, matrix, distortion, and resolution where the file has it; and what was assumed.
 
     Raises:
         DataError: It is none of these, or a lens model that is not known here.
@@ -62,24 +66,26 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     if path.suffix.lower() == ".xml":
         root = read_xml(path)
         if root.child("camera") is not None:
-            return _visp(root, str(path))
+            return _visp(root, str(path)), ()
     return intrinsics_from(read_opencv(path), str(path))
 
 
-def intrinsics_from(content: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Takes the intrinsics out of a document.
+def intrinsics_from(
+    content: Mapping[str, Any], where: str
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Takes the intrinsics out of a document, as `read_intrinsics` does out of a file.
 
     Raises:
         DataError: There are none in it.
     """
     if "cam0" in content:
-        return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0")
+        return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0"), ()
     inner = content.get("intrinsics")
     if isinstance(inner, Mapping):
         return intrinsics_from(inner, f"{where}: intrinsics")
     if {"fx", "fy", "cx", "cy"} <= content.keys():
         values = [number(content[it], f"{where}: {it}") for it in ("fx", "fy", "cx", "cy")]
-        return _lens("brown", values, [], content, where)
+        return _lens("brown", values, [], content, where), ()
     key = next((it for it in _MATRIX_KEYS if it in content), None)
     if key is None:
         raise DataError(
@@ -87,17 +93,36 @@ def intrinsics_from(content: Mapping[str, Any], where: str) -> dict[str, Any]:
             culprits=[where],
             next_step=f"The usual names are {', '.join(_MATRIX_KEYS[:5])}, or fx, fy, cx, cy.",
         )
-    matrix = _array(content[key], f"{where}: {key}")
-    if matrix.size != 9:
-        raise DataError(
-            f"{where}: {key} has {matrix.size} numbers; a 3 x 3 matrix is needed.",
-            culprits=[where],
-        )
-    k = matrix.reshape(3, 3)
+    k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
     coefficients: object = next((content[it] for it in _DISTORTION_KEYS if it in content), [])
     flat = _array(coefficients, f"{where}: distortion").reshape(-1)
+    notes: tuple[str, ...] = ()
+    if len(flat) == 4 and "distortion_model" not in content:
+        notes = (
+            f"{where}: four distortion coefficients without a model are taken for k1, k2, p1, p2; "
+            "OpenCV's fisheye model has four as well.",
+        )
     model = _model(str(content.get("distortion_model", "plumb_bob")), where)
-    return _lens(model, [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], list(flat), content, where)
+    lens = _lens(model, [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], list(flat), content, where)
+    return lens, notes
+
+
+def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
+    """Takes nine numbers as fx, 0, cx; 0, fy, cy; 0, 0, 1: by rows or, as 0, 0, 1 shows, columns.
+
+    Open3D and MATLAB write columns.
+    """
+    k = numbers.reshape(3, 3) if numbers.size == 9 else np.zeros((3, 3))
+    last = [0.0, 0.0, 1.0]
+    k = k.T if not np.array_equal(k[2], last) and np.array_equal(k[:, 2], last) else k
+    if not np.array_equal(k[2], last) or k[1, 0] or abs(k[0, 1]) > _MOST_SKEW * abs(k[0, 0]):
+        raise DataError(
+            f"{where} is {np.array2string(numbers.reshape(-1)[:9], precision=6)}; the nine numbers "
+            "fx, 0, cx, 0, fy, cy, 0, 0, 1 are needed.",
+            culprits=[where],
+            next_step="Leave it out with --intrinsics estimate.",
+        )
+    return k
 
 
 def _array(value: object, where: str) -> FloatArray:
@@ -155,14 +180,8 @@ def _visp(root: Element, where: str) -> dict[str, Any]:
         child = element.child(tag)
         if child is None and default is not None:
             return default
-        place = f"{where}: <{tag}>"
-        try:
-            return number(float(child.text if child else "nan"), place)
-        except ValueError as error:
-            raise DataError(
-                f"{place} is {child.text[:40] if child else ''!r}; a number is needed.",
-                culprits=[place],
-            ) from error
+        place, text = f"{where}: <{tag}>", child.text if child else ""
+        return number(float(text) if is_number(text) else text, place)
 
     values = [read(model, it) for it in ("px", "py", "u0", "v0")]
     size = {"width": read(camera, "image_width", 0.0), "height": read(camera, "image_height", 0.0)}
@@ -176,6 +195,12 @@ def _lens(
     content: Mapping[str, Any],
     where: str,
 ) -> dict[str, Any]:
+    if not (matrix[0] > 0 and matrix[1] > 0):
+        raise DataError(
+            f"{where}: the focal lengths are {matrix[0]:g} and {matrix[1]:g} px; both must be "
+            "above 0.",
+            culprits=[where],
+        )
     count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
     beyond = [it for it in coefficients[count:] if it]
     values = np.array([*matrix, *coefficients])

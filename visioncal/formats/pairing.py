@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from visioncal.conventions import PoseNumbers, Reading
+from visioncal.conventions import PoseNumbers
 from visioncal.errors import DataError
 from visioncal.formats.fields import Fields, stamp_name, unnamed_columns
-from visioncal.formats.foreign import Foreign, numbers_of
-from visioncal.formats.poses import CAMERA_KEYS, ROBOT_KEYS, known_names, poses_from
+from visioncal.formats.foreign import Foreign
+from visioncal.formats.poses import CAMERA_KEYS, ROBOT_KEYS, pose_names, poses_from
 from visioncal.formats.streams import pair_streams, seconds
 from visioncal.formats.wishes import PoseWishes, Wishes
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
 
 
 def with_camera_file(robot_fields: Fields, camera_fields: Fields, wishes: Wishes) -> Foreign:
@@ -22,25 +22,27 @@ def with_camera_file(robot_fields: Fields, camera_fields: Fields, wishes: Wishes
     Raises:
         DataError: Either holds no poses, they are not as many, or their motions do not agree.
     """
-    robot, first = _poses(robot_fields, wishes.robot, "robot", ROBOT_KEYS)
+    robot, robot_names, first = _poses(robot_fields, wishes.robot, "robot", ROBOT_KEYS)
     # A file of the camera's poses alone calls them what a robot's file calls its own.
     keys = (*CAMERA_KEYS, *ROBOT_KEYS)
-    camera, second = _poses(camera_fields, wishes.camera, "camera", keys)
+    camera, camera_names, second = _poses(camera_fields, wishes.camera, "camera", keys)
     notes = (*first, *second)
-    stamps = [stamp_name(it) for it in (robot_fields, camera_fields)]
-    if not all(stamps):
+    robot_stamp = stamp_name(robot_fields, robot_names)
+    camera_stamp = stamp_name(camera_fields, camera_names)
+    if not robot_stamp or not camera_stamp:
         return _row_by_row(robot_fields, robot, camera, notes)
     robot_s, camera_s = (
         seconds(fields.column(name)[:, 0], fields.places)
-        for fields, name in zip((robot_fields, camera_fields), stamps, strict=True)
+        for fields, name in ((robot_fields, robot_stamp), (camera_fields, camera_stamp))
     )
     return _by_time(robot_fields.name, (robot_s, robot), (camera_s, camera), notes)
 
 
 def _poses(
     fields: Fields, wishes: PoseWishes, whose: str, keys: Sequence[tuple[str, ...]]
-) -> tuple[PoseNumbers, tuple[str, ...]]:
-    names = wishes.names or unnamed_columns(fields)["robot"] or known_names(fields, keys)
+) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
+    """Takes the poses of one file: (poses, the fields that hold them, what was assumed)."""
+    names = pose_names(fields, wishes.names, unnamed_columns(fields)["robot"], keys, ())
     if not names:
         raise DataError(
             f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
@@ -48,7 +50,8 @@ def _poses(
             culprits=[fields.name],
             next_step=f"Name them with --{whose}-columns.",
         )
-    return poses_from(fields, names, wishes, whose)
+    poses, notes = poses_from(fields, names, wishes, whose)
+    return poses, names, notes
 
 
 def _row_by_row(
@@ -69,34 +72,29 @@ def _by_time(
     camera: tuple[FloatArray, PoseNumbers],
     notes: tuple[str, ...],
 ) -> Foreign:
-    robot_s, robot_numbers = _whole(*robot)
-    camera_s, camera_numbers = _whole(*camera)
-    paired = pair_streams(robot_s, robot_numbers.poses(), camera_s, camera_numbers.poses())
-    rows = paired.rows
-    places = tuple(camera_numbers.places[it] for it in rows)
-    poses = paired.base_from_flange
-    count = len(rows)
+    robot_s, robot_poses, _ = _known(*robot)
+    camera_s, camera_poses, camera_rows = _known(*camera)
+    paired = pair_streams(robot_s, robot_poses, camera_s, camera_poses)
+    seen = camera[1].rows(camera_rows[paired.rows])
     return Foreign(
         name=name,
-        robot=PoseNumbers(
-            poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9), Reading("matrix"), places
-        ),
-        camera=numbers_of(camera_numbers, rows),
-        stamps_s=camera_s[rows],
+        robot=PoseNumbers.of_poses(paired.base_from_flange, seen.places),
+        camera=seen,
+        stamps_s=camera_s[paired.rows],
         camera_minus_robot_s=paired.camera_minus_robot_s,
         notes=(
             *notes,
             f"The camera's clock is {paired.camera_minus_robot_s:+.4f} s ahead of the robot's, as "
             f"both angular speeds agree there with a correlation of {paired.correlation:.2f}.",
-            f"{count} of {len(camera_s)} samples are taken, at moments when the robot turns by "
+            f"{len(seen)} of {len(camera_s)} samples are taken, at moments when the robot turns by "
             f"less than {np.rad2deg(paired.slow):.1f} deg/s; its poses are interpolated.",
         ),
     )
 
 
-def _whole(stamps_s: FloatArray, numbers: PoseNumbers) -> tuple[FloatArray, PoseNumbers]:
-    """Leaves out the samples without a pose."""
-    there = np.isfinite(numbers.positions).all(axis=1) & np.isfinite(numbers.rotations).all(axis=1)
-    if there.sum() < 3:
-        raise DataError(f"{numbers.places[0]}: {int(there.sum())} poses; 3 or more are needed.")
-    return stamps_s[there], numbers_of(numbers, np.flatnonzero(there))
+def _known(stamps_s: FloatArray, numbers: PoseNumbers) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Leaves out the samples without a pose: (times, (m, 4, 4) poses, their rows)."""
+    rows = np.flatnonzero(numbers.there)
+    if len(rows) < 3:
+        raise DataError(f"{numbers.places[0]}: {len(rows)} poses; 3 or more are needed.")
+    return stamps_s[rows], numbers.poses()[rows], rows

@@ -1,12 +1,14 @@
 """Poses, joints and images out of named fields."""
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from visioncal.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
+from visioncal.documents import as_numbers
 from visioncal.errors import DataError
 from visioncal.formats.fields import Fields
 from visioncal.formats.wishes import PoseWishes
@@ -50,10 +52,48 @@ _ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 
 
-def known_names(fields: Fields, candidates: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """Finds the first of several sets of names that are all there; empty where none is."""
-    known = {*fields.numbers, *(it.rsplit(".", 1)[-1] for it in fields.numbers)}
-    return next((it for it in candidates if known >= set(it)), ())
+def known_names(
+    fields: Fields, candidates: Sequence[tuple[str, ...]], taken: Collection[str]
+) -> tuple[str, ...]:
+    """Finds the first of several sets of names that are all there and free.
+
+    Returns:
+        The fields' full names; empty where no set is whole.
+    """
+    free = [it for it in fields.numbers if it not in taken]
+    endings = Counter(it.rsplit(".", 1)[-1] for it in free)
+    full = {end: it for it in free if endings[end := it.rsplit(".", 1)[-1]] == 1}
+    full |= {it: it for it in free}
+    return next(
+        (tuple(full[it] for it in them) for them in candidates if full.keys() >= set(them)), ()
+    )
+
+
+def pose_names(
+    fields: Fields,
+    given: Sequence[str],
+    unnamed: tuple[str, ...],
+    keys: Sequence[tuple[str, ...]],
+    taken: Collection[str],
+) -> tuple[str, ...]:
+    """Finds the fields that hold poses.
+
+    Args:
+        fields: The fields.
+        given: What the user names.
+        unnamed: What they are in a table without a header.
+        keys: What they are usually called.
+        taken: Full names of those that hold something else.
+
+    Returns:
+        Full names; empty where nothing tells.
+
+    Raises:
+        DataError: The user names what is not there.
+    """
+    if given:
+        return tuple(fields.find(it) for it in given)
+    return () if set(unnamed) & set(taken) else unnamed or known_names(fields, keys, taken)
 
 
 def poses_from(
@@ -115,6 +155,21 @@ def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> Float
     return np.deg2rad(joints) if degrees else joints
 
 
+def as_matrix(value: object, where: str) -> FloatArray:
+    """Reads the 16 numbers of a matrix: (4, 4).
+
+    Raises:
+        DataError: They are not as many, or not finite.
+    """
+    numbers = as_numbers(value, where)
+    if numbers.size != 16 or not np.isfinite(numbers).all():
+        raise DataError(
+            f"{where} has {numbers.size} numbers; the 16 finite ones of a matrix are needed.",
+            culprits=[where],
+        )
+    return numbers.reshape(4, 4)
+
+
 def matrix_numbers(matrices: FloatArray, places: Sequence[str], *, unit: str = "m") -> PoseNumbers:
     """Takes (n, 4, 4) matrices as poses."""
     flat = matrices.reshape(len(matrices), 16)
@@ -162,8 +217,14 @@ def _likely_rotation(
     if size == 9:
         return "matrix", ()
     if size == 4:
-        first = names[0].lower() if len(names) == 4 else ""
-        return f"quaternion-{'wxyz' if first.endswith('w') else 'xyzw'}", ()
+        ends = "".join(it[-1].lower() for it in names)
+        rotation = f"quaternion-{'wxyz' if ends == 'wxyz' else 'xyzw'}"
+        if wishes.form is not None or ends in ("xyzw", "wxyz"):
+            return rotation, ()
+        return rotation, (
+            f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
+            f"--{whose}-form quaternion-wxyz names the other order.",
+        )
     joined = " ".join(names).lower()
     if _ANGLES_NAME.search(joined):
         return "euler-xyz-rad", ()

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from visioncal.formats.format import Format
+from visioncal.formats.format import OwnFormat
 from visioncal.session import Session
 
 
@@ -18,4 +18,4 @@ def _write(session: Session, path: Path) -> None:
     write_recording(path, session, None, (), blueprint(session))
 
 
-RECORDING = Format("an .rrd recording", ".rrd", _recognises, Session.load, _write)
+RECORDING = OwnFormat("an .rrd recording", ".rrd", _recognises, Session.load, _write)

@@ -1,25 +1,29 @@
 """The formats that are known, and the way from one to another."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 from visioncal.errors import DataError
-from visioncal.files import did_you_mean
+from visioncal.files import check_free, did_you_mean
 from visioncal.formats.assemble import assemble, wished
 from visioncal.formats.columns import TABLE
 from visioncal.formats.finding import listed
 from visioncal.formats.folder import FOLDER
 from visioncal.formats.foreign import Foreign
-from visioncal.formats.format import ForeignFormat, Format
+from visioncal.formats.format import ForeignFormat, OwnFormat
 from visioncal.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.formats.recording import RECORDING
+from visioncal.formats.rereading import load_in_doubt, reread, reread_session
 from visioncal.formats.ros import EASY_HANDEYE, MOVEIT
 from visioncal.formats.views import VIEWS
 from visioncal.formats.visp import VISP
 from visioncal.formats.wishes import Wishes
 from visioncal.formats.zivid import ZIVID
+from visioncal.guess import Candidate
 from visioncal.session import Session
 
-FORMATS: tuple[Format, ...] = (FOLDER, RECORDING)
+OWN_FORMATS: tuple[OwnFormat, ...] = (FOLDER, RECORDING)
 
 # The first that recognises a path reads it: those that look for less come last.
 FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
@@ -33,43 +37,58 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     TABLE,
 )
 
+_NO_WISHES = Wishes()
 
-def is_session(source: Path) -> bool:
-    """Tells whether a path is a session in a form of ours, which is converted without loss."""
-    return any(it.recognises(source) for it in FORMATS)
+# Tries other readings of the poses, and settles which is right.
+Choose: TypeAlias = Callable[[Session | Foreign], Candidate]
 
 
 def convert(
     source: Path,
     dest: Path,
     *,
-    force: bool = False,
-    wishes: Wishes | None = None,
+    wishes: Wishes = _NO_WISHES,
     form: str | None = None,
+    force: bool = False,
+    choose: Choose | None = None,
 ) -> Session:
     """Writes a session, or somebody else's recording, as a session's folder or as a recording.
 
     A session goes from one form of ours to another without loss.
 
     Args:
-        source: The session, in any of `FORMATS`, or a recording in any of `FOREIGN_FORMATS`.
+        source: The session, in any of `OWN_FORMATS`, or a recording in any of `FOREIGN_FORMATS`.
         dest: Where to; its suffix says in which form, and none of theirs means a folder.
-        force: Whether a file that is there may be replaced; a folder never is.
         wishes: What is to be known of somebody else's recording beyond what it says.
         form: The name of its format, where it is not to be recognised.
+        force: Whether a file that is there may be replaced; a folder never is.
+        choose: Called, where it is in doubt how the poses are meant, with what was read; what it
+            answers is what is written.
 
     Returns:
         The session.
 
     Raises:
-        DataError: `source` is neither, `dest` is taken, cannot be written or, read again, is
-            another session.
+        DataError: `source` is neither, `wishes` are not for it, `dest` is taken, cannot be written
+            or, read again, is another session.
     """
-    check_free(source, dest, force=force)
-    if form is None and is_session(source):
-        session = next(it for it in FORMATS if it.recognises(source)).read(source)
+    _check_dest(source, dest, force=force)
+    own = next((it for it in OWN_FORMATS if form is None and it.recognises(source)), None)
+    if own is None:
+        foreign = read_foreign(source, wishes, form)
+        session = assemble(foreign if choose is None else reread(foreign, choose(foreign)))
+    elif wishes != _NO_WISHES:
+        raise DataError(
+            f"{source} is a session already; what describes poses and cameras is for somebody "
+            "else's recording.",
+            culprits=[str(source)],
+            next_step="Edit its session.toml, or convert its views.csv.",
+        )
+    elif choose is None:
+        session = own.read(source)
     else:
-        session = assemble(read_foreign(source, wishes or Wishes(), form))
+        session = load_in_doubt(source)
+        session = reread_session(session, choose(session))
     write_session(session, dest)
     return session
 
@@ -106,27 +125,12 @@ def write_session(session: Session, dest: Path) -> None:
         )
 
 
-def check_free(source: Path, dest: Path, *, force: bool) -> None:
-    """Checks that nothing is overwritten.
-
-    Raises:
-        DataError: `dest` is there, and is no file that may be replaced.
-    """
-    form = _format_for(dest)
+def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
+    is_folder = not _format_for(dest).suffix
     # An empty folder is free for a session's folder, which looks for itself.
-    if not dest.exists() or (dest.is_dir() and not form.suffix):
-        return
-    same = source.exists() and dest.samefile(source)
-    replaceable = dest.is_file() and bool(form.suffix) and not same
-    if replaceable and force:
-        return
-    raise DataError(
-        f"{dest} exists, and nothing is overwritten.",
-        culprits=[str(dest)],
-        next_step="Choose another name, or replace the file with --force."
-        if replaceable
-        else "Choose another name.",
-    )
+    if not (is_folder and dest.is_dir()):
+        same = source.exists() and dest.exists() and dest.samefile(source)
+        check_free(dest, force=force, replaceable=not is_folder and not same)
 
 
 def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
@@ -146,7 +150,7 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     for known in FOREIGN_FORMATS:
         if known.name == form or (form is None and known.recognises(source)):
             return known
-    words = "; ".join([it.words for it in FORMATS] + [it.words for it in FOREIGN_FORMATS])
+    words = "; ".join([it.words for it in OWN_FORMATS] + [it.words for it in FOREIGN_FORMATS])
     inside = ", ".join(it.name for it in listed(source)[:8]) if source.is_dir() else ""
     raise DataError(
         f"{source} is no session and in no format that is known: {words}."
@@ -156,6 +160,6 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     )
 
 
-def _format_for(dest: Path) -> Format:
-    by_suffix = {it.suffix: it for it in FORMATS}
+def _format_for(dest: Path) -> OwnFormat:
+    by_suffix = {it.suffix: it for it in OWN_FORMATS}
     return by_suffix.get(dest.suffix.lower(), FOLDER)

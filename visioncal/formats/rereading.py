@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.conventions import PoseNumbers, Reading
+from visioncal.conventions import PoseNumbers
+from visioncal.errors import DataError
 from visioncal.files import parse_toml, read_text
 from visioncal.formats.assemble import assemble, pose_cells, spoken
 from visioncal.formats.foreign import Foreign
 from visioncal.guess import Candidate, Guess, guess_reading
-from visioncal.pipeline.guessing import chain_poses, numbers_in, seen_poses
+from visioncal.pipeline.guessing import chain_poses, numbers_in, seen_poses, told_or_chained
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
 from visioncal.targets import LARGEST_M
-from visioncal.types import FloatArray, IntArray, Mount, Progress
+from visioncal.types import MOUNTS, FloatArray, IntArray, Progress
 
-_MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 # Distances between consecutive rows of one log go up and down together.
 _FEWEST_STEPS, _SAME_LOG = 4, 0.9
 # No printed square is larger.
@@ -27,46 +27,52 @@ _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
 def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Guess:
-    """Tries every plausible reading of somebody else's poses.
-
-    Where the mount is not known, it is the one under which the fewest things are otherwise than
-    declared: a chain with the camera's poses inverted closes as well under the other.
+    """Tries every plausible reading of somebody else's poses, and both mounts where none is known.
 
     Raises:
-        DataError: There is nothing to read, or the target is in no view.
+        DataError: There is nothing to read, the target is in no view, or nothing tells the mount.
         DegenerateError: Too few views have both poses.
         ConvergenceError: The intrinsics do not come to rest.
     """
     foreign = spoken(foreign)
-    session = assemble(foreign, mount=_MOUNTS[0])
+    # The mount has no part in what is taken from the session here.
+    session = assemble(foreign, mount=MOUNTS[0])
     chain = chain_poses(session)
-    is_measured = foreign.camera is None
     camera = foreign.camera
     if camera is None:
         camera = seen_poses(session, progress=progress)
-    robot = foreign.robot if _is_told(foreign) or chain is None else _of_chain(foreign, chain)
-    guesses = [
-        guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
-        for mount in ((foreign.mount,) if foreign.mount else _MOUNTS)
-    ]
-    return min(guesses, key=lambda it: it.candidates[0].changes)
+    return guess_reading(
+        told_or_chained(foreign.robot, chain),
+        camera,
+        foreign.mount,
+        chain=chain,
+        is_measured=foreign.camera is None,
+    )
 
 
 def reread(foreign: Foreign, candidate: Candidate) -> Foreign:
-    """Reads a recording as a candidate has it: poses, pairing, mount and the size of the board."""
-    foreign, notes = spoken(foreign), _note(candidate)
+    """Reads a recording as a candidate has it: poses, pairing, mount and the size of the board.
+
+    Raises:
+        DataError: It reads the robot's poses otherwise, and there are joint angles in their place.
+    """
+    foreign, notes, taken = spoken(foreign), _note(candidate), candidate.hypothesis
     if foreign.mount is None:
-        notes = (
-            *notes,
-            f"The mount is taken for {candidate.mount}, under which the fewest things are "
-            "otherwise than declared; --mount says another.",
-        )
+        notes = (*notes, f"The mount is taken for {taken.mount}.")
+    robot, camera, joints = foreign.robot, foreign.camera, foreign.joints_rad
+    _check_applies(candidate, robot)
+    if joints is not None:
+        chain = chain_poses(assemble(foreign, mount=taken.mount))
+        if _go_together(chain, robot):
+            order = taken.rows(len(joints))
+            joints = np.where((order >= 0)[:, None], joints[order], np.nan)
     target = foreign.target
     return replace(
         foreign,
-        robot=candidate.robot_numbers(foreign.robot) if _is_told(foreign) else foreign.robot,
-        camera=None if foreign.camera is None else candidate.camera_numbers(foreign.camera),
-        mount=candidate.mount,
+        robot=taken.robot_numbers(robot) if robot.there.any() else robot,
+        camera=None if camera is None else taken.camera_numbers(camera),
+        joints_rad=joints,
+        mount=taken.mount,
         target=None if target is None else _scaled(target, candidate.board_scale),
         notes=(*foreign.notes, *notes),
     )
@@ -95,18 +101,20 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
     """Reads a session's poses as a candidate has it; everything else stays as it is.
 
     Raises:
-        DataError: The session that comes out is wrong.
+        DataError: The session that comes out is wrong; or as `reread`.
     """
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     robot, camera = numbers_in(session, POSE), numbers_in(session, MEASURED_CAM_POSE)
-    if _any(robot):
-        if _go_together(session, robot):
-            _reorder(cells, candidate.hypothesis.rows(len(cells)), joint_columns(session.columns))
-        _replace(cells, pose_cells(candidate.robot_numbers(robot), POSE), POSE)
-    if _any(camera):
-        corrected = candidate.camera_numbers(camera)
-        _replace(cells, pose_cells(corrected, MEASURED_CAM_POSE), MEASURED_CAM_POSE)
-    document = {**session.document, "mount": candidate.mount}
+    taken = candidate.hypothesis
+    _check_applies(candidate, robot)
+    if _go_together(chain_poses(session), robot):
+        _reorder(cells, taken.rows(len(cells)), joint_columns(session.columns))
+    if robot.there.any():
+        _replace(cells, pose_cells(taken.robot_numbers(robot), POSE), POSE)
+    if camera.there.any():
+        corrected = pose_cells(taken.camera_numbers(camera), MEASURED_CAM_POSE)
+        _replace(cells, corrected, MEASURED_CAM_POSE)
+    document = {**session.document, "mount": taken.mount}
     target = session.target_document
     if target is not None and candidate.board_scale != 1.0:
         target = _scaled(target, candidate.board_scale)
@@ -129,27 +137,23 @@ def _note(candidate: Candidate) -> tuple[str, ...]:
     return (f"The poses are read otherwise than declared: {candidate.words}.",)
 
 
-def _is_told(foreign: Foreign) -> bool:
-    """Whether the source has poses of the robot, not joints alone."""
-    return bool(np.isfinite(foreign.robot.positions).any())
+def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
+    """Joint angles can change rows with their views, and nothing else."""
+    if not robot.there.any() and candidate.hypothesis.robot != candidate.declared.robot:
+        raise DataError(
+            f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
+            "alone, of which that cannot be said.",
+            culprits=[candidate.words],
+            next_step="Check the robot's model, its tip, and the camera's poses.",
+        )
 
 
-def _of_chain(foreign: Foreign, chain: FloatArray) -> PoseNumbers:
-    rotations = chain[:, :3, :3].reshape(-1, 9)
-    return PoseNumbers(chain[:, :3, 3], rotations, Reading("matrix"), foreign.robot.places)
-
-
-def _any(numbers: PoseNumbers) -> bool:
-    return bool(np.isfinite(numbers.positions).any())
-
-
-def _go_together(session: Session, robot: PoseNumbers) -> bool:
+def _go_together(chain: FloatArray | None, robot: PoseNumbers) -> bool:
     """Whether each row's joint angles are of its pose: they then change rows with it.
 
     Without a model of the robot nobody can tell, and one log is the likelier.
     """
-    chain = chain_poses(session)
-    if chain is None:
+    if chain is None or not robot.there.any():
         return True
     # Other units or frames move all rows alike: what differs from row to row tells.
     steps = [

@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.conventions import PoseNumbers, Reading
-from visioncal.documents import as_numbers, mapping, number, read_json, read_yaml
+from visioncal.documents import mapping, number, read_json, read_yaml
 from visioncal.errors import DataError
 from visioncal.formats.finding import head
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
-from visioncal.formats.poses import matrix_numbers
+from visioncal.formats.poses import as_matrix, matrix_numbers
 from visioncal.formats.wishes import Wishes
-from visioncal.types import FloatArray
 
 
 def _is_easy_handeye(path: Path) -> bool:
@@ -40,15 +39,16 @@ def _read_easy_handeye(path: Path, wishes: Wishes) -> Foreign:
         camera.append(_transform(entry.get("tracking", entry.get("optical")), f"{where}: tracking"))
         places.append(where)
     inverse = wishes.mount == "eye-to-hand"
+    poses = wishes.robot.applied_to(_numbers(robot, places, inverse=inverse))
     note = (
         "inverted, as easy_handeye2 stores them with the camera on the base"
-        if inverse
-        else ("as they stand, as with the camera in the hand")
+        if poses.reading.inverse
+        else "as they stand, as with the camera in the hand"
     )
     return Foreign(
         name=path.stem,
-        robot=_numbers(robot, places, inverse=inverse),
-        camera=_numbers(camera, places, inverse=False),
+        robot=poses,
+        camera=wishes.camera.applied_to(_numbers(camera, places, inverse=False)),
         notes=(f"The robot's poses are read {note}.",),
     )
 
@@ -77,7 +77,7 @@ def _is_moveit(path: Path) -> bool:
     return named or nested
 
 
-def _read_moveit(path: Path, _: Wishes) -> Foreign:
+def _read_moveit(path: Path, wishes: Wishes) -> Foreign:
     """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices.
 
     Either a list of mappings, as its panel saves them, or of pairs, as its tests keep them.
@@ -91,24 +91,14 @@ def _read_moveit(path: Path, _: Wishes) -> Foreign:
         else:
             entry = mapping(sample, where)
             first, second = entry.get("effector_wrt_world"), entry.get("object_wrt_sensor")
-        robot.append(_matrix(first, f"{where}: effector_wrt_world"))
-        camera.append(_matrix(second, f"{where}: object_wrt_sensor"))
+        robot.append(as_matrix(first, f"{where}: effector_wrt_world"))
+        camera.append(as_matrix(second, f"{where}: object_wrt_sensor"))
         places.append(where)
     return Foreign(
         name=path.stem,
-        robot=matrix_numbers(np.array(robot), places),
-        camera=matrix_numbers(np.array(camera), places),
+        robot=wishes.robot.applied_to(matrix_numbers(np.array(robot), places)),
+        camera=wishes.camera.applied_to(matrix_numbers(np.array(camera), places)),
     )
-
-
-def _matrix(value: object, where: str) -> FloatArray:
-    numbers = as_numbers(value, where)
-    if numbers.size != 16 or not np.isfinite(numbers).all():
-        raise DataError(
-            f"{where} has {numbers.size} numbers; 16 finite ones of a matrix are needed.",
-            culprits=[where],
-        )
-    return numbers.reshape(4, 4)
 
 
 def _rows(value: object, where: str) -> list[object]:

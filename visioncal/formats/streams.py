@@ -98,9 +98,11 @@ def pair_streams(
     there = _covered(robot_s, at_s)
     if there.sum() < 3:
         raise DataError(
-            f"The robot's stream covers {int(there.sum())} samples of the camera's; 3 or more are "
-            "needed.",
+            f"The robot's poses cover {int(there.sum())} samples of the camera's; 3 or more are "
+            f"needed. They are {np.median(np.diff(robot_s)):.2f} s apart; where the gap is "
+            f"{_GAP_S} s or more, nothing is interpolated.",
             culprits=["robot", "camera"],
+            next_step="Log the robot's pose ten times a second or more.",
         )
     poses = _interpolated(robot_s, robot, at_s[there])
     angular, linear = _speeds(robot_s, robot, at_s[there])
@@ -153,11 +155,16 @@ def _clock_offset(
             culprits=["robot", "camera"],
             next_step="Check that both streams are of the same motion.",
         )
-    fine = 0.0
-    if 0 < best < len(lags) - 1:
-        left, middle, right = scores[best - 1 : best + 2]
-        curvature = left - 2 * middle + right
-        fine = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
+    if not 0 < best < len(lags) - 1:
+        raise DataError(
+            f"The turning of robot and camera agrees best {lags[best] * _STEP_S:+.2f} s apart, "
+            f"where the search ends: offsets within {widest_s:.2f} s are tried.",
+            culprits=["robot", "camera"],
+            next_step="Stamp both with clocks that differ by less, or record for longer.",
+        )
+    left, middle, right = scores[best - 1 : best + 2]
+    curvature = left - 2 * middle + right
+    fine = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
     return float((lags[best] + fine) * _STEP_S), float(scores[best])
 
 

@@ -9,7 +9,7 @@ from visioncal.documents import is_number, read_npy, read_npz, read_table
 from visioncal.errors import DataError
 from visioncal.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
 from visioncal.formats.fields import fields_of_records, flattened
-from visioncal.formats.finding import listed, number_in
+from visioncal.formats.finding import is_inside, listed, number_in
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
 from visioncal.formats.wishes import Wishes
@@ -41,7 +41,9 @@ def _view_folder(path: Path) -> Path | None:
     """The folder with a file a view: the one named, or `poses` in it."""
     if not path.is_dir():
         return None
-    return next((it for it in (path, path / "poses") if _families(it)), None)
+    inner = path / "poses"
+    folders = (path, inner) if is_inside(inner, path) else (path,)
+    return next((it for it in folders if _families(it)), None)
 
 
 def _read_views(path: Path, wishes: Wishes) -> Foreign:

@@ -10,16 +10,15 @@ from visioncal.conventions import PoseNumbers, Reading
 from visioncal.documents import as_numbers, mapping, read_yaml
 from visioncal.documents.bounds import read_plain_text
 from visioncal.errors import DataError
-from visioncal.formats.finding import IMAGE_ENDINGS, images_of, listed, number_in
+from visioncal.formats.finding import images_beside, listed, number_in
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
 from visioncal.formats.intrinsics import read_intrinsics
 from visioncal.formats.wishes import Wishes
-from visioncal.types import Mount
+from visioncal.types import MOUNTS, Mount
 
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame.
 _POSE_NAME = re.compile(r".*pose_[a-z]Pe_[0-9]+\.ya?ml", re.IGNORECASE)
-_MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 
 
 def _pose_files(path: Path) -> tuple[Path, ...]:
@@ -38,16 +37,14 @@ def _read(path: Path, wishes: Wishes) -> Foreign:
     views = tuple(number_in(it.name) or 0 for it in files)
     places = tuple(it.name for it in files)
     notes: list[str] = []
-    images: tuple[Path | None, ...] = ()
-    if wishes.images is not None or any(it.suffix.lower() in IMAGE_ENDINGS for it in listed(path)):
-        images = images_of(wishes.images or path, views, places, numbered=True)
+    robot = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
     return Foreign(
         name=path.resolve().name,
-        robot=PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places),
-        images=images,
+        robot=wishes.robot.applied_to(robot),
+        images=images_beside(path, wishes.images, views, places, numbered=True),
         mount=_mount(path, notes),
         target=_target(path, notes),
-        lens=_lens(path),
+        lens=_lens(path, notes),
         views=views,
         notes=tuple(notes),
     )
@@ -66,15 +63,19 @@ def _pose(path: Path) -> list[float]:
 
 def _mount(path: Path, notes: list[str]) -> Mount | None:
     name = path.resolve().name
-    found = next((it for it in _MOUNTS if it in name), None)
+    found = next((it for it in MOUNTS if it in name), None)
     if found is not None:
         notes.append(f"The mount is taken from the folder's name: {found}.")
     return found
 
 
-def _lens(path: Path) -> dict[str, Any] | None:
+def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
     cameras = [it for it in listed(path) if it.suffix.lower() == ".xml"]
-    return read_intrinsics(cameras[0]) if cameras else None
+    if not cameras:
+        return None
+    lens, more = read_intrinsics(cameras[0])
+    notes.extend(more)
+    return lens
 
 
 def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
@@ -83,7 +84,7 @@ def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
         if not file.name.endswith("-data.txt"):
             continue
         text = read_plain_text(file)
-        size = re.search(r"size:\s*([0-9.]{1,12})\s*m\b", text)
+        size = re.search(r"size:\s*([0-9]{1,6}(?:\.[0-9]{1,9})?)\s*m\b", text)
         board = re.search(r"([0-9]{1,3})\s*x\s*([0-9]{1,3})", text)
         family = re.search(r"(16h5|25h9|36h10|36h11)", text)
         if size and board and "chess" in text.lower():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from visioncal.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.errors import DataError
-from visioncal.files import did_you_mean
+from visioncal.files import did_you_mean, some_of
 from visioncal.types import Mount
 
 
@@ -54,12 +54,10 @@ class PoseWishes:
 
 def _check(what: str, name: str, known: Sequence[str]) -> None:
     if name not in known:
-        hint = did_you_mean(name, known)
-        names = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
         raise DataError(
-            f"There is no {what} named {name!r}; the names are {names}.",
+            f"There is no {what} named {name!r}; the names are {some_of(known, 20)}.",
             culprits=[name],
-            next_step=hint,
+            next_step=did_you_mean(name, known),
         )
 
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.documents import as_numbers, mapping, read_yaml
+from visioncal.documents import mapping, read_yaml
 from visioncal.errors import DataError
-from visioncal.formats.finding import IMAGE_ENDINGS, head, images_of, listed, number_in
+from visioncal.formats.finding import head, images_beside, listed, number_in
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
-from visioncal.formats.poses import matrix_numbers
+from visioncal.formats.poses import as_matrix, matrix_numbers
 from visioncal.formats.wishes import Wishes
 from visioncal.types import FloatArray
 
@@ -33,13 +33,10 @@ def _read(path: Path, wishes: Wishes) -> Foreign:
     numbers = [number_in(it.name) for it in files]
     views = tuple(it for it in numbers if it is not None)
     places = tuple(it.name for it in files)
-    images: tuple[Path | None, ...] = ()
-    if wishes.images is not None or any(it.suffix.lower() in IMAGE_ENDINGS for it in listed(path)):
-        images = images_of(wishes.images or path, views, places, numbered=True)
     return Foreign(
         name=path.resolve().name,
-        robot=matrix_numbers(matrices, places, unit="mm"),
-        images=images,
+        robot=wishes.robot.applied_to(matrix_numbers(matrices, places, unit="mm")),
+        images=images_beside(path, wishes.images, views, places, numbered=True),
         views=views,
     )
 
@@ -49,13 +46,7 @@ def _matrix(path: Path) -> FloatArray:
     value = content.get("PoseState")
     if value is None:
         value = mapping(content.get("FloatMatrix"), f"{path}: FloatMatrix").get("Data")
-    matrix = as_numbers(value, f"{path}: Data")
-    if matrix.size != 16 or not np.isfinite(matrix).all():
-        raise DataError(
-            f"{path} has {matrix.size} numbers; the 16 of a matrix are needed.",
-            culprits=[str(path)],
-        )
-    return matrix.reshape(4, 4)
+    return as_matrix(value, f"{path}: Data")
 
 
 ZIVID = ForeignFormat(

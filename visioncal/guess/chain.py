@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.conventions import PoseNumbers
 from visioncal.guess.fit import Fit, robust_fit
-from visioncal.guess.hypothesis import Hypothesis
+from visioncal.guess.hypothesis import HALF_TURN, Hypothesis
 from visioncal.transforms import invert, pose_difference
 from visioncal.types import FloatArray
 
@@ -64,5 +64,5 @@ def is_half_turned(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray
     fit = chain_fit(hypothesis, robot, chain)
     if fit is None or fit.score > _AGREES:
         return False
-    away_mm, away_deg = pose_difference(np.diag([-1.0, -1.0, 1.0, 1.0]), fit.x)
+    away_mm, away_deg = pose_difference(HALF_TURN, fit.x)
     return away_mm < _NEAR_MM and away_deg < _NEAR_DEG

@@ -1,7 +1,7 @@
-"""Whether a reading stands out, and in which words."""
+"""Whether a reading stands out, and under which mount."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,16 +9,22 @@ from visioncal.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.guess.chain import by_chain, is_half_turned
-from visioncal.guess.given import CLOSES, FEWEST_ROWS, FLOOR, Recording, Scored, is_plausible
+from visioncal.guess.given import (
+    CLOSING_SCORE,
+    FEWEST_ROWS,
+    SCORE_FLOOR,
+    STANDS_OUT,
+    Recording,
+    Scored,
+    is_likely_unit,
+)
+from visioncal.guess.likeness import flange_and_cell_m, is_far_likelier, likeness
 from visioncal.guess.result import Candidate, Guess
 from visioncal.guess.search import search
 from visioncal.guess.swaps import exchanged
-from visioncal.types import FloatArray, Mount
+from visioncal.guess.words import notes, sentence
+from visioncal.types import MOUNTS, FloatArray, Mount
 
-# How many times better than the declared reading another has to close the chain. Where views turn
-# about two axes a sound reading is beaten by none, and a wrong one by ten times and more: see
-# tests/benchmarks/guess.py.
-_STANDS_OUT = 3.0
 # Readings this near to the best are as good; of them, the one with the fewest changes is meant.
 _ALIKE = 2.0
 # A rival as simple as the best leaves the matter open while it is this near.
@@ -28,13 +34,21 @@ _AGREES = 5.0
 # Turns about a second axis that are smaller, than the largest or at all, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 _LISTED = 12
-_LONG_MM, _WHOLE = 1000.0, 99.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the search finds under one mount: the declared reading first, and the best."""
+
+    recording: Recording
+    scored: tuple[Scored, ...]
+    best: Scored
 
 
 def guess_reading(
     robot: PoseNumbers,
     camera: PoseNumbers,
-    mount: Mount,
+    mount: Mount | None,
     *,
     chain: FloatArray | None = None,
     is_measured: bool = False,
@@ -44,7 +58,8 @@ def guess_reading(
     Args:
         robot: `base_from_flange` of n rows, with the reading that is declared.
         camera: `cam_from_target` of the same rows, likewise; NaN where the target was not seen.
-        mount: The declared mount.
+        mount: The declared mount; None where it is not known: it then is the one of the likelier
+            cell.
         chain: (n, 4, 4) `base_from_flange` through a robot's model at the recorded joints, NaN in
             rows without; it tells what no camera can.
         is_measured: Whether the camera's poses were measured from images by visioncal, so that
@@ -54,25 +69,79 @@ def guess_reading(
         The readings, and whether one stands out.
 
     Raises:
-        DataError: The rows do not match, or a rotation has not as many numbers as its form.
+        DataError: The rows do not match, a rotation has not as many numbers as its form, or
+            nothing tells which mount it is.
         DegenerateError: Too few rows have both poses.
     """
-    recording = Recording(robot, camera, mount, is_measured)
-    _check(recording)
+    mounts = MOUNTS if mount is None else (mount,)
+    recordings = [Recording(robot, camera, it, is_measured) for it in mounts]
+    _check(recordings[0])
     with one_blas_thread():
-        scored = search(recording)
-        if chain is not None:
-            scored = [_by_chain(it, recording, chain) for it in scored]
-        best = _decided(recording, scored)
-        swapped = exchanged(recording, best, is_poor=_is_poor(recording, best))
-        if swapped is not None:
-            best, scored = swapped, [*scored, swapped]
-        if chain is not None and is_half_turned(best.hypothesis, robot, chain):
-            taken = replace(best.hypothesis.robot, half_turned=True)
-            turned = replace(best.hypothesis, robot=taken)
-            best = replace(best, hypothesis=turned, labels=())
-            scored = [*scored, best]
-    return _guess(recording, scored, best, chain)
+        found = [_found(it, chain) for it in recordings]
+        if mount is not None:
+            return _guess(found[0], chain)
+        chosen = _of_likelier_mount(found[0], found[1], chain)
+        return _guess(chosen, chain, _mount_note(chosen))
+
+
+def _found(recording: Recording, chain: FloatArray | None) -> _Found:
+    declared, *others = search(recording)
+    if chain is not None:
+        others = [_by_chain(it, recording, chain) for it in others]
+    scored = [declared, *others]
+    best = _decided(recording, scored)
+    swapped = exchanged(recording, best, is_poor=_is_poor(recording, best))
+    if swapped is not None:
+        best = swapped
+        scored.append(best)
+    if chain is not None and is_half_turned(best.hypothesis, recording.robot, chain):
+        taken = replace(best.hypothesis.robot, half_turned=True)
+        turned = replace(best.hypothesis, robot=taken)
+        best = replace(best, hypothesis=turned, labels=())
+        scored.append(best)
+    return _Found(recording, tuple(scored), best)
+
+
+def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) -> _Found:
+    """Chooses the mount: by residuals, by the joints, by what cells look like, by the changes.
+
+    An inverse of the poses closes the chain under the wrong mount as poses as they are do under
+    the right one, so that the number of changes alone says nothing.
+    """
+    better, worse = sorted((first, second), key=lambda it: it.best.score)
+    if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
+        return better
+    both = {it.best.hypothesis: it for it in (first, second)}
+    by_joints = None if chain is None else by_chain(tuple(both), first.recording.robot, chain)
+    if by_joints is not None:
+        return both[by_joints]
+    other, likelier = sorted(
+        (first, second),
+        key=lambda it: (likeness(it.recording, it.best), -it.recording.cost(it.best.hypothesis)),
+    )
+    is_same = other.best.hypothesis.mount == likelier.best.hypothesis.mount
+    is_clear = is_far_likelier(likelier.recording, likelier.best, other.best)
+    if is_same or (is_clear and not _is_poor(likelier.recording, likelier.best)):
+        return likelier
+    readings = " and ".join(
+        f"{it.best.hypothesis.mount} ({_candidate(it.recording, it.best).words})"
+        for it in (first, second)
+    )
+    raise DataError(
+        f"The mount is not given, and the poses fit both ways of mounting: {readings}.",
+        next_step="Say where the camera is with --mount.",
+    )
+
+
+def _mount_note(chosen: _Found) -> str:
+    if chosen.best.score > CLOSING_SCORE:
+        return ""
+    on_flange_m, at_base_m = flange_and_cell_m(chosen.best)
+    return (
+        f"The mount was not given and is taken for {chosen.best.hypothesis.mount}: what sits on "
+        f"the flange then is {1e3 * on_flange_m:.0f} mm from it, and what stands at the base "
+        f"{1e3 * at_base_m:.0f} mm. --mount says another."
+    )
 
 
 def _check(recording: Recording) -> None:
@@ -118,34 +187,35 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
     alike = [it for it in others if it.score <= _ALIKE * least]
     alike.sort(key=lambda it: (it.cost, it.score))
     best, rivals = alike[0], alike[1:]
-    if best.score > CLOSES:
+    if best.score > CLOSING_SCORE:
         return declared
     # Declared in units in which no camera could see the target, the chain may close as well.
-    if is_plausible(recording, declared.hypothesis) and declared.score <= _STANDS_OUT * best.score:
+    is_likely = is_likely_unit(recording, declared.hypothesis.camera.unit)
+    if is_likely and declared.score <= STANDS_OUT * best.score:
         return declared
     is_open = any(it.cost == best.cost and it.score < _RIVALS * best.score for it in rivals)
     return declared if is_open or _is_poor(recording, best) else best
 
 
-def _guess(
-    recording: Recording,
-    scored: Sequence[Scored],
-    best: Scored,
-    chain: FloatArray | None,
-) -> Guess:
-    candidates = {id(it): _candidate(recording, it) for it in scored}
-    declared, chosen = candidates[id(scored[0])], candidates[id(best)]
+def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Guess:
+    recording, best = found.recording, found.best
+    candidates = {id(it): _candidate(recording, it) for it in found.scored}
+    declared, chosen = candidates[id(found.scored[0])], candidates[id(best)]
     ranked = sorted(candidates.values(), key=lambda it: (it is not chosen, it.score))[:_LISTED]
     if declared not in ranked:
         ranked[-1] = declared
     is_poor = _is_poor(recording, best)
+    is_other = chosen is not declared
+    told = notes(
+        recording, best, has_chain=chain is not None, is_declared=not is_other, is_poor=is_poor
+    )
     return Guess(
         declared,
         tuple(ranked),
         chosen,
-        chosen is not declared,
-        _sentence(declared, chosen, ranked, is_poor=is_poor),
-        tuple(_notes(recording, best, chain)),
+        is_other,
+        sentence(declared, chosen, ranked, is_poor=is_poor),
+        ((mount_note,) if mount_note else ()) + tuple(told),
     )
 
 
@@ -159,86 +229,16 @@ def _candidate(recording: Recording, scored: Scored) -> Candidate:
         rms_mm=1e3 * shift,
         rms_deg=float(np.rad2deg(angle)),
         score=scored.score,
-        agreeing=int((fit.away <= _AGREES * max(fit.score, FLOOR)).sum()),
+        agreeing=int((fit.away <= _AGREES * max(fit.score, SCORE_FLOOR)).sum()),
         rows=len(fit.away),
         is_board=recording.is_measured,
     )
 
 
-def _sentence(
-    declared: Candidate, best: Candidate, ranked: Sequence[Candidate], *, is_poor: bool
-) -> str:
-    if best is not declared:
-        return _found(declared, best)
-    rivals = [it for it in ranked if it is not declared]
-    others = f"the next, {rivals[0].words}, to {_figures(rivals[0])}" if rivals else ""
-    if is_poor:
-        return (
-            "The motion cannot tell readings apart: all views turn about one axis at most. As "
-            f"declared, the chain closes to {_figures(declared)}{others and f'; {others}'}. Add "
-            "views tilted about different axes."
-        )
-    if not declared.closes or any(_is_far_better(it, declared) for it in rivals):
-        return (
-            "No reading that was tried stands out: as declared, the chain closes to "
-            f"{_figures(declared)}{others and f'; {others}'}."
-        )
-    return (
-        f"The poses fit as declared: the chain closes to {_figures(declared)}; "
-        f"{others or 'no other reading comes near'}."
-    )
-
-
-def _is_far_better(it: Candidate, declared: Candidate) -> bool:
-    return _STANDS_OUT * it.score < declared.score
-
-
-def _found(declared: Candidate, best: Candidate) -> str:
-    closes = f"With {best.words}, the chain closes to {_figures(best)}"
-    if best.hypothesis.robot.half_turned:
-        return (
-            f"{closes}, and the poses are those of the joint angles; as declared, the chain closes "
-            f"to {_figures(declared)}."
-        )
-    if best.hypothesis.swap and best.changes == 1:
-        return f"{closes}; as declared, {declared.agreeing} of {declared.rows} views agree."
-    return f"{closes} instead of {_figures(declared)}."
-
-
-def _figures(it: Candidate) -> str:
-    views = "" if it.agreeing == it.rows else f" in {it.agreeing} of {it.rows} views"
-    is_long = it.rms_mm > _LONG_MM
-    length = f"{_short(1e-3 * it.rms_mm)} m" if is_long else f"{_short(it.rms_mm)} mm"
-    return f"{length} and {_short(it.rms_deg)} deg{views}"
-
-
-def _short(value: float) -> str:
-    """Two digits; whole numbers from a hundred on."""
-    return f"{value:.0f}" if value > _WHOLE else f"{value:.2g}"
-
-
-def _notes(recording: Recording, best: Scored, chain: FloatArray | None) -> Iterator[str]:
-    others = [it for it in best.labels if it != best.hypothesis]
-    if others:
-        also = " or with ".join("; ".join(recording.changes(it)) for it in others)
-        yield (
-            f"The views close the chain in the same way with {also}. It was chosen by what lies "
-            "nearer to the flange, or by the joints."
-        )
-    if best.hypothesis.robot.signs == "mirror":
-        yield (
-            "Which axis is mirrored cannot be told from the views: another one turns the base and "
-            "the flange by half a turn. y was taken."
-        )
-    if chain is None:
-        yield (
-            "A base turned about its z (base_link for base) does not show without joint angles "
-            "and the robot's model."
-        )
-
-
 def _is_poor(recording: Recording, best: Scored) -> bool:
     """Whether the views turn about one axis at most, by the camera's account."""
+    if not best.is_readable:
+        return False
     _, camera = best.hypothesis.chain(recording.robot, recording.camera)
     rotations = camera[best.rows[best.fit.kept], :3, :3]
     # Turning about one axis leaves what lies along it in place: the last value vanishes.

@@ -102,14 +102,13 @@ def _read(numbers: PoseNumbers, turns: Sequence[Turns]) -> Forms:
     one_of_each = {it.written: it for it in turns}
     written = {name: it.numbers(numbers) for name, it in one_of_each.items()}
     pairs = [(it, ROTATION_FORMS[it.form].read(written[it.written]).copy()) for it in turns]
-    given = np.isfinite(np.hstack([numbers.positions, numbers.rotations])).all(axis=1)
     for _, rotations in pairs:
-        rotations[~given] = np.nan
+        rotations[~numbers.there] = np.nan
     # The declared way stays first even where it is unreadable; nothing of it will fit.
     whole = [
         (it, rotations)
         for at, (it, rotations) in enumerate(pairs)
-        if at == 0 or np.isfinite(rotations[given]).all()
+        if at == 0 or np.isfinite(rotations[numbers.there]).all()
     ]
     return Forms(tuple(it for it, _ in whole), np.array([rotations for _, rotations in whole]))
 

@@ -1,6 +1,6 @@
 """What the search is given, and how it keeps what it finds."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,10 +13,14 @@ from visioncal.types import IntArray, Mount
 FEWEST_ROWS = 4
 # Scores under this [rad, or share of the distance] are as good as each other: a tenth of a
 # millimetre at one metre.
-FLOOR = 1e-4
+SCORE_FLOOR = 1e-4
 # A chain that closes to this share of the distance, or angle [rad], is closed by the right reading:
 # poses with 10 mm and 1 degree of noise leave less, wrong readings ten times more.
-CLOSES = 0.05
+CLOSING_SCORE = 0.05
+# How many times better than the declared reading another has to close the chain. Where views turn
+# about two axes a sound reading is beaten by none, and a wrong one by ten times and more: see
+# tests/benchmarks/guess.py.
+STANDS_OUT = 3.0
 # Cameras look at boards from here [m].
 _SEEN_FROM_M = (0.02, 30.0)
 
@@ -57,14 +61,13 @@ class Recording:
         strange = sum(strangeness(a.turns) for a, b in sides if a.turns != b.turns)
         return len(self.changes(tried)) + strange
 
+    def part(self, rows: IntArray) -> "Recording":
+        """The same of some rows alone."""
+        return replace(self, robot=self.robot.rows(rows), camera=self.camera.rows(rows))
+
     def common_rows(self) -> IntArray:
         """The rows in which both sides have numbers."""
-        sides = (self.robot, self.camera)
-        whole = [
-            np.isfinite(it.positions).all(axis=1) & np.isfinite(it.rotations).all(axis=1)
-            for it in sides
-        ]
-        return np.flatnonzero(whole[0] & whole[1])
+        return np.flatnonzero(self.robot.there & self.camera.there)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +78,8 @@ class Scored:
         hypothesis: The reading.
         fit: Its fit.
         rows: The camera's rows in the fit.
-        labels: Readings that are as simple and close the chain in the same way.
+        labels: Readings that close the chain in the same way: all that are as simple; of the
+            declared reading those under which the cell is likelier.
         cost: How unlikely the reading is beside the declared one.
     """
 
@@ -88,7 +92,12 @@ class Scored:
     @property
     def score(self) -> float:
         """The fit's score, not under what makes no difference."""
-        return max(self.fit.score, FLOOR)
+        return max(self.fit.score, SCORE_FLOOR)
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether enough rotations can be read for a fit."""
+        return bool(np.isfinite(self.fit.score))
 
 
 def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int) -> Scored:
@@ -100,11 +109,6 @@ def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int)
     if len(rows) < FEWEST_ROWS - 1:
         return Scored(tried, no_fit(len(rows)), rows)
     return Scored(tried, robust_fit(robot[rows], camera[rows], starts), rows)
-
-
-def is_plausible(recording: Recording, tried: Hypothesis) -> bool:
-    """Whether the camera sees the target from where cameras can."""
-    return is_likely_unit(recording, tried.camera.unit)
 
 
 def is_likely_unit(recording: Recording, unit: str) -> bool:

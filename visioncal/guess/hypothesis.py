@@ -16,7 +16,7 @@ SIGNS: tuple[Signs, ...] = ("", "mirror", "x", "y", "z")
 
 # Mirroring any one axis is the same up to half turns of both frames; y is taken.
 _MIRROR = np.array([1.0, -1.0, 1.0])
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # The orders of turns that makers of robots and libraries use, about moving and about fixed axes.
 _ORDERS = {
     it.rotation.split("-")[1].upper()
@@ -105,7 +105,7 @@ class Taken:
         poses = compose(rotations, positions)
         poses[~there] = np.nan
         poses = invert(poses) if self.inverse else poses
-        return _HALF_TURN @ poses if self.half_turned else poses
+        return HALF_TURN @ poses if self.half_turned else poses
 
     def corrected(self, numbers: PoseNumbers) -> PoseNumbers:
         """Returns numbers whose `poses()` are right, as they stand where a reading suffices."""
@@ -150,13 +150,13 @@ class Hypothesis:
 
     def robot_numbers(self, robot: PoseNumbers) -> PoseNumbers:
         """The robot's numbers, corrected and in the order of the camera's rows."""
-        fixed, rows = self.robot.corrected(robot), self.rows(len(robot))
+        rows = self.rows(len(robot))
         there = (rows >= 0)[:, None]
+        ordered = self.robot.corrected(robot).rows(np.maximum(rows, 0))
         return replace(
-            fixed,
-            positions=np.where(there, fixed.positions[rows], np.nan),
-            rotations=np.where(there, fixed.rotations[rows], np.nan),
-            places=tuple(fixed.places[row] for row in np.where(rows < 0, 0, rows)),
+            ordered,
+            positions=np.where(there, ordered.positions, np.nan),
+            rotations=np.where(there, ordered.rotations, np.nan),
         )
 
     def camera_numbers(self, camera: PoseNumbers) -> PoseNumbers:

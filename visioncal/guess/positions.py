@@ -84,7 +84,7 @@ def solve_turn(
     return Turned(pairing, transposed, rows, robot, camera, x, kept, score)
 
 
-def placed(recording: Recording, turned: Turned) -> Iterator[tuple[float, Variant]]:
+def score_variants(recording: Recording, turned: Turned) -> Iterator[tuple[float, Variant]]:
     """Scores all ways to take the positions, at once: they share the equations' left sides.
 
     `R_i t_X - t_Z = -(p_i + R_i R_X c_i)` for all views; t_Z goes with the means.

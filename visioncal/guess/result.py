@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass
 
-from visioncal.conventions import UNITS_M, PoseNumbers, Reading
-from visioncal.guess.given import CLOSES
+import numpy as np
+
+from visioncal.conventions import UNITS_M
+from visioncal.guess.given import CLOSING_SCORE
 from visioncal.guess.hypothesis import Hypothesis
-from visioncal.types import Mount
+
+_LONG_MM, _WHOLE_FROM = 1000.0, 99.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,22 +50,21 @@ class Candidate:
     @property
     def closes(self) -> bool:
         """Whether the chain closes as well as it does under a right reading."""
-        return self.score <= CLOSES
+        return self.score <= CLOSING_SCORE
 
     @property
-    def mount(self) -> Mount:
-        """How the camera is mounted under this reading."""
-        return self.hypothesis.mount
+    def is_readable(self) -> bool:
+        """Whether rotations can be read of the numbers at all."""
+        return bool(np.isfinite(self.rms_mm))
 
     @property
-    def robot(self) -> Reading | None:
-        """The robot's numbers as a reading of them as they stand; None where it takes more."""
-        return self.hypothesis.robot.reading
-
-    @property
-    def camera(self) -> Reading | None:
-        """The same of the camera's numbers."""
-        return self.hypothesis.camera.reading
+    def figures(self) -> str:
+        """How well the chain closes, in words."""
+        if not self.is_readable:
+            return "no rotations"
+        is_long = self.rms_mm > _LONG_MM
+        length = f"{_short(1e-3 * self.rms_mm)} m" if is_long else f"{_short(self.rms_mm)} mm"
+        return f"{length} and {_short(self.rms_deg)} deg"
 
     @property
     def board_scale(self) -> float:
@@ -71,13 +73,10 @@ class Candidate:
             return 1.0
         return UNITS_M[self.hypothesis.camera.unit] / UNITS_M[self.declared.camera.unit]
 
-    def robot_numbers(self, robot: PoseNumbers) -> PoseNumbers:
-        """Corrects the robot's numbers: their `poses()` are right and in the camera's order."""
-        return self.hypothesis.robot_numbers(robot)
 
-    def camera_numbers(self, camera: PoseNumbers) -> PoseNumbers:
-        """Corrects the camera's numbers; for images, scale the board instead."""
-        return self.hypothesis.camera_numbers(camera)
+def _short(value: float) -> str:
+    """Two digits; whole numbers from a hundred on."""
+    return f"{value:.0f}" if value > _WHOLE_FROM else f"{value:.2g}"
 
 
 @dataclass(frozen=True, eq=False)

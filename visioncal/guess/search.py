@@ -12,11 +12,12 @@ from itertools import product
 import numpy as np
 
 from visioncal.conventions import UNITS_M
-from visioncal.guess.forms import Forms, Pairing, camera_forms, robot_forms, screen
-from visioncal.guess.given import FLOOR, Recording, Scored, fitted, is_likely_unit
+from visioncal.guess.forms import SHIFTS, Forms, Pairing, camera_forms, robot_forms, screen
+from visioncal.guess.given import SCORE_FLOOR, Recording, Scored, fitted, is_likely_unit
 from visioncal.guess.hypothesis import Hypothesis, Taken, strangeness
-from visioncal.guess.positions import UNITS, Turned, Variant, placed, solve_turn
-from visioncal.types import IntArray, Mount
+from visioncal.guess.likeness import is_far_likelier, likeness
+from visioncal.guess.positions import UNITS, Turned, Variant, score_variants, solve_turn
+from visioncal.types import MOUNTS, IntArray
 
 # Rows looked at: more would add time and no certainty.
 _MOST_ROWS = 40
@@ -27,7 +28,6 @@ _SLACK_RAD = 5e-3
 # By how much a change makes a reading less likely than one that does without.
 _PRICE = 0.3
 _STARTS = 12
-_MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 
 
 def thinned(rows: IntArray) -> IntArray:
@@ -44,43 +44,56 @@ def search(recording: Recording) -> list[Scored]:
         The declared reading first; then the others, the best first, one for each class of readings
         that residuals can tell apart.
     """
-    rows = thinned(recording.common_rows())
-    robot = robot_forms(recording.robot)
-    camera = camera_forms(recording.camera, is_measured=recording.is_measured)
+    kept = thinned(recording.common_rows())
+    looked_at = _with_neighbours(kept, len(recording.robot))
+    part, rows = recording.part(looked_at), np.searchsorted(looked_at, kept)
+    robot = robot_forms(part.robot)
+    camera = camera_forms(part.camera, is_measured=part.is_measured)
     pairings = _plausible(robot, camera, screen(robot, camera, rows))
-    turned = _turned(recording, robot, camera, pairings, rows)
-    classes = _closing(recording, robot, camera, turned)
-    declared = fitted(recording, recording.declared, rows, _STARTS)
-    others = [_best_label(recording, labels, rows) for labels in classes]
-    return [declared, *sorted(others, key=lambda it: it.score)]
+    turned = _turned(part, robot, camera, pairings, rows)
+    own, classes = _closing(part, robot, camera, turned)
+    declared = _with_likelier(part, fitted(part, part.declared, rows, _STARTS), own, rows)
+    others = [_best_label(part, labels, rows) for labels in classes]
+    others.sort(key=lambda it: it.score)
+    return [replace(it, rows=looked_at[it.rows]) for it in (declared, *others)]
+
+
+def _with_neighbours(rows: IntArray, count: int) -> IntArray:
+    """Rows and those that shifts pair them with: next to each other among these as among all."""
+    near = np.unique(np.add.outer(rows, SHIFTS))
+    return np.asarray(near[(near >= 0) & (near < count)])
 
 
 def _closing(
     recording: Recording, robot: Forms, camera: Forms, turned: Sequence[Turned]
-) -> list[list[Hypothesis]]:
-    """The classes worth fitting in full, each as the simplest readings that say the same."""
+) -> tuple[list[Hypothesis], list[list[Hypothesis]]]:
+    """The declared reading's class, and the others worth fitting, as their simplest readings."""
     scored = [
-        (float(score), one, variant) for one in turned for score, variant in placed(recording, one)
+        (float(score), turn, variant)
+        for turn in turned
+        for score, variant in score_variants(recording, turn)
     ]
     best = min((score for score, *_ in scored), default=0.0)
-    near = [it for it in scored if it[0] <= _REACH * best + _SLACK_RAD]
-    near.sort(key=lambda it: _dear(it[0], _cheap_cost(robot, camera, it[1], it[2])))
-    declared = recording.declared
+    close = [it for it in scored if it[0] <= _REACH * best + _SLACK_RAD]
+    close.sort(key=lambda it: _priced(it[0], _cheap_cost(robot, camera, it[1], it[2])))
+    own: list[Hypothesis] = []
     classes = []
-    for score, one, variant in near[:_LABELLED]:
-        every = list(_labels(recording, robot, camera, one, variant))
-        if declared in every:
+    for score, turn, variant in close[:_LABELLED]:
+        labels = list(_labels(recording, robot, camera, turn, variant))
+        if recording.declared in labels:
+            own = labels
             continue
-        costs = [recording.cost(it) for it in every]
-        simplest = [it for it, cost in zip(every, costs, strict=True) if cost == min(costs)]
-        classes.append((_dear(score, min(costs)), simplest))
+        costs = [recording.cost(it) for it in labels]
+        least = min(costs)
+        simplest = [it for it, cost in zip(labels, costs, strict=True) if cost == least]
+        classes.append((_priced(score, least), simplest))
     classes.sort(key=lambda it: it[0])
-    return [labels for _, labels in classes[:_FITTED]]
+    return own, [labels for _, labels in classes[:_FITTED]]
 
 
-def _dear(score: float, cost: float) -> float:
+def _priced(score: float, cost: float) -> float:
     """A score by which simple readings come before others that are as good."""
-    return (score + FLOOR) * (1.0 + _PRICE * cost)
+    return (score + SCORE_FLOOR) * (1.0 + _PRICE * cost)
 
 
 def _cheap_cost(robot: Forms, camera: Forms, turned: Turned, variant: Variant) -> float:
@@ -113,7 +126,7 @@ def _labels(
     ]
     likely = [it for it in pairs if is_likely_unit(recording, it[1])]
     inverses = (False,) if recording.is_measured else (False, True)
-    for mount, inverse, (unit, camera_unit) in product(_MOUNTS, inverses, likely or pairs):
+    for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
         yield Hypothesis(
             Taken(
                 robot.turns[pairing.robot],
@@ -134,17 +147,23 @@ def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArr
     The target is before the camera, and what sits on the flange is near it.
     """
     scored = [fitted(recording, it, rows, _STARTS) for it in labels]
-    chosen = max(scored, key=lambda it: _likeness(recording, it))
+    chosen = max(
+        scored,
+        key=lambda it: (likeness(recording, it), it.hypothesis.mount == recording.mount),
+    )
     cost = recording.cost(chosen.hypothesis)
     return replace(chosen, labels=tuple(labels), cost=cost)
 
 
-def _likeness(recording: Recording, scored: Scored) -> tuple[bool, bool, bool]:
-    tried, (x, z) = scored.hypothesis, (scored.fit.x, scored.fit.z)
-    before = np.median(tried.camera.poses(recording.camera)[scored.rows, 2, 3]) > 0.0
-    on_flange, in_cell = (x, z) if tried.mount == "eye-in-hand" else (z, x)
-    is_near = np.linalg.norm(on_flange[:3, 3]) < np.linalg.norm(in_cell[:3, 3])
-    return bool(before), bool(is_near), tried.mount == recording.mount
+def _with_likelier(
+    recording: Recording, declared: Scored, own: Sequence[Hypothesis], rows: IntArray
+) -> Scored:
+    """Tells of the simplest readings of the declared one's class that make a likelier cell."""
+    unit = declared.hypothesis.robot.unit
+    scored = [fitted(recording, it, rows, _STARTS) for it in own if it.robot.unit == unit]
+    likelier = [it.hypothesis for it in scored if is_far_likelier(recording, it, declared)]
+    least = min((recording.cost(it) for it in likelier), default=0.0)
+    return replace(declared, labels=tuple(it for it in likelier if recording.cost(it) == least))
 
 
 def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list[Pairing]:
@@ -152,7 +171,7 @@ def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list
     best = min(it.mismatch_rad for it in pairings)
     bound = _REACH * best + _SLACK_RAD
     near = [it for it in pairings[1:] if it.mismatch_rad <= bound]
-    near.sort(key=lambda it: _dear(it.mismatch_rad, _pairing_cost(robot, camera, it)))
+    near.sort(key=lambda it: _priced(it.mismatch_rad, _pairing_cost(robot, camera, it)))
     return [pairings[0], *near[: _PAIRINGS - 1]]
 
 
@@ -177,5 +196,5 @@ def _turned(
         solved += [solve_turn(pairing, it, inside, sides) for it in product((False, True), cameras)]
     best = min((it.score for it in solved), default=0.0)
     near = [it for it in solved if it.score <= _REACH * best + _SLACK_RAD]
-    near.sort(key=lambda it: _dear(it.score, _pairing_cost(robot, camera, it.pairing)))
+    near.sort(key=lambda it: _priced(it.score, _pairing_cost(robot, camera, it.pairing)))
     return near[:_TURNED]

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.guess.fit import distances, robust_fit
-from visioncal.guess.given import CLOSES, FLOOR, Recording, Scored, fitted
+from visioncal.guess.given import CLOSING_SCORE, SCORE_FLOOR, Recording, Scored, fitted
 from visioncal.guess.hypothesis import Hypothesis
 
 # A view stands out from here, in the typical distance of those that agree. Exchanged back it has
@@ -34,11 +34,13 @@ def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored 
         The same reading with the rows exchanged; None where no exchange explains anything, or
         several do.
     """
+    if not scored.is_readable:
+        return None
     scored = _on_all_rows(recording, scored)
     fit, tried = scored.fit, scored.hypothesis
-    if len(fit.away) <= _FEW and fit.score > CLOSES:
+    if len(fit.away) <= _FEW and fit.score > CLOSING_SCORE:
         return None if is_poor else _exchanged_among_few(recording, scored)
-    typical = max(fit.score, FLOOR)
+    typical = max(fit.score, SCORE_FLOOR)
     out = np.flatnonzero(fit.away > _OUT * typical)
     if not 2 <= len(out) <= min(_MOST, len(fit.away) - 4):
         return None
@@ -75,7 +77,7 @@ def _exchanged_among_few(recording: Recording, scored: Scored) -> Scored | None:
         found.append(Scored(changed, fit, scored.rows))
     found.sort(key=lambda it: it.score)
     best, second = found[:2]
-    is_clear = best.score < CLOSES and second.score > _CLEARLY * best.score
+    is_clear = best.score < CLOSING_SCORE and second.score > _CLEARLY * best.score
     return best if is_clear and scored.score > _NEARER * best.score else None
 
 

@@ -57,7 +57,8 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
         DegenerateError: Too few views have both poses.
     """
     chain = chain_poses(seen.session)
-    robot = _robot_numbers(seen.session, chain) if robot is None else robot
+    if robot is None:
+        robot = told_or_chained(numbers_in(seen.session, POSE), chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
     for camera in _seen_ways(seen, robot):
         guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
@@ -93,6 +94,11 @@ def chain_poses(session: Session) -> FloatArray | None:
         if joints is not None and len(joints) == robot.joint_count:
             poses[at] = robot.base_from_flange(joints[None])[0]
     return poses if np.isfinite(poses).any() else None
+
+
+def told_or_chained(told: PoseNumbers, chain: FloatArray | None) -> PoseNumbers:
+    """The robot's poses as they were reported; those of its joints where none were."""
+    return told if chain is None or told.there.any() else PoseNumbers.of_poses(chain, told.places)
 
 
 def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
@@ -161,14 +167,6 @@ def _chosen(seen: Known, robot: PoseNumbers) -> Known:
     return replace(seen, poses={it.view: it for it in choice.views})
 
 
-def _robot_numbers(session: Session, chain: FloatArray | None) -> PoseNumbers:
-    """The reported poses; those of the joints where nothing is reported."""
-    numbers = numbers_in(session, POSE)
-    if not np.isfinite(numbers.positions).any() and chain is not None:
-        return _matrices(session, chain)
-    return numbers
-
-
 def _camera_numbers(seen: Known) -> PoseNumbers:
     """The target's poses, of each view the best by its image, or as the session gives them."""
     if not seen.corners:
@@ -177,12 +175,7 @@ def _camera_numbers(seen: Known) -> PoseNumbers:
     for at, view in enumerate(seen.session.views):
         if view.number in seen.poses:
             poses[at] = seen.poses[view.number].cam_from_target[0]
-    return _matrices(seen.session, poses)
-
-
-def _matrices(session: Session, poses: FloatArray) -> PoseNumbers:
-    reading = Reading("matrix", "m")
-    return PoseNumbers(poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9), reading, _places(session))
+    return PoseNumbers.of_poses(poses, _places(seen.session))
 
 
 def _places(session: Session) -> tuple[str, ...]:

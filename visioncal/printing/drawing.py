@@ -12,6 +12,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D, Transform
@@ -21,6 +22,7 @@ from visioncal.types import FloatArray
 
 _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
+_FONT = "DejaVu Sans"
 _GREY = "#444444"
 _LINE_PT = 0.5
 # The ruler's line above the quiet zone, its ticks, its label, its arrow [mm].
@@ -48,6 +50,12 @@ def to_png(sheet: Sheet, dpi: float) -> bytes:
     return _saved(sheet, "png", {"Software": "visioncal"}, dpi)
 
 
+def not_in_font(text: str) -> str:
+    """Gives the letters of a text that the sheets' font does not have."""
+    font = get_font(findfont(_FONT))
+    return "".join(it for it in text if not font.get_char_index(ord(it)))
+
+
 def _saved(
     sheet: Sheet, kind: str, metadata: dict[str, str | None], dpi: float | None = None
 ) -> bytes:
@@ -62,7 +70,7 @@ def _saved(
 def _style() -> Iterator[None]:
     """Settings under which the same sheet gives the same bytes, whatever a user has set."""
     settings: dict[Any, Any] = {
-        "font.family": "DejaVu Sans",
+        "font.family": _FONT,
         "path.simplify": False,
         "pdf.compression": 9,
         "pdf.fonttype": 3,
@@ -99,6 +107,8 @@ def _figure(sheet: Sheet) -> Figure:
             fontsize=FONT_PT,
             color="black" if number == 0 else _GREY,
             va="top",
+            # A name may hold the signs that matplotlib takes for formulas.
+            parse_math=False,
         )
     return figure
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import tomli_w
 
 from visioncal.errors import DataError
-from visioncal.files import named_errors, parse_toml, read_text, write_atomically
+from visioncal.files import check_free, named_errors, parse_toml, read_text, write_atomically
 from visioncal.printing.page import Sheet
 from visioncal.targets import target_document, target_from_document
 from visioncal.types import Target
@@ -13,6 +13,7 @@ from visioncal.types import Target
 # Beyond this many pixels a page takes gigabytes to draw.
 _MOST_PIXELS = 2.5e8
 _LEAST_DPI = 50.0
+_LONGEST_NAME = 100
 
 
 def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
@@ -35,21 +36,16 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
             large.
     """
     # matplotlib takes half a second to import, which help and refusals need not wait for.
-    from visioncal.printing.drawing import to_pdf, to_png, to_svg
+    from visioncal.printing.drawing import not_in_font, to_pdf, to_png, to_svg
 
-    name = _checked_name(sheet.target.name)
+    name = sheet.target.name
+    _check_name(name, not_in_font(name))
     _check_dpi(sheet, dpi)
     files = {ending: folder / f"{name}.{ending}" for ending in ("pdf", "svg", "png", "toml")}
     kept = _describes(files["toml"], sheet.target)
-    taken = [
-        path for ending, path in files.items() if path.exists() and not (ending == "toml" and kept)
-    ]
-    if taken and not force:
-        raise DataError(
-            f"{taken[0]} exists already.",
-            culprits=[str(path) for path in taken],
-            next_step="Choose another folder with -o, or replace the files with --force.",
-        )
+    for ending, path in files.items():
+        if ending != "toml" or not kept:
+            check_free(path, force=force)
     drawn: dict[str, bytes | str] = {
         "pdf": to_pdf(sheet),
         "svg": to_svg(sheet),
@@ -64,14 +60,16 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
     return tuple(files.values())
 
 
-def _checked_name(name: str) -> str:
-    if not name.strip() or name.startswith(".") or any(it in name for it in '/\\:*?"<>|\0'):
+def _check_name(name: str, not_in_font: str) -> None:
+    """Refuses what cannot be the name of a file, or be printed on the sheet."""
+    wrong = sorted({*not_in_font, *'/\\:*?"<>|'} & set(name))
+    if not name.strip() or name.startswith(".") or wrong or len(name) > _LONGEST_NAME:
         raise DataError(
-            f"{name!r} cannot be the name of files.",
+            f"{name[:_LONGEST_NAME]!r} cannot be the name of files and stand on the print"
+            + (f": {' '.join(map(repr, wrong))} cannot." if wrong else "."),
             culprits=[name],
-            next_step="Use letters, digits, _ and -.",
+            next_step=f"Use up to {_LONGEST_NAME} letters, digits, _ and -.",
         )
-    return name
 
 
 def _check_dpi(sheet: Sheet, dpi: float) -> None:

@@ -79,12 +79,11 @@ class Sheet:
 
 @dataclass(frozen=True)
 class _Room:
-    """What a board needs: white on its left, top, right and below, and all of it [mm]."""
+    """What a board needs: white on its left, top and right, and all of it [mm]."""
 
     left: float
     top: float
     right: float
-    bottom: float
     width: float
     height: float
 
@@ -142,7 +141,7 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
     for page in pages:
         room = _room(target, pattern, page)
         if room.width <= page.width_mm and room.height <= page.height_mm:
-            return _placed(target, pattern, page, room)
+            return _centred(target, pattern, page, room)
     left, top, right, bottom = pattern.box
     needed = _room(target, pattern, pages[0])
     what = "side" if target.kind == "marker" else "square"
@@ -189,10 +188,10 @@ def _room(target: Target, pattern: Pattern, page: Page) -> _Room:
     beside = max(EDGE_MM, quiet_mm)
     below = quiet_mm + _GAP_MM + LINE_MM * len(lines) + EDGE_MM
     width, height = above + right - left + beside, above + bottom - top + below
-    return _Room(above, above, beside, below, width, height)
+    return _Room(above, above, beside, width, height)
 
 
-def _placed(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet:
+def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet:
     """Centres the print between the edges of a page that has room for it."""
     left, top, right, bottom = (1e3 * side for side in pattern.box)
     width, height = right - left, bottom - top

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visioncal.targets import charuco_board
+from visioncal.targets import aruco_dictionary, charuco_board
 from visioncal.types import FloatArray, Mask, Target
 
 # White that finders need around squares; markers need one of their own modules.
@@ -36,12 +36,12 @@ def draw_pattern(target: Target) -> Pattern:
         case "marker":
             dark = _marker_cells(target.dictionary, target.marker_id)
             module_m = side / len(dark)
-            loops = _placed(dark, np.full(2, -0.5 * side), module_m)
+            loops = _moved(dark, np.full(2, -0.5 * side), module_m)
             return Pattern(loops, (-side / 2, -side / 2, side / 2, side / 2), module_m)
         case "checkerboard":
             # The square diagonally outside corner 0 is dark.
             row, column = np.indices((target.rows + 1, target.columns + 1))
-            loops = _placed((row + column) % 2 == 0, np.full(2, -side), side)
+            loops = _moved((row + column) % 2 == 0, np.full(2, -side), side)
             box = (-side, -side, target.columns * side, target.rows * side)
             return Pattern(loops, box, _QUIET_M)
         case "charuco":
@@ -95,14 +95,14 @@ def _without_straight(loop: FloatArray) -> FloatArray:
     return np.asarray(loop[turns])
 
 
-def _placed(dark: Mask, corner_m: FloatArray, cell_m: float) -> tuple[FloatArray, ...]:
+def _moved(dark: Mask, corner_m: FloatArray, cell_m: float) -> tuple[FloatArray, ...]:
     """Outlines of a grid whose first cell's outer corner and cell side are given [m]."""
     return tuple(corner_m + cell_m * loop for loop in outlines(dark))
 
 
 def _marker_cells(dictionary_name: str, marker_id: int) -> Mask:
     """The dark cells of a marker, its border of one cell included."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary_name))
+    dictionary = aruco_dictionary(dictionary_name)
     size = dictionary.markerSize
     code = dictionary.bytesList[marker_id : marker_id + 1]
     bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
@@ -117,10 +117,10 @@ def _charuco_loops(target: Target) -> tuple[FloatArray, ...]:
     light = np.floor(places.mean(axis=1) / target.square_m).astype(int)
     dark = np.ones((target.rows, target.columns), dtype=bool)
     dark[light[:, 1], light[:, 0]] = False
-    loops = list(_placed(dark, np.zeros(2), target.square_m))
+    loops = list(_moved(dark, np.zeros(2), target.square_m))
     inset = (target.square_m - target.marker_m) / 2
     for marker_id, square in zip(ids, light, strict=True):
         cells = _marker_cells(target.dictionary, marker_id)
         corner_m = target.square_m * square + inset
-        loops += _placed(cells, corner_m, target.marker_m / len(cells))
+        loops += _moved(cells, corner_m, target.marker_m / len(cells))
     return tuple(loops)

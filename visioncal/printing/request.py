@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
-
 from visioncal.printing.page import Page, arrange, largest_side_mm
-from visioncal.targets import target_from_document
+from visioncal.targets import aruco_dictionary, metres, target_from_document
 from visioncal.types import Target, TargetKind
 
 # A marker's share of its square: it leaves at least one module of white on every side.
@@ -66,7 +64,7 @@ def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
 
 def _target(request: Request, square_mm: float) -> Target:
     document: dict[str, Any] = {"kind": request.kind}
-    side_m = _metres(square_mm)
+    side_m = metres(square_mm)
     if request.kind == "marker":
         document |= {"size_m": side_m, "dictionary": request.dictionary or "DICT_APRILTAG_36h11"}
         wishes: dict[str, int | None] = {"id": request.marker_id}
@@ -77,11 +75,12 @@ def _target(request: Request, square_mm: float) -> Target:
     if request.kind == "charuco":
         marker_mm = request.marker_mm
         if marker_mm is None:
-            marker_mm = _MARKER_SHARE * square_mm
-            # Under ten millimetres a whole number would be too far from the share.
+            # Under ten millimetres a whole number would be too far from the share; a nanometre
+            # is as good as any number.
+            marker_mm = round(_MARKER_SHARE * square_mm, 6)
             marker_mm = float(int(marker_mm)) if square_mm >= 2 * _LEAST_MM else marker_mm
         document |= {
-            "marker_m": _metres(marker_mm),
+            "marker_m": metres(marker_mm),
             "dictionary": request.dictionary or _enough(request),
             "legacy": request.legacy,
         }
@@ -90,17 +89,11 @@ def _target(request: Request, square_mm: float) -> Target:
     return target if request.name else target_from_document(document, _name(target))
 
 
-def _metres(millimetres: float) -> float:
-    # Rounded to a nanometre, so that the file reads 0.03 where 30 mm was meant.
-    return round(1e-3 * millimetres, 9)
-
-
 def _enough(request: Request) -> str:
     """The first of the usual dictionaries that has enough markers."""
     needed = (request.columns or 0) * (request.rows or 0) // 2
     for name in _USUAL:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-        if len(dictionary.bytesList) >= needed:
+        if len(aruco_dictionary(name).bytesList) >= needed:
             return name
     return _USUAL[-1]
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from visioncal.targets import charuco_board
+from visioncal.targets import aruco_dictionary, charuco_board
 from visioncal.types import FloatArray, Image, Target
 
 # Enough to show the bits of the markers; the pattern of a large board still stays small.
@@ -45,7 +45,7 @@ def picture(target: Target) -> Image:
         board = charuco_board(target).generateImage((columns * square_px, rows * square_px))
         return np.asarray(board, dtype=np.uint8)
     if target.kind == "marker":
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+        dictionary = aruco_dictionary(target.dictionary)
         side_px = 4 * _SQUARE_PX
         marker = cv2.aruco.generateImageMarker(dictionary, target.marker_id, side_px)
         return np.asarray(marker, dtype=np.uint8)
