@@ -3,10 +3,13 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from samples import made_up
+from typer.testing import CliRunner
 
+from visioncal.cli.app import app
 from visioncal.errors import DataError
 from visioncal.formats import convert
 from visioncal.pipeline import calibrate
@@ -104,7 +107,9 @@ def test_the_command_converts_and_refuses(folder: Path, tmp_path: Path) -> None:
     assert "--force" in again.stderr
 
 
-def test_a_session_whose_poses_are_misread_is_mended(tmp_path: Path) -> None:
+@pytest.fixture
+def misread(tmp_path: Path) -> Session:
+    """A session whose copy in the folder `mm` has its positions in millimetres."""
     session = made_up(9, images=False).session
     cells = [
         [
@@ -114,6 +119,20 @@ def test_a_session_whose_poses_are_misread_is_mended(tmp_path: Path) -> None:
         for view in session.views
     ]
     Session.assemble(session.document, session.columns, cells, session.images).save(tmp_path / "mm")
+    return session
+
+
+@pytest.mark.usefixtures("misread")
+def test_no_answer_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr("visioncal.cli.convert.sys", terminal)
+    command = ["convert", str(tmp_path / "mm"), str(tmp_path / "no"), "--guess"]
+    with pytest.raises(DataError, match=r"there was no answer.*--yes"):
+        CliRunner().invoke(app, command, input="", catch_exceptions=False)
+    assert not (tmp_path / "no").exists()
+
+
+def test_a_session_whose_poses_are_misread_is_mended(misread: Session, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "visioncal", "convert", str(tmp_path / "mm")]
     asked = subprocess.run(
         [*command, str(tmp_path / "no"), "--guess"],
@@ -136,7 +155,7 @@ def test_a_session_whose_poses_are_misread_is_mended(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "positions in mm" in done.stderr
     mended = Session.load(tmp_path / "mended")
-    for old, new in zip(session.views, mended.views, strict=True):
+    for old, new in zip(misread.views, mended.views, strict=True):
         # Multiplied by 1000 and divided again, each rounded once.
         for name in ("x_m", "y_m", "z_m", "qx", "qw", "cft_x_m"):
             assert new.numbers[name] == pytest.approx(old.numbers[name], abs=1e-14)

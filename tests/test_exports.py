@@ -6,6 +6,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -344,11 +345,12 @@ def test_names_that_are_not_known_get_a_hint(name, edge, words):
     assert words in str(caught.value)
 
 
-def visioncal(*arguments):
+def visioncal(*arguments, stdout=subprocess.PIPE):
     return subprocess.run(
         [sys.executable, "-m", "visioncal", "export", *map(str, arguments)],
         check=False,
-        capture_output=True,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
         text=True,
         encoding="utf-8",
         env=os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
@@ -406,6 +408,8 @@ def test_the_command_lists_its_formats():
         (["--to", "kukka"], "Did you mean kuka"),
         (["--to", "ros", "--child", 'a"b'], "frame's name"),
         (["--to", "ros", "-o", "nowhere/here.yaml"], "nowhere/here.yaml"),
+        (["--to", "ros", "--parent", ""], "'' cannot be a frame's name"),
+        (["--to", "ros", "--edge", ""], "no transform ''"),
         ([], "--to"),
     ],
 )
@@ -414,6 +418,29 @@ def test_mistakes_are_status_2_and_write_nothing(saved, arguments, words):
     assert (done.returncode, done.stdout) == (2, "")
     assert words in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_dash_is_stdout(saved):
+    done = visioncal(saved, "--to", "ros", "-o", "-")
+    assert (done.returncode, done.stdout) == (0, export(SAMPLE, "ros"))
+    assert not Path("-").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_behind_stdout_is_told(saved):
+    with Path("/dev/full").open("w") as full:
+        done = visioncal(saved, "--to", "ros", stdout=full)
+    assert done.returncode == 2
+    assert "stdout cannot be written" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["", "session.toml"])
+def test_a_session_is_to_be_calibrated_first(tmp_path, name):
+    (tmp_path / "session.toml").write_text("schema = 1\n", encoding="utf-8")
+    done = visioncal(tmp_path / name, "--to", "ur")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"Run visioncal calibrate {tmp_path}" in done.stderr
 
 
 def test_frame_names_of_an_edited_calibration_are_checked_too(tmp_path):

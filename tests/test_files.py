@@ -7,6 +7,7 @@ import pytest
 from visioncal.errors import DataError
 from visioncal.files import (
     Table,
+    check_free,
     decode_text,
     did_you_mean,
     parse_toml,
@@ -81,3 +82,16 @@ def test_a_number_that_does_not_serve_is_refused_by_name(
     with pytest.raises(DataError, match=words) as caught:
         Table(content, "robot x").number("a", positive=True)
     assert caught.value.culprits == ("robot x: a",)
+
+
+def test_a_link_that_leads_nowhere_is_not_replaced_unasked(tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="nothing is overwritten"):
+        check_free(link, force=False)
+    check_free(link, force=True)
+
+
+def test_a_name_that_no_disk_takes_is_named(tmp_path):
+    with pytest.raises(DataError, match="cannot be written"):
+        check_free(tmp_path / ("x" * 300), force=False)

@@ -218,6 +218,8 @@ def test_make_leaves_a_description_of_the_same_board_alone(tmp_path):
     done = run("make", described, "-o", tmp_path, "--dpi", 72)
     assert done.exit_code == 0, done.exception
     assert described.read_text(encoding="utf-8") == text
+    assert f"kept {described}" in done.stderr
+    assert f"wrote {described}" not in done.stderr
     assert (tmp_path / "mine.pdf").stat().st_size > 1000
 
 
@@ -229,6 +231,9 @@ def test_a_name_is_printed_as_it_stands(tmp_path):
     assert (tmp_path / "größe $b^$ c.pdf").is_file()
 
 
+CHARUCO = ("--kind", "charuco", "--columns", 9, "--rows", 6)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -237,12 +242,19 @@ def test_a_name_is_printed_as_it_stands(tmp_path):
         (("--kind", "charuco", "--columns", 9), "rows is missing"),
         (("--kind", "marker", "--id", 1, "--square-mm", 20), "--size-mm"),
         (("charuco_9x6_30mm", "--columns", 5), "--columns would change nothing"),
+        ((*CHARUCO, "--square-mm", "inf"), "--square-mm is inf"),
+        ((*CHARUCO, "--square-mm", "nan"), "--square-mm is nan"),
+        ((*CHARUCO, "--square-mm=-3"), "--square-mm is -3; 0.1 to 1000 mm"),
+        ((*CHARUCO, "--square-mm", 20, "--marker-mm", "inf"), "--marker-mm is inf"),
+        (("--kind", "marker", "--id", 1, "--size-mm", 1e-300), "--size-mm is 1e-300"),
         (("--kind", "checkerboard", "--marker-mm", 5), "--marker-mm would change nothing"),
         (("charuco_13x8_30mm", "--page", "A4"), "does not fit on A4"),
         (("charuco_9x6_30mm", "--dpi", 1e6), "--dpi"),
         (("--kind", "marker", "--id", 1, "--name", "../tag"), "name of files"),
         (("--kind", "marker", "--id", 1, "--name", "板 1"), "'板' cannot"),
-        (("--kind", "marker", "--id", 1, "--name", 300 * "x"), "up to 100 letters"),
+        (("--kind", "marker", "--id", 1, "--name", 300 * "x"), "up to 60 letters"),
+        # 300 bytes, where file systems take 255.
+        (("--kind", "marker", "--id", 1, "--name", 100 * "€"), "up to 60 letters"),
     ],
     ids=str,
 )
@@ -251,3 +263,9 @@ def test_make_refuses_and_writes_nothing(arguments, message, tmp_path):
     assert isinstance(done.exception, DataError)
     assert message in str(done.exception)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_no_file_system_takes_is_named(tmp_path):
+    done = run("make", "charuco_9x6_30mm", "-o", tmp_path / (300 * "x"))
+    assert isinstance(done.exception, DataError)
+    assert "File name too long" in str(done.exception)

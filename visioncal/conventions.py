@@ -272,6 +272,7 @@ class PoseNumbers:
                 f"{some_of(partly)}: a part of the pose's numbers is missing; all or none are "
                 "needed.",
                 culprits=partly,
+                next_step="Fill in what is missing, or leave the whole pose of that row empty.",
             )
         rotations = form.read(self.rotations)
         wrong = self._places_of(there & ~np.isfinite(rotations).all(axis=(1, 2)))

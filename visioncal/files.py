@@ -78,8 +78,11 @@ def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
     Raises:
         DataError: `path` is there.
     """
-    replaceable = replaceable and path.is_file()
-    if not path.exists() or (force and replaceable):
+    with named_errors(path):
+        # A link that leads nowhere is there, too.
+        there = path.exists() or path.is_symlink()
+        replaceable = replaceable and (path.is_file() or path.is_symlink())
+    if not there or (force and replaceable):
         return
     raise DataError(
         f"{path} exists, and nothing is overwritten.",
@@ -131,8 +134,16 @@ def decode_text(data: bytes, label: str) -> str:
         raise DataError(
             f"{label}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text.",
             culprits=[f"{label}, line {line}"],
-            next_step="Save the file as UTF-8.",
+            next_step=save_as_utf8("LATIN1"),
         ) from error
+
+
+def save_as_utf8(encoding: str) -> str:
+    """Words how a text file in another encoding is saved as UTF-8."""
+    return (
+        "Save the file as UTF-8: in Excel as the type `CSV UTF-8`, in an editor with that encoding "
+        f"under `Save as`, or with `iconv -f {encoding} -t UTF-8 OLD > NEW`."
+    )
 
 
 def parse_toml(text: str, label: str) -> dict[str, Any]:
@@ -196,7 +207,9 @@ def find_described(
         raise DataError(
             f"The {what} file {path} does not exist.",
             culprits=[str(path)],
-            next_step="Its path is relative to the file that names it.",
+            next_step="Check the path and its spelling."
+            if folder is None
+            else "Its path is relative to the file that names it.",
         )
     if name_or_path in shipped:
         return shipped[name_or_path]

@@ -6,8 +6,11 @@ from pathlib import Path
 from visioncal.calibration import Calibration, to_document
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
-from visioncal.outputs import RECORDING
+from visioncal.outputs import CALIBRATION, RECORDING
 from visioncal.session import Session
+
+# What tells the folder of a session.
+_SESSION = "session.toml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,18 +40,31 @@ def load_calibration(path: Path) -> Calibration:
         DataError: There is none, or it cannot be read.
     """
     if path.suffix.lower() != ".rrd":
+        _refuse_session(path)
         return Calibration.load(path)
     # The codec takes half a second to import, which a calibration.json need not wait for.
     from visioncal.recording import read_calibration
 
     calibration = read_calibration(path)
     if calibration is None:
-        raise DataError(
-            f"{path} is the recording of a session without a result.",
-            culprits=[str(path)],
-            next_step=f"Run visioncal calibrate {path} first.",
-        )
+        raise _uncalibrated(path, "the recording of a session")
     return calibration
+
+
+def _refuse_session(path: Path) -> None:
+    """Refuses a session where its result is needed."""
+    folder = path.parent if path.name == _SESSION else path
+    calibrated = path == folder and (folder / CALIBRATION).exists()
+    if not calibrated and (folder / _SESSION).is_file():
+        raise _uncalibrated(folder, "a session")
+
+
+def _uncalibrated(path: Path, what: str) -> DataError:
+    return DataError(
+        f"{path} is {what} without a result.",
+        culprits=[str(path)],
+        next_step=f"Run visioncal calibrate {path} -o FOLDER first, and name that FOLDER.",
+    )
 
 
 def load_stored(path: Path) -> Stored:

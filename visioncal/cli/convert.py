@@ -48,10 +48,12 @@ def convert_command(
     Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
     nothing was written, and the message says what is missing or wrong.
     """
+    robot_names = _names(robot_columns, "--robot-columns")
+    camera_names = _names(camera_columns, "--camera-columns")
     wishes = Wishes(
-        robot=PoseWishes(_names(robot_columns), robot_form, robot_unit, robot_inverse),
-        camera=PoseWishes(_names(camera_columns), camera_form, camera_unit, camera_inverse),
-        joints=_names(joint_columns),
+        robot=PoseWishes(robot_names, robot_form, robot_unit, robot_inverse),
+        camera=PoseWishes(camera_names, camera_form, camera_unit, camera_inverse),
+        joints=_names(joint_columns, "--joint-columns"),
         joints_deg=joint_unit == "deg",
         image=image_column,
         camera_file=camera_file,
@@ -72,8 +74,16 @@ def convert_command(
     messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))
 
 
-def _names(words: str | None) -> tuple[str, ...]:
-    return tuple(it.strip() for it in words.split(",") if it.strip()) if words else ()
+def _names(words: str | None, option: str) -> tuple[str, ...]:
+    if words is None:
+        return ()
+    names = tuple(it.strip() for it in words.split(","))
+    if not all(names) or len(set(names)) < len(names):
+        raise DataError(
+            f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",
+            culprits=[option],
+        )
+    return names
 
 
 def _size(words: str | None) -> tuple[int, int] | None:
@@ -117,6 +127,12 @@ def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
             culprits=[guess.best.words],
             next_step="Take it with --yes.",
         )
-    if not typer.confirm(f"Read them so: {guess.best.words}?", err=True):
+    try:
+        agreed = typer.confirm(f"Read them so: {guess.best.words}?", err=True)
+    except typer.Abort as error:
+        raise DataError(
+            "Nothing was written: there was no answer.", next_step="Take the reading with --yes."
+        ) from error
+    if not agreed:
         raise DataError("Nothing was written: the reading was declined.")
     return guess.best

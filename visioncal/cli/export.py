@@ -7,6 +7,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
+from visioncal.cli.stdout import write_stdout
 from visioncal.exports import EXPORT_FORMATS, Selection, export
 from visioncal.files import check_free, write_atomically
 from visioncal.stored import load_calibration
@@ -27,18 +28,21 @@ def export_command(
     ],
     to: Annotated[str, typer.Option("--to", help="The format; --list shows them all.")],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="The file to write; otherwise stdout.")
+        Path | None,
+        typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
     ] = None,
     edge: Annotated[
-        str, typer.Option("--edge", help="The transform; the camera's where none is named.")
-    ] = "",
+        str | None,
+        typer.Option("--edge", help="The transform; the camera's where none is named."),
+    ] = None,
     inverse: Annotated[bool, typer.Option("--inverse", help="Write the inverse of it.")] = False,
     parent: Annotated[
-        str, typer.Option("--parent", help="What to call the frame in which the pose is given.")
-    ] = "",
+        str | None,
+        typer.Option("--parent", help="What to call the frame in which the pose is given."),
+    ] = None,
     child: Annotated[
-        str, typer.Option("--child", help="What to call the frame whose pose it is.")
-    ] = "",
+        str | None, typer.Option("--child", help="What to call the frame whose pose it is.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     _list: Annotated[
         bool,
@@ -57,8 +61,8 @@ def export_command(
             f"[bold red]warning:[/] the verdict on this calibration is bad. "
             f"{escape(' '.join(result.verdict.reasons))}"
         )
-    if out is None:
-        typer.echo(document, nl=False)
+    if out is None or out == Path("-"):
+        write_stdout(document)
         return
     check_free(out, force=force)
     write_atomically(out, document)

@@ -8,19 +8,22 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
+from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.files import check_free, read_bytes, write_atomically
 from visioncal.finders.identify import identify
 from visioncal.finders.identify_text import describe, to_document, to_toml
 from visioncal.finders.imaging import decode_image
-from visioncal.printing import Page, Request, arrange, pages_named, requested_target, write_board
-from visioncal.targets import (
-    load_target,
-    metres,
-    target_document,
-    target_from_document,
-    target_names,
+from visioncal.printing import (
+    Page,
+    Request,
+    arrange,
+    pages_named,
+    requested_target,
+    side_metres,
+    write_board,
 )
+from visioncal.targets import load_target, target_document, target_from_document, target_names
 from visioncal.types import Image, Target, TargetKind
 
 target_app = typer.Typer(
@@ -125,6 +128,9 @@ def make_command(
     files = write_board(out, sheet, dpi=dpi, force=force)
     for file in files:
         messages().print(escape(f"wrote {file}"))
+    description = files[0].with_name(f"{chosen.name}.toml")
+    if description not in files:
+        messages().print(escape(f"kept {description}, which describes this board already"))
     messages().print(escape(f"Print it on {sheet.page} at 100 %, and check both rulers."))
 
 
@@ -153,7 +159,7 @@ def check_command(
     image: Annotated[Path, typer.Argument(help="A photograph of the board: png, jpg or tif.")],
     square_mm: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Measured side of a square; of the marker for a single one."),
+        typer.Option(help="Measured side of a square; of the marker for a single one."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Write the description here.")
@@ -167,7 +173,7 @@ def check_command(
 
     Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
     """
-    square_m = None if square_mm is None else metres(square_mm)
+    square_m = None if square_mm is None else side_metres("--square-mm", square_mm)
     if out is not None and square_m is None:
         raise DataError(
             "A description needs the size of the squares, which a photograph does not show.",
@@ -184,17 +190,24 @@ def check_command(
         write_atomically(out, description)
     messages().print(escape(describe(identity)))
     if as_json:
-        typer.echo(json.dumps(to_document(identity, square_m), indent=2))
+        write_stdout(json.dumps(to_document(identity, square_m), indent=2) + "\n")
     elif out is None:
-        typer.echo(description, nl=False)
-    else:
+        write_stdout(description)
+    if out is not None:
+        for note in identity.notes:
+            messages().print(escape(note))
         messages().print(escape(f"wrote {out}"))
 
 
 def _decoded(path: Path) -> Image:
     image = decode_image(read_bytes(path))
     if isinstance(image, str):
-        raise DataError(f"{path} is {image}.", culprits=[str(path)])
+        raise DataError(
+            f"{path} is {image}.",
+            culprits=[str(path)],
+            next_step="A photograph is needed, as png, jpg or tif; a page of a PDF has to be saved "
+            "as one.",
+        )
     return image
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from visioncal.errors import DataError
-from visioncal.files import decode_text
+from visioncal.files import decode_text, save_as_utf8
 
 # Thousands of poses fill a few megabytes as text; more is another kind of file.
 MAX_BYTES = 50_000_000
@@ -21,7 +21,7 @@ def read_bounded(path: Path, most: int = MAX_BYTES) -> bytes:
     """
     try:
         if not path.is_file():
-            what = "is no file" if path.exists() else "does not exist"
+            what = "is no regular file" if path.exists() else "does not exist"
             raise DataError(f"{path} {what}; a file is needed.", culprits=[str(path)])
         with path.open("rb") as file:
             data = file.read(most + 1)
@@ -49,7 +49,7 @@ def read_plain_text(path: Path) -> str:
         raise DataError(
             f"{path}, line {line}: a NUL byte; it is no text file in UTF-8.",
             culprits=[str(path)],
-            next_step="Save the file as UTF-8.",
+            next_step=save_as_utf8("UTF-16"),
         )
     return decode_text(data, str(path))
 

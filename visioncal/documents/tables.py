@@ -15,6 +15,8 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(n
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
 # What else str.splitlines splits at may stand inside a cell.
 _LINE_END = re.compile(r"\r\n|\r|\n")
+# Excel writes the separator itself into the first line, for itself.
+_SEPARATOR = re.compile(r"sep=([;\t,])", re.I)
 _COMMENTS = ("#", "%", "//")
 
 
@@ -50,7 +52,8 @@ def read_table(path: Path) -> TextTable:
     """Reads a table; the separator is a semicolon, a tab, a comma or blanks, in this order.
 
     A comment that has as many words as the table has columns, right before the first row, is the
-    header where there is no other. Behind semicolons a decimal comma is read as a point.
+    header where there is no other; a first line such as `sep=;` names the separator. Between
+    semicolons or tabs a decimal comma is read as a point.
 
     Raises:
         DataError: It is missing, no text, too large, empty, its rows differ in length, or two
@@ -60,6 +63,9 @@ def read_table(path: Path) -> TextTable:
     if text.count("\n") + text.count("\r") > MAX_VALUES:
         raise too_many(where)
     every = _LINE_END.split(text)
+    said = _SEPARATOR.fullmatch(every[0])
+    if said:
+        every[0] = ""
     lines = [
         (at, line)
         for at, line in enumerate(every, start=1)
@@ -67,7 +73,7 @@ def read_table(path: Path) -> TextTable:
     ]
     if not lines:
         raise DataError(f"{where} has no rows.", culprits=[where])
-    separator = next((it for it in ";\t," if it in lines[0][1]), " ")
+    separator = said[1] if said else next((it for it in ";\t," if it in lines[0][1]), " ")
     if sum(line.count(separator) + 1 for _, line in lines) > MAX_VALUES:
         raise too_many(where)
     numbers = [at for at, _ in lines]
@@ -85,6 +91,7 @@ def read_table(path: Path) -> TextTable:
             raise DataError(
                 f"{where}, line {at}: {len(row)} cells; {width} are needed, as in the first row.",
                 culprits=[f"{where}, line {at}"],
+                next_step="Where commas are decimal, separate the columns by semicolons or tabs.",
             )
     named = tuple(columns or (str(at) for at in range(1, width + 1)))
     return TextTable(path, _unique(named, where), columns is not None, tuple(rows), tuple(numbers))
@@ -98,7 +105,7 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
     except (csv.Error, ValueError) as error:
         raise DataError(f"{where}: {error}.", culprits=[where]) from error
     stripped = (it.strip() for it in cells)
-    if separator == ";":
+    if separator in ";\t":
         return tuple(
             it.replace(",", ".") if _DECIMAL_COMMA.fullmatch(it) else it for it in stripped
         )

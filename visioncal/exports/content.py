@@ -21,19 +21,19 @@ HAND_EYE: Mapping[Mount, str] = {"eye-in-hand": "flange_from_cam", "eye-to-hand"
 
 @dataclass(frozen=True)
 class Selection:
-    """What to export; what is empty is left to the format.
+    """What to export; what is None is left to the format.
 
     Attributes:
-        edge: A transform of the calibration by name; empty for the camera's.
+        edge: A transform of the calibration by name; None for the camera's.
         inverse: Whether its inverse is wanted.
         parent: What to call the frame in which the pose is given.
         child: What to call the frame whose pose it is; the camera, in a format of lenses.
     """
 
-    edge: str = ""
+    edge: str | None = None
     inverse: bool = False
-    parent: str = ""
-    child: str = ""
+    parent: str | None = None
+    child: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +90,15 @@ def select(calibration: Calibration, selection: Selection, names: Mapping[str, s
     Raises:
         DataError: There is no such transform, or a frame's name cannot be written safely.
     """
-    name = selection.edge or HAND_EYE[calibration.mount]
+    name = HAND_EYE[calibration.mount] if selection.edge is None else selection.edge
     edge, frames = _edge(calibration, name)
     if selection.inverse:
         edge, frames = _inverted(edge), (frames[1], frames[0])
         name = f"inverse of {name}"
-    parent = _frame(selection.parent or names.get(frames[0], frames[0]))
-    child = _frame(selection.child or names.get(frames[1], frames[1]))
+    parent, child = (
+        _frame(names.get(frame, frame) if chosen is None else chosen)
+        for frame, chosen in zip(frames, (selection.parent, selection.child), strict=True)
+    )
     if parent == child:
         raise DataError(
             f"parent and child are both named {parent!r}, but a transform joins two frames.",

@@ -61,14 +61,16 @@ def _find(name: str) -> ExportFormat:
 
 
 def _check_holds(form: ExportFormat, selection: Selection) -> None:
-    if form.holds == "lens" and (selection.edge or selection.inverse or selection.parent):
+    if form.holds == "lens" and (
+        selection.inverse or selection.edge is not None or selection.parent is not None
+    ):
         raise DataError(
             f"{form.name} holds the lens and no transform: --edge, --inverse and --parent do not "
             "go with it.",
             culprits=[form.name],
             next_step="Leave them out; --child names the camera.",
         )
-    hand_eye = selection.edge in ("", *HAND_EYE.values())
+    hand_eye = selection.edge in (None, *HAND_EYE.values())
     if form.holds == "hand-eye" and (selection.inverse or not hand_eye):
         raise DataError(
             f"{form.name} holds the camera's pose on the flange or in the base, and nothing else.",

@@ -3,6 +3,9 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
+
 from visioncal.errors import DataError
 from visioncal.finders.charuco import find_charuco
 from visioncal.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
@@ -16,8 +19,14 @@ from visioncal.types import Image, Target, TargetKind
 # Edges wider than this hide the bits of small markers [px].
 _MAX_BLUR_PX = 6.0
 _LISTED = 12
+# A picture whose sides are twice as long or more is searched at this size too.
+_USUAL_PIXELS, _MUCH_LARGER = 2e6, 0.5
 # So many markers on one lattice are a board, even where its corners are not found.
 _SURE_MARKERS = 8
+_MAYBE_CHARUCO = (
+    "The light squares are not plain: rather a ChArUco board whose markers are too blurred to "
+    "read. Take a sharper picture."
+)
 
 
 @dataclass(frozen=True)
@@ -88,30 +97,49 @@ def identify(image: Image) -> Identity:
     Raises:
         DataError: There is none; the message says what was looked for and what may help.
     """
-    markers = decode_markers(image)
-    boards = _charucos(image, markers)
-    singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
-    found = list(boards.values()) or [*_checkerboards(image), *singles]
-    if found:
-        best = max(found, key=lambda it: it.corners_seen)
-        beside = (it for it in singles if it is not best)
-        return replace(best, notes=(*best.notes, *_notes_beside(beside)))
+    identity = _identity(image)
+    if identity is not None:
+        return identity
+    # Details of a picture much larger than what the finders were made for hide its board.
+    scale = (_USUAL_PIXELS / image.size) ** 0.5
+    if scale < _MUCH_LARGER:
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        identity = _identity(np.asarray(small, np.uint8))
+        if identity is not None:
+            note = f"It is found only in the picture reduced to {small.shape[1]} pixels in width."
+            return replace(identity, notes=(note, *identity.notes))
     why = why_hard_to_see(image, _MAX_BLUR_PX)
     height, width = image.shape
     raise DataError(
         f"No target is seen in this image of {width} x {height} pixels"
         + (f": {why}." if why else ".")
         + " Looked for were ChArUco boards and single markers of OpenCV's ArUco and AprilTag "
-        f"dictionaries, and checkerboards of 3 x 3 inner corners or more; {len(markers)} patterns "
-        "looked like a marker.",
+        "dictionaries, and checkerboards of 3 x 3 inner corners or more; "
+        f"{len(decode_markers(image))} patterns looked like a marker.",
         next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
         "nearer, and tilted by less than 60 degrees.",
     )
 
 
+def _identity(image: Image) -> Identity | None:
+    """The target whose corners are the most; None where there is none."""
+    markers = decode_markers(image)
+    boards = _charucos(image, markers)
+    singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
+    found = list(boards.values()) or [*_checkerboards(image), *singles]
+    if not found:
+        return None
+    best = max(found, key=lambda it: it.corners_seen)
+    beside = (it for it in (*found, *singles) if it is not best)
+    return replace(best, notes=(*best.notes, *dict.fromkeys(_notes_beside(beside))))
+
+
 def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
     for it in others:
-        yield f"Beside it, marker {it.marker_ids[0]} of {it.dictionary} is seen."
+        if it.kind == "marker":
+            yield f"Beside it, marker {it.marker_ids[0]} of {it.dictionary} is seen."
+        elif _MAYBE_CHARUCO in it.notes:
+            yield f"Squares are seen around it. {_MAYBE_CHARUCO}"
 
 
 def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
@@ -190,6 +218,8 @@ def _checkerboards(image: Image) -> list[Identity]:
         return []
     count = squares.columns * squares.rows
     notes = []
+    if squares.filled:
+        notes.append(_MAYBE_CHARUCO)
     if squares.cut:
         notes.append("The board may go on outside the image.")
     if not squares.found:

@@ -15,11 +15,18 @@ _SEED = (3, 3)
 _MOST = 100
 # How far from a corner its four squares are looked at, in squares.
 _REACH = 0.25
+# The same beyond the last corners, where the image may show little white around the board.
+_REACHES_OUT = (_REACH, 0.1, 0.05)
 # Of the corners along one more line, so many must alternate for the line to belong to the board.
 _MOST_OF = 0.8
 # Fewer of them in the image do not tell whether the board goes on.
 _ENOUGH = 0.5
 _OUTWARD = {"left": (-1.0, 0.0), "top": (0.0, -1.0), "right": (1.0, 0.0), "bottom": (0.0, 1.0)}
+# Places in a square, from its middle, where a marker would be, in squares.
+_INSIDE = np.stack(np.meshgrid(*2 * [np.linspace(-0.3, 0.3, 7)]), axis=-1).reshape(-1, 2)
+# Grey levels that scatter more in light squares than in dark ones, by this share of the contrast,
+# are no shading.
+_TEXTURE = 0.1
 # A corner that is farther off is none of the board's, in squares.
 _OFF = 0.15
 _ATTEMPTS = (
@@ -37,12 +44,14 @@ class Squares:
         rows: The same along the other.
         cut: Whether it may go on outside the image.
         found: Whether the corner finder finds a board of just this size.
+        filled: Whether the light squares are not plain, as where markers are too blurred to read.
     """
 
     columns: int
     rows: int
     cut: bool
     found: bool
+    filled: bool
 
 
 @dataclass(frozen=True)
@@ -119,12 +128,12 @@ def _counted(image: Image, grid: FloatArray) -> Squares | None:
     shrunk = _shrunk(image, plane, extent, typical)
     if shrunk is None:
         return None
-    grown, cut = _grown(image, plane, shrunk, typical)
+    grown, cut = _grown(image, plane, shrunk)
     columns, rows = max(grown.size), min(grown.size)
     if rows < _SEED[1]:
         return None
     found = _is_there(image, (columns, rows))
-    return Squares(columns, rows, cut, found)
+    return Squares(columns, rows, cut, found, _filled(image, plane, shrunk, typical))
 
 
 def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
@@ -154,6 +163,16 @@ def _share_alternating(image: Image, plane: Plane, corners: FloatArray, typical:
     return float(alternating(values, corners, typical).mean())
 
 
+def _alternate_as(
+    image: Image, plane: Plane, extent: _Extent, corners: FloatArray, reach: float
+) -> bool:
+    """Whether more corners alternate as those of the board do, seen equally near."""
+    known = extent.corners()
+    typical = typical_contrast(contrasts(image, plane, known, reach), known)
+    values = contrasts(image, plane, corners, reach)
+    return bool(alternating(values, corners, typical).mean() >= _MOST_OF)
+
+
 def _shrunk(image: Image, plane: Plane, extent: _Extent, typical: float) -> _Extent | None:
     """Takes off the outer lines that do not alternate, the worst first."""
     while min(extent.size) >= _SEED[0]:
@@ -168,7 +187,7 @@ def _shrunk(image: Image, plane: Plane, extent: _Extent, typical: float) -> _Ext
     return None
 
 
-def _grown(image: Image, plane: Plane, extent: _Extent, typical: float) -> tuple[_Extent, bool]:
+def _grown(image: Image, plane: Plane, extent: _Extent) -> tuple[_Extent, bool]:
     """Adds the next lines that alternate; also says whether the image cuts one of them."""
     cut = False
     sides = list(_OUTWARD)
@@ -176,15 +195,30 @@ def _grown(image: Image, plane: Plane, extent: _Extent, typical: float) -> tuple
         side = sides[0]
         wider = _moved(extent, side, 1)
         corners = _outermost(wider, side).corners()
-        seen = plane.shows(image, corners + _REACH * np.array(_OUTWARD[side]))
-        enough = seen.mean() >= _ENOUGH
-        goes_on = enough and _share_alternating(image, plane, corners[seen], typical) >= _MOST_OF
+        for reach in _REACHES_OUT:
+            seen = plane.shows(image, corners + reach * np.array(_OUTWARD[side]))
+            enough = seen.mean() >= _ENOUGH
+            if enough:
+                break
+        goes_on = enough and _alternate_as(image, plane, extent, corners[seen], reach)
         if goes_on and seen.all():
             extent = wider
             continue
         cut = cut or goes_on or not enough
         sides.pop(0)
     return extent, cut
+
+
+def _filled(image: Image, plane: Plane, extent: _Extent, typical: float) -> bool:
+    """Whether the grey levels within light squares scatter as they do not in dark ones."""
+    inner = replace(extent, right=extent.right - 1, bottom=extent.bottom - 1)
+    squares = inner.corners()
+    scatter = plane.levels(image, squares[:, None] + 0.5 + _INSIDE).std(axis=1)
+    # Below and right of a corner at an even place the square is as light as `typical` says.
+    even = squares.sum(axis=1) % 2 == 0
+    light = even if typical > 0 else ~even
+    more = np.median(scatter[light]) - np.median(scatter[~light])
+    return bool(more > _TEXTURE * abs(typical))
 
 
 def _is_there(image: Image, size: tuple[int, int]) -> bool:

@@ -18,7 +18,7 @@ from visioncal.formats.boards import described_target, target_name
 from visioncal.formats.foreign import Foreign, rows_of
 from visioncal.formats.intrinsics import read_intrinsics
 from visioncal.formats.wishes import Wishes
-from visioncal.robot import read_robot_document
+from visioncal.robot import Robot, read_robot_document
 from visioncal.session import MemoryImages, Session
 from visioncal.session import columns as known
 from visioncal.types import Mount
@@ -98,7 +98,9 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     rows = _written(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
     files = {path: file for row in rows for path, file in row.image.items()}
+    notes = list(foreign.notes)
     if files:
+        _check_images(foreign.name, list(files.values()), notes)
         document["camera"] = _camera(foreign, list(files.values()))
     target = foreign.target if files else None
     if target is not None:
@@ -116,11 +118,26 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
         target_document=target,
         robot_document=robot,
     )
-    notes = list(foreign.notes)
-    missing = [file.name for path, file in files.items() if not session.images.exists(path)]
-    if missing:
-        notes.append(f"{len(missing)} of {len(files)} images are missing: {some_of(missing)}.")
+    if foreign.joints_rad is None and not foreign.robot.there.all():
+        absent = [foreign.robot.places[it] for it in np.flatnonzero(~foreign.robot.there)]
+        notes.append(
+            f"{len(absent)} of {len(rows)} rows have no pose of the robot: {some_of(absent)}."
+        )
     return replace(session, warnings=(*notes, *session.warnings))
+
+
+def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
+    missing = [it for it in files if not it.is_file()]
+    if not missing:
+        return
+    words = f"{len(missing)} of {len(files)} images are missing: {some_of([*map(str, missing)], 3)}"
+    if len(missing) == len(files):
+        raise DataError(
+            f"{name}: {words}.",
+            culprits=[str(missing[0])],
+            next_step="Name the folder that holds them with --images.",
+        )
+    notes.append(f"{words}. --images names the folder that holds them.")
 
 
 @dataclass(frozen=True)
@@ -305,11 +322,12 @@ def _image_bytes(file: Path) -> bytes:
 
 
 def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
-    """Names the robot's model in the document, and reads it."""
+    """Names the robot's model in the document, reads it, and checks that it is one."""
     if foreign.arm is None:
         return None
     arm = {it: str(value) for it, value in foreign.arm.items()}
     robot = read_robot_document(arm["model"], tip=arm.get("tip"))
+    Robot.from_document(robot)
     suffix = Path(arm["model"]).suffix.lower()
     document["robot"] = arm | ({"model": f"robot{suffix}"} if suffix in (".toml", ".urdf") else {})
     return robot

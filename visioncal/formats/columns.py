@@ -17,6 +17,7 @@ from visioncal.documents import (
     read_yaml,
 )
 from visioncal.errors import DataError
+from visioncal.files import some_of
 from visioncal.formats.fields import (
     Fields,
     fields_of_arrays,
@@ -26,7 +27,7 @@ from visioncal.formats.fields import (
     stamp_name,
     unnamed_columns,
 )
-from visioncal.formats.finding import IMAGE_ENDINGS, images_beside, images_named, listed
+from visioncal.formats.finding import images_beside, images_named, is_image_name, listed
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
 from visioncal.formats.pairing import with_camera_file
@@ -179,8 +180,10 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
         camera, more = poses_from(fields, camera_names, wishes.camera, "camera")
         notes = (*notes, *more)
     stamps = stamp_name(fields, used)
+    if stamps and stamps in unnamed["time"]:
+        notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if _view_numbers(fields) else {stamps}
-    paths, image_name = _images(fields, wishes, images)
+    paths, image_name, more = _images(fields, wishes, images, used)
     return Foreign(
         name=fields.name,
         robot=robot,
@@ -192,7 +195,7 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         views=fields.views or _view_numbers(fields),
         columns={it: cells for it, cells in fields.texts.items() if it not in used | {image_name}},
-        notes=notes,
+        notes=(*notes, *more),
     )
 
 
@@ -209,20 +212,44 @@ def _joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
 
 
 def _images(
-    fields: Fields, wishes: Wishes, folder: Path | None
-) -> tuple[tuple[Path | None, ...], str]:
-    """Pairs the rows with images: (paths, the field that names them)."""
-    name = wishes.image or next((it for it in _IMAGE_NAMES if it in fields.texts), "")
-    name = fields.find(name) if name else ""
-    if name in fields.texts and any(
-        it.lower().endswith(IMAGE_ENDINGS) or wishes.image for it in fields.texts[name]
-    ):
-        return images_named(fields.texts[name], fields.folder, wishes.images), name
-    beside = folder or wishes.images
+    fields: Fields, wishes: Wishes, folder: Path | None, taken: Collection[str]
+) -> tuple[tuple[Path | None, ...], str, tuple[str, ...]]:
+    """Pairs the rows with images: (paths, the field that names them, what was assumed)."""
+    beside = wishes.images or folder
+    name = fields.find(wishes.image) if wishes.image else _image_name(fields, beside, taken)
+    if name in fields.texts:
+        return images_named(fields.texts[name], fields.folder, wishes.images), name, ()
     if beside is None:
-        return (), ""
+        return (), "", ()
     views, numbered = fields.views or tuple(range(len(fields))), bool(fields.views)
-    return images_beside(beside, wishes.images, views, fields.places, numbered=numbered), ""
+    paths, notes = images_beside(beside, wishes.images, views, fields.places, numbered=numbered)
+    return paths, "", notes
+
+
+def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> str:
+    """Finds the field that names images, by its name or its cells; empty where none does.
+
+    Raises:
+        DataError: Several do, and none has a usual name.
+    """
+    free = {name: cells for name, cells in fields.texts.items() if name not in taken}
+    usual = (it for it in _IMAGE_NAMES if any(map(is_image_name, free.get(it, ()))))
+    if name := next(usual, ""):
+        return name
+    files = [] if folder is None else listed(folder)
+    there = {name for it in files if is_image_name(it.name) for name in (it.name, it.stem)}
+    naming = [
+        name
+        for name, cells in free.items()
+        if any(cells) and all(not it or is_image_name(it) or it in there for it in cells)
+    ]
+    if len(naming) > 1:
+        raise DataError(
+            f"{fields.name}: {some_of(naming)} name images; one column of them is needed.",
+            culprits=naming,
+            next_step="Say which with --image-column.",
+        )
+    return next(iter(naming), "")
 
 
 TABLE = ForeignFormat(

@@ -81,9 +81,14 @@ class Fields:
         if full in self.ragged:
             raise DataError(self.ragged[full], culprits=[full])
         if full not in self.numbers:
-            text = next((it for it in self.texts[full] if it and not is_number(it)), "")
+            told = zip(self.places, self.texts[full], strict=True)
+            odd = ((place, it) for place, it in told if it and not is_number(it))
+            # JSON has numbers in quotes as well.
+            place, text = next(odd, (self.places[0], self.texts[full][0]))
             raise DataError(
-                f"{self.name}: {full} holds {text[:40]!r}; numbers are needed.", culprits=[full]
+                f"{place}: {full} holds {text[:40]!r}; a number is needed.",
+                culprits=[place],
+                next_step="Correct the cell, or leave the whole pose of that row empty.",
             )
         return self.numbers[full].reshape(len(self), -1)
 
@@ -128,6 +133,12 @@ def fields_of_records(
         if any(isinstance(it, str) for it in values):
             texts[key] = tuple("" if it is None else str(it) for it in values)
             continue
+        if bad := [at for at, it in enumerate(values) if isinstance(it, list)]:
+            ragged[key] = (
+                f"{places[bad[0]]}: {key} is no regular list or matrix of numbers: its lists "
+                "differ in length, or hold something else."
+            )
+            continue
         arrays = [it if isinstance(it, np.ndarray) else None for it in values]
         shapes = Counter(it.shape for it in arrays if it is not None)
         if not shapes:
@@ -151,7 +162,8 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     """Joins the names of nested mappings by points; parsing has bounded their depth.
 
     Returns:
-        Texts, and arrays of few numbers; what is larger or null is left out.
+        Texts, arrays of few numbers, and lists that are no arrays; what is larger or null is left
+        out.
     """
     if isinstance(record, Mapping):
         flat: dict[str, object] = {}
@@ -164,7 +176,7 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     try:
         array = np.array(record, dtype=float)
     except (ValueError, TypeError, OverflowError):
-        return {}
+        return {name: record}
     return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
 
 
@@ -229,4 +241,15 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
         for name, numbers in fields.numbers.items()
         if name.lower() in _TIME_NAMES and name not in taken and numbers.size == len(fields)
     )
-    return next(iter(unnamed_columns(fields)["time"]), next(named, ""))
+    return next(iter(_unnamed_times(fields, taken)), next(named, ""))
+
+
+def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
+    """The times in a table without a header, where the poses stand behind them."""
+    unnamed = unnamed_columns(fields)
+    if not set(unnamed["robot"]) <= set(taken):
+        return ()
+    # Numbers of rows are no times.
+    return tuple(
+        it for it in unnamed["time"] if (np.diff(np.sort(fields.column(it)[:, 0])) != 1).any()
+    )

@@ -52,7 +52,7 @@ def images_in(folder: Path) -> tuple[Path, ...]:
     Raises:
         DataError: There are none.
     """
-    found = tuple(it for it in listed(folder) if it.suffix.lower() in IMAGE_ENDINGS)
+    found = tuple(it for it in listed(folder) if is_image_name(it.name))
     if not found:
         raise DataError(
             f"{folder} has no images (png, jpg, tif).",
@@ -84,11 +84,27 @@ def images_named(
 
     Returns:
         (n,) paths; one that does not exist is where the source says that it should be.
+
+    Raises:
+        DataError: A name leaves the folder, or is of no image.
     """
     if folder is None:
-        return tuple(below(base, name) if name else None for name in names)
+        found = [_beside(base, name) if name else None for name in names]
+    else:
+        found = _found(names, folder)
+    for name, path in zip(names, found, strict=True):
+        if path is not None and not is_image_name(path.name):
+            raise DataError(
+                f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif or bmp is needed.",
+                culprits=[str(name)[:80]],
+                next_step="Correct it, or name the column of the images with --image-column.",
+            )
+    return tuple(found)
+
+
+def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
     there = images_in(folder)
-    by_name = {it.name: it for it in there}
+    by_name = {it.stem: it for it in there} | {it.name: it for it in there}
     by_number = _unique_numbers(there)
     wanted = [number_in(it) for it in names if it]
     numbers_tell = len(set(wanted)) == len(wanted) and None not in wanted
@@ -103,12 +119,24 @@ def images_named(
         if match is None and numbers_tell and number is not None:
             match = by_number.get(number)
         found.append(match or below(folder, plain))
-    return tuple(found)
+    return found
 
 
-def images_of(
+def is_image_name(name: str) -> bool:
+    """Tells whether a name ends as those of images do."""
+    return name.lower().endswith(IMAGE_ENDINGS)
+
+
+def _beside(base: Path, name: str) -> Path:
+    """Finds a named image where the name says, else in the folder `images` beside the source."""
+    path = below(base, name)
+    inner = base / "images" / path.name
+    return inner if not path.exists() and is_inside(inner, base) and inner.exists() else path
+
+
+def _images_of(
     folder: Path, views: Sequence[int], labels: Sequence[str], *, numbered: bool
-) -> tuple[Path | None, ...]:
+) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
     """Pairs rows with the images of a folder, by number or in order.
 
     Args:
@@ -119,7 +147,7 @@ def images_of(
             in natural order, and must be as many.
 
     Returns:
-        (n,) paths; None in a row whose number no image has.
+        (n,) paths, None in a row whose number no image has; and a note where order decides.
 
     Raises:
         DataError: Their numbers differ, with what is over.
@@ -127,7 +155,7 @@ def images_of(
     there = images_in(folder)
     by_number = _unique_numbers(there)
     if numbered and len(by_number) == len(there) and by_number.keys() & set(views):
-        return tuple(by_number.get(it) for it in views)
+        return tuple(by_number.get(it) for it in views), ()
     if len(there) != len(views):
         first, last = there[0].name, there[-1].name
         raise DataError(
@@ -136,7 +164,10 @@ def images_of(
             culprits=[str(folder)],
             next_step="Remove what is over, or name each row's image with --image-column.",
         )
-    return there
+    return there, (
+        f"Rows and images are paired in order, {labels[0]} with {there[0].name}, {labels[-1]} with "
+        f"{there[-1].name}; --image-column names a column that tells each row's image.",
+    )
 
 
 def images_beside(
@@ -146,16 +177,19 @@ def images_beside(
     labels: Sequence[str],
     *,
     numbered: bool,
-) -> tuple[Path | None, ...]:
-    """Pairs rows, as `images_of` does, with the images of `chosen`, else with any in the folder.
+) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
+    """Pairs rows by number or in order with the images of `chosen`, else with any in the folder.
+
+    Returns:
+        (n,) paths, None in a row whose number no image has; and a note where order decides.
 
     Raises:
-        DataError: As `images_of`; `chosen` has no images.
+        DataError: `chosen` has no images, or they are not as many as the rows.
     """
-    beside = any(it.suffix.lower() in IMAGE_ENDINGS for it in listed(folder))
+    beside = any(is_image_name(it.name) for it in listed(folder))
     if chosen is None and not beside:
-        return ()
-    return images_of(chosen or folder, views, labels, numbered=numbered)
+        return (), ()
+    return _images_of(chosen or folder, views, labels, numbered=numbered)
 
 
 def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:

@@ -65,8 +65,9 @@ def _read_hand_eye(path: Path, wishes: Wishes) -> Foreign:
             f"{file}: static_camera is {static!r}; true or false is needed.", culprits=[str(file)]
         )
     notes: list[str] = []
-    lens = _lens(document, str(file), notes)
-    target = _target(document, notes)
+    # What the user says stands in place of what the source does.
+    lens = None if wishes.intrinsics else _lens(document, str(file), notes)
+    target = None if wishes.target else _target(document, notes)
     numbered = [number_in(it) for it in places]
     views = tuple(it for it in numbered if it is not None)
     return Foreign(

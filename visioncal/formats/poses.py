@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from visioncal.documents import as_numbers
 from visioncal.errors import DataError
 from visioncal.formats.fields import Fields
 from visioncal.formats.wishes import PoseWishes
+from visioncal.session.columns import SELECTORS
 from visioncal.types import FloatArray
 
 # Names under which pose pairs are commonly stored, the most telling first.
@@ -30,8 +31,12 @@ ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
     ("x", "y", "z", "qx", "qy", "qz", "qw"),
     ("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
     ("x", "y", "z", "rx", "ry", "rz"),
-    ("X", "Y", "Z", "A", "B", "C"),
+    ("x", "y", "z", "a", "b", "c"),
+    ("x", "y", "z", "w", "p", "r"),
+    ("x", "y", "z", "q1", "q2", "q3", "q4"),
     ("pose",),
+    ("robot",),
+    ("robot.rvec", "robot.tvec"),
 )
 CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
     ("cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw"),
@@ -45,8 +50,14 @@ CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
     ("camera_poses",),
     ("rvec", "tvec"),
     ("rvecs", "tvecs"),
+    ("camera",),
+    ("camera.rvec", "camera.tvec"),
 )
 JOINT_KEYS: tuple[str, ...] = ("joint_pose", "joints", "joint_angles", "joint_positions", "q")
+
+# A turn, and what rounding adds; joints may count some turns.
+_MOST_RAD = 2 * np.pi + 0.01
+_MOST_TURNS_RAD = 10 * 2 * np.pi
 
 _ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
@@ -55,18 +66,36 @@ _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 def known_names(
     fields: Fields, candidates: Sequence[tuple[str, ...]], taken: Collection[str]
 ) -> tuple[str, ...]:
-    """Finds the first of several sets of names that are all there and free.
+    """Finds the first of several sets of names that are all there and free, in any case of letters.
+
+    What holds no numbers counts where its name tells enough, so that it is refused by its place.
 
     Returns:
         The fields' full names; empty where no set is whole.
     """
-    free = [it for it in fields.numbers if it not in taken]
+    # One number in a field called `robot` or `camera` tells which of several it is.
+    numbers = (it for it, them in fields.numbers.items() if them.ndim > 1 or it not in SELECTORS)
+    holding = [*numbers, *fields.ragged]
+    worded = (it for it, cells in fields.texts.items() if any(cells) and it not in SELECTORS)
+    names = list(dict.fromkeys([*holding, *worded]))
+    whole = _sets_of_names(names, candidates, taken)
+    return next((it for it in whole if len(it) > 1 or it[0] in holding), ())
+
+
+def _sets_of_names(
+    names: Sequence[str], candidates: Sequence[tuple[str, ...]], taken: Collection[str]
+) -> Iterator[tuple[str, ...]]:
+    """Yields the full names of every candidate that is whole."""
+    free = [it for it in names if it not in taken]
     endings = Counter(it.rsplit(".", 1)[-1] for it in free)
     full = {end: it for it in free if endings[end := it.rsplit(".", 1)[-1]] == 1}
     full |= {it: it for it in free}
-    return next(
-        (tuple(full[it] for it in them) for them in candidates if full.keys() >= set(them)), ()
-    )
+    # A name in the very letters of a candidate goes before one in other letters.
+    full = {it.lower(): name for it, name in full.items()} | full
+    for them in candidates:
+        found = tuple(full.get(it, full.get(it.lower(), "")) for it in them)
+        if all(found):
+            yield found
 
 
 def pose_names(
@@ -152,7 +181,36 @@ def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> Float
     if bad.any():
         place = fields.places[int(np.argmax(bad))]
         raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
+    if not degrees and np.abs(joints).max(initial=0.0) > _MOST_TURNS_RAD:
+        raise DataError(
+            f"{fields.name}: joint angles up to {np.abs(joints).max():.0f} are no radians.",
+            culprits=list(names),
+            next_step="Say --joint-unit deg.",
+        )
     return np.deg2rad(joints) if degrees else joints
+
+
+def check_radians(poses: PoseNumbers, wishes: PoseWishes, whose: str) -> None:
+    """Checks that angles of which nobody says what they are can be radians.
+
+    Raises:
+        DataError: They turn farther than once about.
+    """
+    there, rotation = poses.there, poses.reading.rotation
+    radians = rotation == "rotation-vector" or rotation.endswith("-rad")
+    if wishes.form is not None or not radians or not there.any():
+        return
+    largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
+    row = int(largest.argmax())
+    if largest[row] > _MOST_RAD:
+        raise DataError(
+            f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
+            "too large for radians, and the source does not say what it is.",
+            culprits=[poses.places[row]],
+            next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
+            "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg "
+            "...; or let --guess find it.",
+        )
 
 
 def as_matrix(value: object, where: str) -> FloatArray:
@@ -218,8 +276,10 @@ def _likely_rotation(
         return "matrix", ()
     if size == 4:
         ends = "".join(it[-1].lower() for it in names)
-        rotation = f"quaternion-{'wxyz' if ends == 'wxyz' else 'xyzw'}"
-        if wishes.form is not None or ends in ("xyzw", "wxyz"):
+        # ABB counts q1 to q4 from the scalar on.
+        counted = [it[-2:].lower() for it in names] == ["q1", "q2", "q3", "q4"]
+        rotation = f"quaternion-{'wxyz' if counted or ends == 'wxyz' else 'xyzw'}"
+        if wishes.form is not None or counted or ends in ("xyzw", "wxyz"):
             return rotation, ()
         return rotation, (
             f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
@@ -242,7 +302,11 @@ def _checked(
     infinite = np.isinf(numbers.positions).any(axis=1) | np.isinf(numbers.rotations).any(axis=1)
     if infinite.any():
         place = numbers.places[int(np.argmax(infinite))]
-        raise DataError(f"{place}: a number of the pose is infinite.", culprits=[place])
+        raise DataError(
+            f"{place}: a number of the pose is infinite.",
+            culprits=[place],
+            next_step="Correct it, or leave the whole pose of that row empty.",
+        )
     if wishes.unit is None and wishes.form not in POSE_FORMS:
         notes = (
             *notes,

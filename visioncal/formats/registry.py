@@ -13,6 +13,7 @@ from visioncal.formats.folder import FOLDER
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat, OwnFormat
 from visioncal.formats.industrial import HAND_EYE, KINEMATICS
+from visioncal.formats.poses import check_radians
 from visioncal.formats.recording import RECORDING
 from visioncal.formats.rereading import load_in_doubt, reread, reread_session
 from visioncal.formats.ros import EASY_HANDEYE, MOVEIT
@@ -76,6 +77,10 @@ def convert(
     own = next((it for it in OWN_FORMATS if form is None and it.recognises(source)), None)
     if own is None:
         foreign = read_foreign(source, wishes, form)
+        if choose is None:
+            check_radians(foreign.robot, wishes.robot, "robot")
+            if foreign.camera is not None:
+                check_radians(foreign.camera, wishes.camera, "camera")
         session = assemble(foreign if choose is None else reread(foreign, choose(foreign)))
     elif wishes != _NO_WISHES:
         raise DataError(
@@ -125,6 +130,21 @@ def write_session(session: Session, dest: Path) -> None:
         )
 
 
+def _check_source(source: Path) -> None:
+    if not source.exists():
+        raise DataError(
+            f"{source} does not exist.",
+            culprits=[str(source)],
+            next_step="Check the path and its spelling.",
+        )
+    if not (source.is_file() or source.is_dir()):
+        raise DataError(
+            f"{source} is no regular file; a file or a folder is needed.",
+            culprits=[str(source)],
+            next_step="Save what it gives as a file first.",
+        )
+
+
 def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
     is_folder = not _format_for(dest).suffix
     # An empty folder is free for a session's folder, which looks for itself.
@@ -134,12 +154,7 @@ def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
 
 
 def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
-    if not source.exists():
-        raise DataError(
-            f"{source} does not exist.",
-            culprits=[str(source)],
-            next_step="Check the path and its spelling.",
-        )
+    _check_source(source)
     names = [it.name for it in FOREIGN_FORMATS]
     if form is not None and form not in names:
         raise DataError(

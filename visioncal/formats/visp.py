@@ -37,16 +37,17 @@ def _read(path: Path, wishes: Wishes) -> Foreign:
     views = tuple(number_in(it.name) or 0 for it in files)
     places = tuple(it.name for it in files)
     notes: list[str] = []
+    images, paired = images_beside(path, wishes.images, views, places, numbered=True)
     robot = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
     return Foreign(
         name=path.resolve().name,
         robot=wishes.robot.applied_to(robot),
-        images=images_beside(path, wishes.images, views, places, numbered=True),
+        images=images,
         mount=_mount(path, notes),
-        target=_target(path, notes),
+        target=None if wishes.target else _target(path, notes),
         lens=_lens(path, notes),
         views=views,
-        notes=tuple(notes),
+        notes=(*notes, *paired),
     )
 
 

@@ -33,11 +33,13 @@ def _read(path: Path, wishes: Wishes) -> Foreign:
     numbers = [number_in(it.name) for it in files]
     views = tuple(it for it in numbers if it is not None)
     places = tuple(it.name for it in files)
+    images, notes = images_beside(path, wishes.images, views, places, numbered=True)
     return Foreign(
         name=path.resolve().name,
         robot=wishes.robot.applied_to(matrix_numbers(matrices, places, unit="mm")),
-        images=images_beside(path, wishes.images, views, places, numbered=True),
+        images=images,
         views=views,
+        notes=notes,
     )
 
 

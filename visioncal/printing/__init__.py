@@ -3,7 +3,7 @@
 from visioncal.printing.files import write_board
 from visioncal.printing.page import Page, Sheet, arrange, pages_named
 from visioncal.printing.pattern import Pattern, draw_pattern
-from visioncal.printing.request import Request, requested_target
+from visioncal.printing.request import Request, requested_target, side_metres
 
 __all__ = [
     "Page",
@@ -14,5 +14,6 @@ __all__ = [
     "draw_pattern",
     "pages_named",
     "requested_target",
+    "side_metres",
     "write_board",
 ]

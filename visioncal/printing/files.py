@@ -13,7 +13,8 @@ from visioncal.types import Target
 # Beyond this many pixels a page takes gigabytes to draw.
 _MOST_PIXELS = 2.5e8
 _LEAST_DPI = 50.0
-_LONGEST_NAME = 100
+# Whatever its letters, such a name keeps below the 255 bytes that file systems take.
+_LONGEST_NAME = 60
 
 
 def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
@@ -29,7 +30,7 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
         force: Whether files that are there may be replaced.
 
     Returns:
-        The files, the PDF first.
+        The files that were written, the PDF first.
 
     Raises:
         DataError: A file is there already, the folder cannot be written, or the PNG would be too
@@ -42,10 +43,12 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
     _check_name(name, not_in_font(name))
     _check_dpi(sheet, dpi)
     files = {ending: folder / f"{name}.{ending}" for ending in ("pdf", "svg", "png", "toml")}
-    kept = _describes(files["toml"], sheet.target)
-    for ending, path in files.items():
-        if ending != "toml" or not kept:
-            check_free(path, force=force)
+    # The folder may have a name that no file system takes.
+    with named_errors(folder):
+        kept = _describes(files["toml"], sheet.target)
+        for ending, path in files.items():
+            if ending != "toml" or not kept:
+                check_free(path, force=force)
     drawn: dict[str, bytes | str] = {
         "pdf": to_pdf(sheet),
         "svg": to_svg(sheet),
@@ -57,7 +60,7 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
         folder.mkdir(parents=True, exist_ok=True)
     for ending, content in drawn.items():
         write_atomically(files[ending], content)
-    return tuple(files.values())
+    return tuple(files[ending] for ending in drawn)
 
 
 def _check_name(name: str, not_in_font: str) -> None:
@@ -67,7 +70,7 @@ def _check_name(name: str, not_in_font: str) -> None:
         raise DataError(
             f"{name[:_LONGEST_NAME]!r} cannot be the name of files and stand on the print"
             + (f": {' '.join(map(repr, wrong))} cannot." if wrong else "."),
-            culprits=[name],
+            culprits=[name[:_LONGEST_NAME]],
             next_step=f"Use up to {_LONGEST_NAME} letters, digits, _ and -.",
         )
 

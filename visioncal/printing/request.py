@@ -3,14 +3,17 @@
 from dataclasses import dataclass
 from typing import Any
 
+from visioncal.errors import DataError
 from visioncal.printing.page import Page, arrange, largest_side_mm
-from visioncal.targets import aruco_dictionary, metres, target_from_document
+from visioncal.targets import LARGEST_M, aruco_dictionary, metres, target_from_document
 from visioncal.types import Target, TargetKind
 
 # A marker's share of its square: it leaves at least one module of white on every side.
 _MARKER_SHARE = 0.75
 # Smaller squares are lost to the printer's dots.
 _LEAST_MM = 5
+# Nobody measures a smaller one to its 0.1 %.
+_SMALLEST_MM = 0.1
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 
 
@@ -41,6 +44,25 @@ class Request:
     name: str = ""
 
 
+def side_metres(option: str, side_mm: float) -> float:
+    """Turns a side given in millimetres into metres.
+
+    Args:
+        option: By which option it was given, for messages.
+        side_mm: Side of a square or of a marker [mm].
+
+    Raises:
+        DataError: It is no number, or none that a board could have.
+    """
+    most_mm = 1e3 * LARGEST_M
+    if not _SMALLEST_MM <= side_mm <= most_mm:
+        raise DataError(
+            f"{option} is {side_mm:g}; {_SMALLEST_MM:g} to {most_mm:g} mm are possible.",
+            culprits=[option],
+        )
+    return metres(side_mm)
+
+
 def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
     """Builds the target that is wished for.
 
@@ -64,7 +86,7 @@ def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
 
 def _target(request: Request, square_mm: float) -> Target:
     document: dict[str, Any] = {"kind": request.kind}
-    side_m = metres(square_mm)
+    side_m = side_metres("--size-mm" if request.kind == "marker" else "--square-mm", square_mm)
     if request.kind == "marker":
         document |= {"size_m": side_m, "dictionary": request.dictionary or "DICT_APRILTAG_36h11"}
         wishes: dict[str, int | None] = {"id": request.marker_id}
@@ -80,7 +102,7 @@ def _target(request: Request, square_mm: float) -> Target:
             marker_mm = round(_MARKER_SHARE * square_mm, 6)
             marker_mm = float(int(marker_mm)) if square_mm >= 2 * _LEAST_MM else marker_mm
         document |= {
-            "marker_m": metres(marker_mm),
+            "marker_m": side_metres("--marker-mm", marker_mm),
             "dictionary": request.dictionary or _enough(request),
             "legacy": request.legacy,
         }
