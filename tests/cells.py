@@ -6,6 +6,7 @@ import numpy as np
 
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
+from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell
 from visioncal.transforms import invert, log
@@ -29,8 +30,11 @@ def session_of(cell: Cell) -> Session:
     )
 
 
-def known_of(cell: Cell, **changes) -> Known:
-    """What is known after detection."""
+def known_of(cell: Cell, *, joints: bool = True, **changes) -> Known:
+    """What is known after detection; without `joints`, poses are all that is said of the robot."""
+    if joints:
+        arm = {"joints_rad": dict(enumerate(cell.joints)), "robot": load_robot(cell.options.robot)}
+        changes = arm | changes
     poses = dict(enumerate(cell.base_from_flange))
     return replace(
         Known(session_of(cell), "joint"),

@@ -40,6 +40,8 @@ CONTRACT_KEYS = {
     "rms",
     "validation",
     "verdict",
+    "board",
+    "uncertainty",
 }
 
 
@@ -275,7 +277,7 @@ def test_a_wrong_view_spoils_the_verdict(tmp_path):
     folder = write_session(simulate(options), tmp_path / "wrong", images=False)
     verdict = visioncal.calibrate(folder).verdict
     assert verdict.status != "good"
-    assert any("disagree with the others" in it for it in verdict.reasons)
+    assert any("were left out" in it for it in verdict.reasons)
 
 
 def test_a_wrong_lens_spoils_the_verdict(rendered, session_copy):
@@ -285,8 +287,15 @@ def test_a_wrong_lens_spoils_the_verdict(rendered, session_copy):
     lines = f"matrix = {(truth.matrix * 1.5).tolist()}\ndistortion = [0, 0, 0, 0, 0]\n"
     wrong = text.replace("[camera]\n", "[camera]\n" + lines)
     (session_copy / "session.toml").write_text(wrong, encoding="utf-8")
-    verdict = visioncal.calibrate(session_copy).verdict
-    assert verdict.status == "bad"
+    result = visioncal.calibrate(session_copy)
+    assert result.verdict.status == "check"
+    assert any("The given intrinsics do not fit" in it for it in result.verdict.reasons)
+    # Nothing is left of what was given: the lens is that of the images, within its sigma.
+    away = result.camera.camera.matrix - truth.matrix
+    assert np.all(np.abs(away) < 4.0 * np.sqrt(np.diag(result.camera.covariance)[:4]))
+    held = wrong.replace("[camera]\n", '[camera]\nintrinsics = "hold"\n')
+    (session_copy / "session.toml").write_text(held, encoding="utf-8")
+    assert visioncal.calibrate(session_copy).verdict.status == "bad"
 
 
 def test_one_view_off_by_five_millimetres_is_named(tmp_path):
@@ -301,7 +310,7 @@ def test_one_view_off_by_five_millimetres_is_named(tmp_path):
     with_rows(folder, shifted)
     verdict = visioncal.calibrate(folder).verdict
     assert verdict.status != "good"
-    assert any("View 4 stands out" in it for it in verdict.reasons)
+    assert any("View 4 was left out" in it and "5.1 mm" in it for it in verdict.reasons)
 
 
 def test_looking_again_and_again_from_one_stop_adds_no_views(tmp_path):

@@ -96,11 +96,11 @@ def test_industrial_calibration(real_data, calibrated):
     # Within what 15 views leave open.
     sigma_mm = result.edges["base_from_cam"].sigma_mm
     assert away_mm(result, "base_from_cam", [-18.4, 1263.7, 290.0]) < 3 * sigma_mm
-    # The session that was made of the same data by hand gives the same camera: the numbers are the
-    # same to the last digit, and the fit settles to a thousandth of its sigma.
+    # The session that was made of the same data by hand states its squares to 0.06 %, and not to
+    # the 0.1 % that are taken where nothing is said, which moves the camera by less than its sigma.
     by_hand = visioncal.calibrate(real_data / "sessions/ric_charuco_eye_to_hand")
     x_mm = 1e3 * by_hand.transforms["base_from_cam"].translation
-    assert away_mm(result, "base_from_cam", x_mm) < 1e-3 * sigma_mm
+    assert away_mm(result, "base_from_cam", x_mm) < 0.3 * sigma_mm
 
 
 def test_visp_in_the_hand(real_data, calibrated):
@@ -109,13 +109,16 @@ def test_visp_in_the_hand(real_data, calibrated):
         "--images",
         real_data / "sessions/visp_franka_eye_in_hand/images",
     )
-    assert not result.camera.estimated
-    # The session that was made of the same data by hand states the lens to a thousandth of a
-    # pixel, which moves the camera by less than a micrometre.
+    # What both were told of the lens does not fit the images, so that it was refined.
+    assert result.camera.estimated
+    # The session that was made of the same data by hand states its squares to another sigma, which
+    # moves the camera by little of its own.
     by_hand = visioncal.calibrate(real_data / "sessions/visp_franka_eye_in_hand")
     x_mm = 1e3 * by_hand.transforms["flange_from_cam"].translation
-    assert away_mm(result, "flange_from_cam", x_mm) < 1e-3
-    assert result.rms.mm == pytest.approx(by_hand.rms.mm, abs=1e-3)
+    assert (
+        away_mm(result, "flange_from_cam", x_mm) < 0.1 * by_hand.edges["flange_from_cam"].sigma_mm
+    )
+    assert result.rms.mm == pytest.approx(by_hand.rms.mm, rel=0.05)
     sigma_mm = result.edges["flange_from_cam"].sigma_mm
     assert away_mm(result, "flange_from_cam", [58.2, -34.2, -42.6]) < 3 * sigma_mm
 

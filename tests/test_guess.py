@@ -273,7 +273,8 @@ def pairs_session(poses):
 def test_a_poor_calibration_says_how_the_poses_should_be_read(name):
     planted = MISTAKES[name](cell_poses("eye-in-hand"), np.random.default_rng(0))
     verdict = visioncal.calibrate(pairs_session(planted)).verdict
-    assert verdict.status == "bad"
+    # Two exchanged rows are left out, and the rest is sound.
+    assert verdict.status == ("check" if name == "two rows exchanged" else "bad")
     assert "visioncal convert SESSION FIXED --guess" in verdict.reasons[0]
 
 

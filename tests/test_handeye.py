@@ -11,8 +11,8 @@ from visioncal.errors import DegenerateError
 from visioncal.estimator.closure import (
     Closure,
     Edges,
-    Lens,
     Noise,
+    Shared,
     closure_jacobian,
     estimate_noise,
     fit_closure,
@@ -54,18 +54,20 @@ def some_motion(count, seed=0, tilt=0.5):
     return compose(rotation, rng.uniform(-0.3, 0.3, (count, 3)))
 
 
-def test_jacobian_agrees_with_central_differences():
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_jacobian_agrees_with_central_differences(mount):
     x, z = some_edges()
     rng = np.random.default_rng(0)
-    lens = Lens(np.eye(3), rng.normal(size=(5, 6, 3)))
-    data = replace(made_up(some_motion(5), x, z, Noise(0.05, 0.02)), lens=lens)
+    by_camera, by_flange = rng.normal(size=(2, 5, 6, 3))
+    shared = Shared(np.eye(3), np.zeros(3), np.zeros(3), by_camera, by_flange)
+    data = replace(made_up(some_motion(5), x, z, Noise(0.05, 0.02), mount=mount), shared=shared)
     edges = Edges(x, z, np.zeros(3))
     analytic, step = closure_jacobian(data, edges), 1e-6
     for axis in range(15):
         shift = np.zeros(15)
         shift[axis] = step
         moved = [edges.moved(sign * shift) for sign in (1, -1)]
-        ahead, behind = (log(invert(it.z) @ data.through(it.lens).placed(it.x)) for it in moved)
+        ahead, behind = (log(invert(it.z) @ data.under(it.shared).placed(it.x)) for it in moved)
         # Truncation step^2, rounding 1e-16 / step = 1e-10, and the series' own cut of 1e-9.
         np.testing.assert_allclose(analytic[:, :, axis], (ahead - behind) / (2 * step), atol=5e-9)
 
@@ -161,7 +163,7 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
 
 def test_a_stop_counts_once_however_often_it_is_looked_at():
     cell = simulate(CellOptions(seed=4, views=12, pixel_sigma_px=0.1))
-    data = calibrated(cell).closure(range(12))
+    data = replace(calibrated(cell).closure(range(12)), shared=None)
     once = solve_hand_eye(data)
     again = np.repeat(np.arange(12), 3)
     thrice = Closure(

@@ -10,12 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from findings import CONTRADICTS, healthy, sick, with_contradiction, with_findings
 from samples import CAMERA, REJECTED, Sample, made_up
 
 from visioncal.calibration import Calibration, CameraResult, Rms, Verdict, VerdictStatus
 from visioncal.errors import DataError
 from visioncal.outputs import write_outputs
-from visioncal.pipeline import Run
+from visioncal.pipeline import Run, run
 from visioncal.recording import write_recording
 from visioncal.report import write_report
 from visioncal.report.advice import listed, next_steps, suspects
@@ -25,7 +26,9 @@ from visioncal.report.thumbnails import thumbnail
 from visioncal.report.trends import twist_of
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
+from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.stored import load_stored
+from visioncal.types import Target
 
 
 class Page(HTMLParser):
@@ -152,6 +155,105 @@ def test_advice_without_outliers_points_at_what_views_share(sample: Sample) -> N
         "No view stands out, so look for what all of them share: a board that moved."
     )
     assert steps[1:] == ("Add views tilted by 20 degrees.",)
+
+
+def section(page: Page, heading: str, end: str) -> str:
+    """The words from the last heading of that name on."""
+    return page.words[page.words.rindex(heading) : page.words.rindex(end)]
+
+
+def test_sources_of_uncertainty_are_told_with_their_shares(sample: Sample) -> None:
+    page = Page(render(with_findings(sample, sick()), sample.session, sample.evidence))
+    words = section(page, "Where the uncertainty comes from", "How it was obtained")
+    assert "0.50 m from the camera" in words
+    assert "in the frame of the flange with a sigma of 1.2 mm" in words
+    assert "right to within 0.16 mm" in words
+    assert "94 % of the variance, comes from the arm; more views would hardly lower it" in words
+    # The bars, the largest first.
+    labels = ["errors of the arm's links", "the robot, from stop to stop", "total"]
+    assert sorted(labels, key=words.index) == labels
+    assert "1.2 (94 %)" in words
+    assert "robot translation 0.051 mm 95 %: 0.041 to 0.062" in words
+    assert "sigma / largest accepted" in words
+
+
+def test_board_and_arm_are_told_where_something_is_wrong_with_them(sample: Sample) -> None:
+    page = Page(render(with_findings(sample, sick()), sample.session, sample.evidence))
+    words = section(page, "Where the uncertainty comes from", "How it was obtained")
+    assert f"squares, stated 30.000 mm {chr(177)} 0.030" in words
+    # 30 mm with 0.2 % more of scale and 0.1 % of aspect, half of it on each side.
+    assert f"squares, found 30.045 {chr(215)} 30.075 mm {chr(177)} 0.030, between" in words
+    assert "bend 0.29 mm of depth" in words
+    assert "depth [mm]" in words
+    assert "typically off by 0.46 mm, 0.053 deg" in words
+    assert "likelihood ratio 356 " in words
+    assert "estimated along with the result" in words
+    assert "The arm's errors that were estimated are still in here." in page.words
+
+
+def test_healthy_cells_look_calm(sample: Sample) -> None:
+    page = Page(render(with_findings(sample, healthy()), sample.session, sample.evidence))
+    words = section(page, "Where the uncertainty comes from", "How it was obtained")
+    assert "64 % of the variance, comes from the robot; more stops would lower it" in words
+    assert "squares, found as stated" in words
+    assert "bend none flat within what is seen" in words
+    assert "0.0010 (<1 %)" in words
+    for absent in ("depth [mm]", "Arm", "likelihood"):
+        assert absent not in words
+
+
+def test_closed_forms_look_for_no_other_board(sample: Sample) -> None:
+    park = sample.calibration.solvers["park"].matrices
+    edges = {
+        name: replace(edge, matrix=park[name]) for name, edge in sample.calibration.edges.items()
+    }
+    calibration = replace(with_findings(sample, healthy()), edges=edges)
+    words = Page(render(calibration, sample.session, ())).words
+    assert "size and shape as stated a closed form takes them as they are" in words
+
+
+def test_exact_cells_and_single_markers_have_a_report() -> None:
+    many = made_up(5, images=False)
+    documents = sick()
+    documents["uncertainty"]["budget_mm"] = {"poses": 0.0, "total": 0.0}
+    documents["uncertainty"]["spectrum"] = [0.0] * 12
+    documents["board"]["shape"]["bow_xy"] = 3e-4
+    marker = Target("marker", "marker", 1, 1, 0.1, 1e-4, dictionary="DICT_4X4_50", marker_id=7)
+    session = replace(many.session, target=marker)
+    words = Page(render(with_findings(many, documents), session, many.evidence)).words
+    assert "noise of the poses" in words
+    assert "depth [mm]" in words
+    assert "The largest part" not in words
+    assert "sigma / largest accepted" not in words
+
+
+def test_older_calibrations_still_tell_the_noise(html: str) -> None:
+    words = section(Page(html), "Where the uncertainty comes from", "How it was obtained")
+    assert "robot rotation 0.0042 deg" in words
+    assert "variance" not in words
+    assert "Board" not in words
+
+
+def test_views_that_contradict_the_others_are_set_apart(sample: Sample) -> None:
+    html = render(with_contradiction(sample), sample.session, sample.evidence)
+    page, rows = Page(html), [" ".join(row.split()) for row in Page(html).rows]
+    assert f"view 6 not used {CONTRADICTS}" in rows
+    assert any(row.startswith("6 ") and row.endswith(" left out") for row in rows)
+    assert any(row.startswith("3 ") and row.endswith(" no") for row in rows)
+    assert "Find out what went wrong with view 6, which the result does not use" in page.words
+    assert "Red: left out, since it contradicts the others." in page.words
+    # Its picture shows how far off it is.
+    assert html[html.index("View 6:") - 2000 : html.index("View 6:")].count("<path d=") > 10
+    # Residuals far beyond the others' are clipped, and say how far they reach.
+    assert " 14 " in section(page, "Residuals by view", "Residuals over joint angles")
+
+
+def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
+    cell = simulate(CellOptions(views=15, wrong_views=1))
+    write_session(cell, tmp_path / "cell", images=False)
+    calibration = run(tmp_path / "cell").calibration
+    assert sum(it.contradict for it in suspects(calibration)) == 1
+    assert "the largest part" in Page(render(calibration, None, ())).words.lower()
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import Edges, Noise
 from visioncal.estimator.observability import Direction
+from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult, Solution
 from visioncal.stages.judge import Findings, judge
 from visioncal.transforms import exp
@@ -45,12 +46,23 @@ SOUND = Findings(
     views=views(),
     stops=20,
     lost=(),
+    disagreeing=(),
     hand_eye=hand_eye(),
     rms=Rms(0.1, 0.01, 0.1),
     held_out=Rms(0.11, 0.011, 0.12),
     holdout=None,
     pixel_px=0.05,
     robot=Noise(1e-4, 1e-4),
+    diagnosis=Diagnosis(
+        point_cam=np.array([0.0, 0.0, 0.5]),
+        budget_mm={"pixels": 0.05, "robot": 0.03, "total": 0.06},
+        radius95_mm=0.1,
+        intervals=np.full((2, 2), 1e-4),
+        spectrum=np.full(12, 0.01),
+        inflation=1.0,
+        arm=None,
+        warnings=(),
+    ),
     warnings=(),
 )
 STRAYED = Solution(exp(np.array([0, 0, 0, 0.01, 0, 0.0])), np.eye(4), 1e-4, 1e-4)
@@ -82,14 +94,18 @@ def test_sound_findings_are_good_and_say_how_good():
         (
             {"hand_eye": hand_eye(worst=directions(2e-3, 0, 0, 0))},
             "check",
-            "The direction 0 is weak",
+            "the direction 0 (2 mm)",
         ),
-        ({"hand_eye": hand_eye(worst=directions(4e-3, 0, 0, 0))}, "bad", "sigma is 4 mm"),
-        ({"hand_eye": hand_eye(worst=directions(0, 3e-3, 0, 0))}, "check", "sigma is 0.17 deg"),
+        ({"hand_eye": hand_eye(worst=directions(4e-3, 0, 0, 0))}, "bad", "the direction 0 (4 mm)"),
+        (
+            {"hand_eye": hand_eye(worst=directions(0, 3e-3, 0, 0))},
+            "check",
+            "the direction 1 (0.17 deg)",
+        ),
         (
             {"hand_eye": hand_eye(worst=directions(0, 0, 2e-3, 0))},
             "check",
-            "The direction 2 is weak",
+            "the direction 2 (2 mm)",
         ),
         ({"robot": Noise(1e-4, 1e-3)}, "check", "have to be off by 1 mm and 0.0057 deg"),
         ({"robot": Noise(5e-4, 1e-4)}, "check", "0.029 deg from stop to stop"),

@@ -124,10 +124,11 @@ def test_views_that_were_not_used_are_marked_in_the_plots(samples, recordings):
         if not it.used
     }
     for plot in (paths.POSITION_MM, paths.ORIENTATION_DEG, paths.REPROJECTION_PX):
-        marks = column(
-            recordings["images and joints"], f"{plot}/{paths.REJECTED}", "Scalars:scalars"
-        )
-        assert set(marks) == rejected
+        marks = [
+            column(recordings["images and joints"], f"{plot}/{name}", "Scalars:scalars")
+            for name in (paths.REJECTED, paths.BEYOND)
+        ]
+        assert {place for it in marks for place in it} == rejected
 
 
 def test_a_view_without_target_takes_the_marks_of_the_last_off(recordings):

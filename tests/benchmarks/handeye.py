@@ -1,106 +1,407 @@
-"""Errors of the hand-eye result against the truth, its stated covariance, and a closed form.
+"""The joint estimator against its bound, OpenCV's solvers, wrong views, wrong arms and boards.
 
 Simulated cells from their corners on (no images are rendered): the stages behind detection run as
-in a calibration, without being told the noise. Each row is one world over the same seeds.
+in a calibration, without being told the noise. The bound is `tests/bound.py`'s.
 
-    PYTHONPATH=tests python tests/benchmarks/handeye.py
+    PYTHONPATH=tests python tests/benchmarks/handeye.py [SEEDS]
 """
 
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from multiprocessing import Pool
+from pathlib import Path
+
+import cv2
 import numpy as np
+from bound import edge_bound
 from cells import calibrated, error_of
 from results import write_section
+from worlds import BOTH_AT_ONCE, Problem, opencv
 
+from visioncal.errors import VisioncalError
+from visioncal.session import Session
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate, wide_camera
+from visioncal.simulation.boards import Sheet, corners_m
 from visioncal.transforms import invert, log
+from visioncal.types import FloatArray
 
-SEEDS = 100
-CAMERAS = {"1280 x 800": wide_camera(), "2448 x 2048": fine_camera()}
-ROBOTS = {"0.03 / 0.05": (3e-5, 5e-5), "0.3 / 0.5": (3e-4, 5e-4)}
-HEAD = (
-    "camera",
-    "mount",
-    "lens",
-    "robot [mm / mrad]",
-    "error [mm]",
-    "error [mrad]",
-    "Park [mm]",
-    "Park [mrad]",
-    "squared error / covariance",
-    "robot found [mm / mrad]",
-)
+SEEDS = 1000
+IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
+FINE, WIDE = fine_camera(), wide_camera()
+GOOD, COARSE = (3e-5, 5e-5), (3e-4, 5e-4)
+METHODS = ("tsai", "park", "horaud", "andreff", "daniilidis", *BOTH_AT_ONCE)
 
 
-def rms(values: list[float]) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def park_error(cell: Cell, known) -> np.ndarray:
-    """(6,) error of the camera's edge by Park's closed form from the same poses."""
-    return log(invert(next(iter(cell.transforms.values()))) @ known.solved.solutions["park"].x)
-
-
-def world(camera: str, mount: str, given: bool, robot: str) -> list[str]:
+@dataclass(frozen=True)
+class World:
     """One row of the table."""
-    sigma_m, sigma_rad = ROBOTS[robot]
-    errors, others, surprises, noises = [], [], [], []
-    for seed in range(SEEDS):
-        cell = simulate(
-            CellOptions(
-                mount=mount,
-                camera=CAMERAS[camera],
-                state_intrinsics=given,
-                robot_sigma_m=sigma_m,
-                robot_sigma_rad=sigma_rad,
-                pixel_sigma_px=0.1,
-                seed=seed,
+
+    words: str
+    options: CellOptions
+
+
+def world(words: str, camera, pixel_px, robot, given, mount, **more) -> World:
+    sigma_m, sigma_rad = robot
+    return World(
+        words,
+        CellOptions(
+            mount=mount,
+            camera=camera,
+            state_intrinsics=given,
+            robot_sigma_m=sigma_m,
+            robot_sigma_rad=sigma_rad,
+            pixel_sigma_px=pixel_px,
+            **more,
+        ),
+    )
+
+
+WORLDS = (
+    world("5 MP, 0.1 px, good robot, lens given, in hand", FINE, 0.1, GOOD, True, IN_HAND),
+    world("5 MP, 0.05 px, good robot, lens estimated, to hand", FINE, 0.05, GOOD, False, TO_HAND),
+    world("5 MP, 0.1 px, coarse robot, lens given, to hand", FINE, 0.1, COARSE, True, TO_HAND),
+    world("1.0 MP, 0.2 px, good robot, lens given, to hand", WIDE, 0.2, GOOD, True, TO_HAND),
+    world("1.0 MP, 0.1 px, good robot, lens estimated, in hand", WIDE, 0.1, GOOD, False, IN_HAND),
+    world("1.0 MP, 0.2 px, coarse robot, lens estimated", WIDE, 0.2, COARSE, False, TO_HAND),
+    world("the first, tilts under 10 deg", FINE, 0.1, GOOD, True, IN_HAND, tilt_rad=(0.0, 0.17)),
+)
+ROBUST = (WORLDS[0], WORLDS[4])
+
+
+def opencv_poses(cell: Cell) -> FloatArray:
+    """(m, 4, 4) `cam_from_target` by OpenCV: calibrateCamera or solvePnP."""
+    options = cell.options
+    points = corners_m(Sheet(options.target, 1.0, 0.0))
+    stated = [points[it.ids].astype(np.float32) for it in cell.corners]
+    px = [it.px.astype(np.float32) for it in cell.corners]
+    if options.state_intrinsics:
+        fx, fy, cx, cy = options.camera.matrix
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        lens = options.camera.distortion
+        found = [cv2.solvePnP(a, b, matrix, lens)[1:] for a, b in zip(stated, px, strict=True)]
+        turns, shifts = zip(*found, strict=True)
+    else:
+        *_, turns, shifts = cv2.calibrateCamera(stated, px, options.camera.resolution, None, None)
+    poses = np.tile(np.eye(4), (len(px), 1, 1))
+    poses[:, :3, :3] = [cv2.Rodrigues(it)[0] for it in turns]
+    poses[:, :3, 3] = np.reshape(shifts, (-1, 3))
+    return poses
+
+
+def opencv_errors(cell: Cell) -> FloatArray:
+    """(methods, 2) rotation [rad] and translation [m] errors of X by each of OpenCV's solvers."""
+    x, z = cell.transforms.values()
+    robot = cell.base_from_flange
+    problem = Problem(
+        robot if cell.options.mount == IN_HAND else invert(robot), opencv_poses(cell), x, z
+    )
+    away = [log(invert(x) @ _rigid(opencv(name, problem))) for name in METHODS]
+    return np.array([[np.linalg.norm(it[:3]), np.linalg.norm(it[3:])] for it in away])
+
+
+def _rigid(matrix: FloatArray) -> FloatArray:
+    """The nearest rigid transform: some of OpenCV's results are rotations to 1e-6 only."""
+    u, _, vt = np.linalg.svd(np.nan_to_num(matrix[:3, :3]))
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = u @ vt, np.nan_to_num(matrix[:3, 3], nan=1e3)
+    return rigid
+
+
+def squared(error: FloatArray) -> list[float]:
+    return [float(error[:3] @ error[:3]), float(error[3:6] @ error[3:6])]
+
+
+def surprise(error: FloatArray, spread: FloatArray) -> float:
+    return float(error @ np.linalg.solve(spread, error)) / len(error)
+
+
+def against_the_bound(task: tuple[World, int]) -> list[float] | None:
+    """Squared errors, their bound, the covariance's word, and OpenCV's squared errors."""
+    row, seed = task
+    cell = simulate(replace(row.options, seed=seed))
+    try:
+        known = calibrated(cell)
+    except VisioncalError:
+        return None
+    bound, error = edge_bound(cell), error_of(cell, known)
+    return [
+        *squared(error),
+        float(np.trace(bound[:3, :3])),
+        float(np.trace(bound[3:6, 3:6])),
+        surprise(error, known.solved.covariance[:12, :12]),
+        float(len(known.used) < row.options.views),
+        *np.square(opencv_errors(cell)).ravel(),
+    ]
+
+
+def bound_table(pool, seeds: int) -> str:
+    head = ("world", "error / bound, mm", "mrad", "error / OpenCV's best, mm", "mrad",
+            "squared error / covariance", "sound views lost", "refused")  # fmt: skip
+    rows = []
+    for row in WORLDS:
+        kept = _run(pool, against_the_bound, [(row, seed) for seed in range(seeds)])
+        mean = np.mean(kept, axis=0)
+        best = np.mean(np.reshape([it[6:] for it in kept], (len(kept), -1, 2)), axis=0).min(axis=0)
+        rows.append(
+            (
+                row.words,
+                f"{np.sqrt(mean[1] / mean[3]):.3f}",
+                f"{np.sqrt(mean[0] / mean[2]):.3f}",
+                f"{np.sqrt(mean[1] / best[1]):.2f}",
+                f"{np.sqrt(mean[0] / best[0]):.2f}",
+                f"{mean[4]:.3f}",
+                f"{100 * mean[5]:.1f} % of runs",
+                f"{seeds - len(kept)}",
             )
         )
+    return table(head, rows)
+
+
+def with_wrong_views(task: tuple[World, int, int]) -> list[float] | None:
+    row, wrong, seed = task
+    cell = simulate(replace(row.options, seed=seed, wrong_views=wrong))
+    try:
         known = calibrated(cell)
-        error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
-        errors.append(error[:6])
-        others.append(park_error(cell, known))
-        surprises.append(error @ np.linalg.solve(spread, error) / 12)
-        noises.append([known.solved.noise.sigma_m, known.solved.noise.sigma_rad])
-    figures = [
-        1e3 * rms([float(np.linalg.norm(it[part])) for it in group])
-        for group in (errors, others)
-        for part in (slice(3, 6), slice(0, 3))
-    ]
-    found_m, found_rad = 1e3 * np.sqrt(np.mean(np.square(noises), axis=0))
+    except VisioncalError:
+        return None
+    right = [it for it in range(row.options.views) if it not in cell.wrong_views]
+    bound, error = edge_bound(cell, right), error_of(cell, known)
+    out = set(range(row.options.views)) - set(known.used)
     return [
-        camera,
-        mount,
-        "given" if given else "estimated",
-        robot,
-        *(f"{it:.3f}" for it in figures),
-        f"{np.mean(surprises):.2f}",
-        f"{found_m:.3f} / {found_rad:.3f}",
+        *squared(error),
+        float(np.trace(bound[:3, :3])),
+        float(np.trace(bound[3:6, 3:6])),
+        float(out == set(cell.wrong_views)),
+        float(bool(set(cell.wrong_views) - out)),
+        surprise(error, known.solved.covariance[:12, :12]),
     ]
 
 
-def main() -> None:
-    """Prints the table and keeps it."""
-    rows = [
-        world(camera, mount, given, robot)
-        for camera in CAMERAS
-        for mount in ("eye-in-hand", "eye-to-hand")
-        for given in (True, False)
-        for robot in ROBOTS
+def wrong_table(pool, seeds: int) -> str:
+    head = ("world", "wrong of 20", "error / bound of the right, mm", "mrad",
+            "all wrong and no right view left out", "a wrong view missed",
+            "squared error / covariance", "refused")  # fmt: skip
+    rows = []
+    for row in ROBUST:
+        for wrong in (0, 2, 4, 6):
+            kept = _run(pool, with_wrong_views, [(row, wrong, seed) for seed in range(seeds)])
+            mean = np.mean(kept, axis=0)
+            rows.append(
+                (
+                    row.words,
+                    str(wrong),
+                    f"{np.sqrt(mean[1] / mean[3]):.3f}",
+                    f"{np.sqrt(mean[0] / mean[2]):.3f}",
+                    f"{100 * mean[4]:.1f} %",
+                    f"{100 * mean[5]:.1f} %",
+                    f"{mean[6]:.3f}",
+                    f"{seeds - len(kept)}",
+                )
+            )
+    return table(head, rows)
+
+
+def with_a_wrong_arm(task: tuple[CellOptions, bool, int]) -> list[float] | None:
+    options, joints, seed = task
+    cell = simulate(replace(options, seed=seed))
+    try:
+        known = calibrated(cell, joints=joints)
+    except VisioncalError:
+        return None
+    error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
+    flagged = known.arm is not None and known.verdict.status != "good"
+    return [*squared(error), surprise(error, spread), float(flagged)]
+
+
+def arm_table(pool, seeds: int) -> str:
+    head = ("arm", "mount", "session has", "error [mm]", "[mrad]", "squared error / covariance",
+            "errors of the arm flagged", "refused")  # fmt: skip
+    arms = {
+        "as its model": CellOptions(camera=FINE, pixel_sigma_px=0.1),
+        "DH off by 0.5 mm, 1 mrad": CellOptions(
+            camera=FINE, pixel_sigma_px=0.1, dh_sigma_m=5e-4, dh_sigma_rad=1e-3
+        ),
+    }
+    rows = []
+    for words, options in arms.items():
+        for mount in (IN_HAND, TO_HAND):
+            for joints in (True, False):
+                row = replace(options, mount=mount)
+                tasks = [(row, joints, seed) for seed in range(seeds)]
+                kept = _run(pool, with_a_wrong_arm, tasks)
+                mean = np.mean(kept, axis=0)
+                rows.append(
+                    (
+                        words,
+                        mount,
+                        "joints and model" if joints else "poses only",
+                        f"{1e3 * np.sqrt(mean[1]):.3f}",
+                        f"{1e3 * np.sqrt(mean[0]):.3f}",
+                        f"{mean[2]:.2f}",
+                        f"{100 * mean[3]:.1f} %",
+                        f"{seeds - len(kept)}",
+                    )
+                )
+    return table(head, rows)
+
+
+def with_a_board(task: tuple[CellOptions, int]) -> list[float] | None:
+    options, seed = task
+    cell = simulate(replace(options, seed=seed))
+    try:
+        known = calibrated(cell)
+    except VisioncalError:
+        return None
+    said = " ".join(known.warnings)
+    return [
+        *squared(error_of(cell, known)),
+        float("not flat" in said),
+        float("robot's motion the board" in said),
     ]
-    lines = [HEAD, ["---"] * len(HEAD), *rows]
-    table = "\n".join("| " + " | ".join(row) + " |" for row in lines)
-    text = (
-        f"{SEEDS} simulated UR10e cells a row, 20 views of a 9 x 6 ChArUco board of 30 mm squares, "
-        "corners with 0.1 px of noise. Errors are of the camera's transform against the truth, "
-        "root mean square; Park is its closed form from the same poses. The squared error over the "
-        "stated covariance of both edges, per degree of freedom, is 1 where the covariance tells "
-        f"the truth (standard deviation of the mean: 0.04).\n\n{table}\n"
+
+
+def board_table(pool, seeds: int) -> str:
+    head = ("board", "lens", "error [mm]", "[mrad]", "bend noticed", "size noticed", "refused")
+    boards = {
+        "flat, as stated": {},
+        "bent by 0.3 mm": {"board_bow_m": 3e-4},
+        "bent by 0.1 mm": {"board_bow_m": -1e-4},
+        "0.2 % too large": {"board_scale": 1.002},
+        "0.1 % too large": {"board_scale": 1.001},
+    }
+    rows = []
+    for words, more in boards.items():
+        for given in (True, False):
+            options = CellOptions(camera=FINE, pixel_sigma_px=0.1, state_intrinsics=given, **more)
+            kept = _run(pool, with_a_board, [(options, seed) for seed in range(seeds)])
+            mean = np.mean(kept, axis=0)
+            rows.append(
+                (
+                    words,
+                    "given" if given else "estimated",
+                    f"{1e3 * np.sqrt(mean[1]):.3f}",
+                    f"{1e3 * np.sqrt(mean[0]):.3f}",
+                    f"{100 * mean[2]:.1f} %",
+                    f"{100 * mean[3]:.1f} %",
+                    f"{seeds - len(kept)}",
+                )
+            )
+    return table(head, rows)
+
+
+def healthy(seed: int) -> float:
+    """1 where a healthy set is refused; they differ in everything, small tilts included."""
+    rng = np.random.default_rng(seed)
+    tilt = rng.uniform(0.06, 0.8)
+    options = CellOptions(
+        mount=rng.choice([IN_HAND, TO_HAND]),
+        robot=str(rng.choice(["ur3e", "ur5e", "ur10e"])),
+        camera=FINE if rng.random() < 0.5 else WIDE,
+        views=int(rng.integers(8, 31)),
+        state_intrinsics=bool(tilt < 0.4 or rng.random() < 0.5),
+        tilt_rad=(0.0, tilt),
+        roll_rad=float(rng.uniform(0.2, 1.4)),
+        pixel_sigma_px=float(rng.uniform(0.03, 0.2)),
+        robot_sigma_m=float(10 ** rng.uniform(-5, -4)),
+        robot_sigma_rad=float(10 ** rng.uniform(-5, -4)),
+        seed=seed,
     )
+    try:
+        calibrated(simulate(options))
+    except VisioncalError:
+        return 1.0
+    return 0.0
+
+
+def real_folds(path: Path, repeats: int) -> tuple[float, float]:
+    """Held-out position [mm] and rotation [deg] of the board, rms over repeated 5-fold."""
+    from visioncal.pipeline.known import Known
+    from visioncal.pipeline.steps import STAGES
+
+    session = Session.load(path)
+    seen = Known(session, "joint")
+    for stage in STAGES:
+        if stage.name in ("robot", "detect", "intrinsics", "pnp", "choose"):
+            seen = stage.run(seen)
+    views, away = np.array(seen.used), []
+    rng = np.random.default_rng(0)
+    for _ in range(repeats):
+        for fold in np.array_split(rng.permutation(len(views)), 5):
+            fitted = replace(seen, used=tuple(np.delete(views, fold).tolist()))
+            for stage in STAGES:
+                if stage.name in ("look", "agree", "refine", "hand-eye"):
+                    fitted = stage.run(fitted)
+            edges = fitted.solved.edges
+            left = fitted.closure(views[fold].tolist()).under(edges.shared)
+            away.append(log(invert(edges.z) @ left.placed(edges.x)))
+    error = np.concatenate(away)
+    return (
+        1e3 * float(np.sqrt(np.mean(np.sum(error[:, 3:] ** 2, axis=1)))),
+        float(np.rad2deg(np.sqrt(np.mean(np.sum(error[:, :3] ** 2, axis=1))))),
+    )
+
+
+def real_table() -> str:
+    folder = Path(__file__).parents[3] / "shared" / "data" / "sessions"
+    path = folder / "ric_charuco_eye_to_hand"
+    if not path.is_dir():
+        return "The real session is not here (../shared/data)."
+    millimetres, degrees = real_folds(path, 20)
+    return (
+        f"`ric_charuco_eye_to_hand`, 20 times 5-fold over 15 views, everything but the corners "
+        f"fitted anew in each fold: {millimetres:.2f} mm and {degrees:.3f} deg."
+    )
+
+
+def _run(pool, function: Callable, tasks: Sequence) -> list:
+    return [it for it in pool.map(function, tasks, chunksize=4) if it is not None]
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(row) + " |" for row in lines)
+
+
+def main(seeds: int) -> None:
+    """Prints the tables and keeps them."""
+    few = max(seeds // 5, 10)
+    with Pool() as pool:
+        refused = int(sum(pool.map(healthy, range(seeds // 2), chunksize=4)))
+        text = f"""Simulated UR10e cells, 20 views of a 9 x 6 ChArUco board of 30 mm squares,
+cameras of 2448 x 2048 (5 MP) and 1280 x 800 (1.0 MP). A good robot errs by 0.03 mm and 0.05 mrad a
+stop, a coarse one by 0.3 mm and 0.5 mrad. Errors are of the camera's transform, root mean square;
+the bound is Cramer and Rao's with the board as stated. The squared error over the stated covariance
+of both edges, per degree of freedom, is 1 where the covariance tells the truth; the board's scale
+is exact here and counts as known to 0.1 %, which makes it 11/12. OpenCV's best is the best of seven
+methods for each figure, from poses by solvePnP or calibrateCamera.
+
+{seeds} seeds a row:
+
+{bound_table(pool, seeds)}
+
+Views whose reported pose is off by 5 to 30 mm and 1 to 5 degrees, {few} seeds a row:
+
+{wrong_table(pool, few)}
+
+Arms that differ from their model, {few} seeds a row:
+
+{arm_table(pool, few)}
+
+Boards that differ from their description, {few} seeds a row (5 MP, 0.1 px, good robot, in hand):
+
+{board_table(pool, few)}
+
+Of {seeds // 2} healthy sets (8 to 30 views, tilts up to 3 to 45 degrees, both mounts, three arms),
+{refused} were refused.
+
+{real_table()}
+"""
     print(text)
-    command = "PYTHONPATH=tests python tests/benchmarks/handeye.py"
-    write_section("Hand-eye against the truth", command, text)
+    write_section(
+        "The joint estimator", "PYTHONPATH=tests python tests/benchmarks/handeye.py", text
+    )
 
 
 if __name__ == "__main__":
-    main()
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS)

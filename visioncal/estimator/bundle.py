@@ -121,12 +121,13 @@ def _finished(
 
 def _blocks(stack: CornerStack, at: Reprojection) -> _Blocks:
     by_pose, by_intrinsics = at.by_pose, at.by_intrinsics
-    transposed = np.swapaxes(by_pose, 1, 2)
-    flat = by_intrinsics.reshape(-1, by_intrinsics.shape[2])
+    size, flat = by_intrinsics.shape[2], by_intrinsics.reshape(-1, by_intrinsics.shape[2])
+    rest = np.concatenate([by_pose, by_intrinsics, at.residuals[:, :, None]], axis=2)
+    products = stack.products_by_view(by_pose, rest)
     return _Blocks(
         flat.T @ flat,
-        stack.sum_by_view(transposed @ by_pose),
-        stack.sum_by_view(transposed @ by_intrinsics),
+        products[:, :, :6],
+        products[:, :, 6 : 6 + size],
         flat.T @ at.residuals.reshape(-1),
-        stack.sum_by_view((transposed @ at.residuals[:, :, None])[:, :, 0]),
+        products[:, :, -1],
     )

@@ -10,19 +10,25 @@ The noise of a residual is that of the camera's pose, which is known from its co
 error of the flange, whose two levels are estimated (Strobl and Hirzinger 2006; Ulrich and Hillemann
 2021). Where nothing is known of the camera's poses, both are estimated as one.
 
-Where the lens was estimated from the same corners, its error moves all camera poses together. It is
-an unknown beside the edges, with the corners' information on it: to first order, that is the bundle
-adjustment of corners, lens and edges in one.
+Lens and board move all camera poses together. What is open about them are unknowns beside the
+edges, with the corners' information on them: to first order, and exactly where the poses were made
+with the same values, that is the bundle adjustment of corners, lens, board and edges in one.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance, damped_step
-from visioncal.estimator.variance import Components, Knowledge, RatioPrior, estimate_sigmas
+from visioncal.estimator.variance import (
+    Components,
+    Knowledge,
+    RatioPrior,
+    estimate_sigmas,
+)
 from visioncal.transforms import (
     adjoint,
     exp,
@@ -39,20 +45,41 @@ _SETTLED = 1e-10
 # Noise levels are started from above: at least here [rad and m].
 _START_SIGMAS = np.array([5e-4, 5e-4])
 # Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
-_PRIOR = RatioPrior(ratio=0.6, spread=1.5)
+RATIO_PRIOR = RatioPrior(ratio=0.6, spread=1.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
-    """What the corners leave open of the intrinsics that the camera poses were made with.
+class Shared:
+    """Unknowns by which all views move together: lens and board, and errors of the arm's links.
 
     Attributes:
-        information: (k, k) on the intrinsics, from the corners alone.
-        shift: (m, 6, k) how each view's `cam_from_target` moves with them.
+        information: (k, k) on them, from the corners and from what is known beforehand.
+        pull: (k,) half the gradient of what is known of them, where the camera poses were made.
+        anchor: (k,) information that keeps some of them where they are while the fit moves: they
+            are held, yet what is open about them counts in the covariance.
+        by_camera: (m, 6, k) how each view's `cam_from_target` moves with them.
+        by_flange: (m, 6, k) how each view's `base_from_flange` moves with them.
     """
 
     information: FloatArray
-    shift: FloatArray
+    pull: FloatArray
+    anchor: FloatArray
+    by_camera: FloatArray
+    by_flange: FloatArray
+
+    def subset(self, chosen: Mask) -> "Shared":
+        """Returns the views of an (m,) mask."""
+        return replace(self, by_camera=self.by_camera[chosen], by_flange=self.by_flange[chosen])
+
+    def joined(self, other: "Shared") -> "Shared":
+        """Returns these unknowns and others behind them, of which nothing is known in common."""
+        return Shared(
+            block_diag(self.information, other.information),
+            np.concatenate([self.pull, other.pull]),
+            np.concatenate([self.anchor, other.anchor]),
+            np.concatenate([self.by_camera, other.by_camera], axis=2),
+            np.concatenate([self.by_flange, other.by_flange], axis=2),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,33 +91,37 @@ class Closure:
         robot: (m, 4, 4) the known part of the chain that is the robot's.
         camera: (m, 4, 4) `cam_from_target`.
         camera_covariance: (m, 6, 6) of the camera's right perturbations; None where unknown.
-        lens: What is open about the intrinsics; None where they are held.
+        shared: What moves all camera poses together; None where they are held.
     """
 
     mount: Mount
     robot: FloatArray
     camera: FloatArray
     camera_covariance: FloatArray | None = None
-    lens: Lens | None = None
+    shared: Shared | None = None
 
     def __len__(self) -> int:
         return len(self.robot)
 
     @property
-    def unchanged_lens(self) -> FloatArray:
-        """(k,) no change of the intrinsics; k = 0 where they are held."""
-        return np.zeros(0 if self.lens is None else len(self.lens.information))
+    def unchanged(self) -> FloatArray:
+        """(k,) no change of what is shared; k = 0 where it is held."""
+        return np.zeros(0 if self.shared is None else len(self.shared.information))
 
     def subset(self, chosen: Mask) -> "Closure":
         """Returns the views of an (m,) mask."""
-        known, lens = self.camera_covariance, self.lens
+        known, shared = self.camera_covariance, self.shared
         return Closure(
             self.mount,
             self.robot[chosen],
             self.camera[chosen],
             None if known is None else known[chosen],
-            None if lens is None else Lens(lens.information, lens.shift[chosen]),
+            None if shared is None else shared.subset(chosen),
         )
+
+    def with_more(self, more: Shared) -> "Closure":
+        """Returns the views with more unknowns that they share, behind those that are there."""
+        return replace(self, shared=more if self.shared is None else self.shared.joined(more))
 
     def merged(self, stops: IntArray) -> "Closure":
         """Makes one view of all that were taken at one stop of the robot.
@@ -105,11 +136,16 @@ class Closure:
             return self
         return _joined([self.subset(stops == stop) for stop in range(stops.max() + 1)])
 
-    def through(self, lens_change: FloatArray) -> "Closure":
-        """Returns the views as seen through a lens that is changed by (k,) intrinsics."""
-        if self.lens is None or not len(lens_change):
+    def under(self, change: FloatArray) -> "Closure":
+        """Returns the views as they look when what is shared changes by (k,)."""
+        if self.shared is None or not len(change):
             return self
-        return replace(self, camera=self.camera @ exp(self.lens.shift @ lens_change))
+        flange = exp(self.shared.by_flange @ change)
+        if self.mount == "eye-in-hand":
+            robot = self.robot @ flange
+        else:
+            robot = invert(invert(self.robot) @ flange)
+        return replace(self, robot=robot, camera=self.camera @ exp(self.shared.by_camera @ change))
 
     def placed(self, x: FloatArray) -> FloatArray:
         """Where each view places the target: (m, 4, 4) `robot * x * camera`."""
@@ -121,7 +157,7 @@ class Closure:
 
 
 def _joined(groups: Sequence[Closure]) -> Closure:
-    robot, camera, spreads, shifts = [], [], [], []
+    robot, camera, spreads, shifts, arms = [], [], [], [], []
     for group in groups:
         first = group.camera[0]
         known = group.camera_covariance
@@ -132,15 +168,18 @@ def _joined(groups: Sequence[Closure]) -> Closure:
         robot.append(group.robot[0])
         camera.append(first @ exp(np.einsum("mij,mj->i", shares, away)))
         spreads.append(spread)
-        if group.lens is not None:
-            shifts.append(np.einsum("mij,mjk->ik", shares, group.lens.shift))
-    lens = groups[0].lens
+        if group.shared is not None:
+            shifts.append(np.einsum("mij,mjk->ik", shares, group.shared.by_camera))
+            arms.append(group.shared.by_flange[0])
+    shared = groups[0].shared
     return Closure(
         groups[0].mount,
         np.array(robot),
         np.array(camera),
         None if groups[0].camera_covariance is None else np.array(spreads),
-        None if lens is None else Lens(lens.information, np.array(shifts)),
+        None
+        if shared is None
+        else replace(shared, by_camera=np.array(shifts), by_flange=np.array(arms)),
     )
 
 
@@ -163,16 +202,16 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """The unknowns: both edges (4, 4), and the change (k,) of the intrinsics."""
+    """The unknowns: both edges (4, 4), and the change (k,) of what all views share."""
 
     x: FloatArray
     z: FloatArray
-    lens: FloatArray
+    shared: FloatArray
 
     def moved(self, step: FloatArray) -> "Edges":
         """Returns the unknowns after a (12 + k,) step, on the right of both edges."""
         by = exp(step[:12].reshape(2, 6))
-        return Edges(self.x @ by[0], self.z @ by[1], self.lens + step[12:])
+        return Edges(self.x @ by[0], self.z @ by[1], self.shared + step[12:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,11 +266,12 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
 
     def linearise(at: Edges) -> Linearised[Edges]:
         residuals, jacobian = _residuals(data, at), closure_jacobian(data, at)
-        weighted, known = weights @ jacobian, _knowledge(data, at)
+        weighted, known = weights @ jacobian, knowledge_of(data, at)
         information = np.einsum("mij,mik->jk", jacobian, weighted) + known.information
-        pull = known.information @ known.offset
-        gradient = np.einsum("mij,mi->j", weighted, residuals) + pull
-        cost = np.einsum("mi,mij,mj->", residuals, weights, residuals) + known.offset @ pull
+        gradient = np.einsum("mij,mi->j", weighted, residuals) + known.pull
+        cost = np.einsum("mi,mij,mj->", residuals, weights, residuals)
+        if data.shared is not None:
+            cost += at.shared @ (data.shared.pull + known.pull[12:])
         return Linearised(
             at,
             float(cost),
@@ -242,15 +282,23 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
 
 
 def closure_jacobian(data: Closure, edges: Edges) -> FloatArray:
-    """Derivatives (m, 6, 12 + k) of the residuals by the unknowns' steps: x, z, intrinsics."""
-    seen = data.through(edges.lens)
+    """Derivatives (m, 6, 12 + k) of the residuals by the unknowns' steps: x, z, shared."""
+    seen = data.under(edges.shared)
     error = invert(edges.z) @ seen.placed(edges.x)
     log_slope = inverse_right_jacobian(log(error))
     blocks = [log_slope @ adjoint(invert(seen.camera)), -log_slope @ adjoint(invert(error))]
-    if data.lens is not None:
-        # The intrinsics' change is so small that the order of its steps does not matter.
-        blocks.append(log_slope @ data.lens.shift)
+    if data.shared is not None:
+        # The change is so small that the order of its steps does not matter.
+        flange = flange_to_residual(seen, edges) @ data.shared.by_flange
+        blocks.append(log_slope @ (data.shared.by_camera + flange))
     return np.concatenate(blocks, axis=2)
+
+
+def flange_to_residual(data: Closure, edges: Edges) -> FloatArray:
+    """How a small motion of each view's flange moves its residual, (m, 6, 6), at a closed chain."""
+    if data.mount == "eye-in-hand":
+        return adjoint(invert(edges.x @ data.camera))
+    return -adjoint(invert(data.placed(edges.x)))
 
 
 def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
@@ -259,38 +307,91 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     It is taken where the chain closes exactly: at the measured poses their noise would pass for
     information about directions that the motion leaves open.
     """
+    slopes, camera, robot = weighted_slopes(data, edges, noise)
+    information = np.einsum("mij,mik,mkl->jl", slopes, camera + robot, slopes)
+    if data.shared is not None:
+        information[12:, 12:] += data.shared.information
+    return np.asarray(information)
+
+
+def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Information (12 + k, 12 + k) and gradient (12 + k,) of half the whitened squared error."""
+    residuals, jacobian, spread = residual_blocks(data, edges, noise)
+    known = knowledge_of(data, edges)
+    weighted = np.linalg.solve(spread, jacobian)
+    return (
+        np.einsum("mij,mik->jk", jacobian, weighted) + known.information,
+        np.einsum("mij,mi->j", weighted, residuals) + known.pull,
+    )
+
+
+def left_out_residuals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """Residuals (m, 6) of each view from a fit without it, to first order.
+
+    By the identity of Cook and Weisberg (1982, section 2.2), with the noise as it is.
+    """
+    residuals, jacobian, spread = residual_blocks(data, edges, noise)
+    fitted = covariance(normal_equations(data, edges, noise)[0])
+    taken = jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
+    return np.asarray((spread @ covariance(spread - taken) @ residuals[:, :, None])[:, :, 0])
+
+
+def weighted_slopes(
+    data: Closure, edges: Edges, noise: Noise
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What makes up the score, where the chain closes exactly.
+
+    Returns:
+        (m, 6, 12 + k) inverse covariance of each residual times its derivatives, and the (m, 6, 6)
+        covariances that the camera and the robot contribute to the residual.
+    """
     ideal = replace(data, camera=data.predicted_camera(edges.x, edges.z))
-    jacobian = closure_jacobian(ideal, replace(edges, lens=data.unchanged_lens))
-    weighted = _weights(data, edges.z, noise) @ jacobian
-    known = _knowledge(data, edges).information
-    return np.asarray(np.einsum("mij,mik->jk", jacobian, weighted) + known)
+    jacobian = closure_jacobian(ideal, replace(edges, shared=data.unchanged))
+    components = components_of(data, edges.z)
+    total = components.total(noise.sigmas)
+    slopes = np.asarray(np.linalg.solve(total, jacobian), dtype=float)
+    return slopes, components.known, total - components.known
+
+
+def residual_blocks(
+    data: Closure, edges: Edges, noise: Noise
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (m, 6), their derivatives (m, 6, 12 + k) and their covariances (m, 6, 6)."""
+    spread = components_of(data, edges.z).total(noise.sigmas)
+    return _residuals(data, edges), closure_jacobian(data, edges), spread
 
 
 def estimate_noise(data: Closure, edges: Edges) -> Noise:
     """Estimates the noise's levels from the residuals at some edges."""
+    return noise_likelihood(data, edges)[0]
+
+
+def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
+    """The noise's most likely levels, and their negative restricted log-likelihood."""
     residuals = _residuals(data, edges)
     rms = np.sqrt([np.mean(residuals[:, :3] ** 2), np.mean(residuals[:, 3:] ** 2)])
-    sigmas = estimate_sigmas(
+    sigmas, value = estimate_sigmas(
         residuals,
         closure_jacobian(data, edges),
-        _components(data, edges.z),
-        _knowledge(data, edges),
+        components_of(data, edges.z),
+        knowledge_of(data, edges),
         np.maximum(rms, _START_SIGMAS),
-        _PRIOR,
+        RATIO_PRIOR,
     )
-    return Noise(float(sigmas[0]), float(sigmas[1]))
+    return Noise(float(sigmas[0]), float(sigmas[1])), value
 
 
-def _knowledge(data: Closure, edges: Edges) -> Knowledge:
-    """What is known of the unknowns without the robot: of the lens alone."""
-    size = 12 + len(edges.lens)
-    information = np.zeros((size, size))
-    if data.lens is not None:
-        information[12:, 12:] = data.lens.information
-    return Knowledge(information, np.concatenate([np.zeros(12), edges.lens]))
+def knowledge_of(data: Closure, edges: Edges) -> Knowledge:
+    """What is known of the unknowns without the robot: of what is shared alone."""
+    size = 12 + len(edges.shared)
+    information, pull = np.zeros((size, size)), np.zeros(size)
+    if data.shared is not None:
+        information[12:, 12:] = data.shared.information + np.diag(data.shared.anchor)
+        pull[12:] = data.shared.pull + information[12:, 12:] @ edges.shared
+    return Knowledge(information, pull)
 
 
-def _components(data: Closure, z: FloatArray) -> Components:
+def components_of(data: Closure, z: FloatArray) -> Components:
     """How the camera's known noise and the two levels make up the residuals' covariance."""
     levels = np.zeros((2, 6, 6))
     levels[0, :3, :3] = levels[1, 3:, 3:] = np.eye(3)
@@ -307,8 +408,8 @@ def _components(data: Closure, z: FloatArray) -> Components:
 
 def _weights(data: Closure, z: FloatArray, noise: Noise) -> FloatArray:
     """Inverse covariances (m, 6, 6) of the residuals."""
-    return np.asarray(np.linalg.inv(_components(data, z).total(noise.sigmas)))
+    return np.asarray(np.linalg.inv(components_of(data, z).total(noise.sigmas)))
 
 
 def _residuals(data: Closure, edges: Edges) -> FloatArray:
-    return log(invert(edges.z) @ data.through(edges.lens).placed(edges.x))
+    return log(invert(edges.z) @ data.under(edges.shared).placed(edges.x))

@@ -5,13 +5,12 @@ over a view's corners are segments of the stack.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from visioncal.camera import project_with_jacobian
-from visioncal.transforms import skew
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
 
@@ -64,6 +63,10 @@ class CornerStack:
             self.px[mask],
         )
 
+    def with_points(self, points: FloatArray) -> "CornerStack":
+        """Returns the stack with its corners elsewhere on the target, (n, 3) [m]."""
+        return replace(self, points=points)
+
     @property
     def counts(self) -> IntArray:
         """(v,) corners a view."""
@@ -72,6 +75,17 @@ class CornerStack:
     def sum_by_view(self, values: FloatArray) -> FloatArray:
         """Sums (n, ...) values over the corners of each view, to (v, ...)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
+
+    def products_by_view(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Sums `left^T right` over the corners of each view: (n, 2, j), (n, 2, k) to (v, j, k)."""
+        rows_l, rows_r = left.reshape(-1, left.shape[2]), right.reshape(-1, right.shape[2])
+        ends = 2 * np.append(self.starts[1:], len(self.px))
+        return np.array(
+            [
+                rows_l[start:end].T @ rows_r[start:end]
+                for start, end in zip((2 * self.starts).tolist(), ends.tolist(), strict=True)
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,24 +103,39 @@ class Reprojection:
     by_intrinsics: FloatArray
 
 
-def reproject(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> Reprojection:
+def reproject(
+    stack: CornerStack, camera: Camera, cam_from_target: FloatArray, *, lens: bool = True
+) -> Reprojection:
     """Reprojects a stack.
 
     Args:
         stack: The corners of v views.
         camera: The intrinsics.
         cam_from_target: (v, 4, 4) one pose a view.
+        lens: Whether derivatives by the intrinsics are wanted; else k = 0.
 
     Returns:
         Residuals and derivatives. A point at or behind the camera counts as seen a whole image
         away, without a derivative, so that a step that puts it there is not taken.
     """
-    poses = cam_from_target[stack.view_of]
-    rotation = poses[:, :3, :3]
-    points_cam = (rotation @ stack.points[:, :, None])[:, :, 0] + poses[:, :3, 3]
-    projection = project_with_jacobian(camera, points_cam)
-    by_translation = projection.by_point @ rotation
-    by_pose = np.concatenate([-by_translation @ skew(stack.points), by_translation], axis=2)
+    # Written out by components: batched products of matrices this small are mostly overhead.
+    rotation = np.ascontiguousarray(np.moveaxis(cam_from_target[:, :3, :3], 0, 2))
+    rotation = rotation[:, :, stack.view_of]
+    px, py, pz = stack.points.T
+    points_cam = (rotation[:, 0] * px + rotation[:, 1] * py + rotation[:, 2] * pz).T
+    points_cam = points_cam + cam_from_target[:, :3, 3][stack.view_of]
+    projection = project_with_jacobian(camera, points_cam, lens=lens)
+    by_cam = np.ascontiguousarray(np.moveaxis(projection.by_point, 2, 0))
+    columns = rotation[:, :, :, None]
+    bx, by, bz = (
+        by_cam[0] * columns[0, at] + by_cam[1] * columns[1, at] + by_cam[2] * columns[2, at]
+        for at in range(3)
+    )
+    # A turn by w moves point p by w x p: a row b of derivatives becomes p x b.
+    px, py, pz = (it[:, None] for it in (px, py, pz))
+    by_pose = np.stack(
+        [py * bz - pz * by, pz * bx - px * bz, px * by - py * bx, bx, by, bz], axis=2
+    )
     residuals = projection.px - stack.px
     behind = ~np.isfinite(residuals).all(axis=1)
     if behind.any():

@@ -38,7 +38,7 @@ def descend(
     for _ in range(_ITERATIONS):
         then = linearise(now.step(damping))
         if then.cost <= now.cost:
-            rested = now.cost - then.cost <= settled * (now.cost + 1.0)
+            rested = now.cost - then.cost <= settled * (abs(now.cost) + 1.0)
             now, damping = then, max(damping / 10, _LEAST_DAMPING)
             if rested:
                 return now.state, True

@@ -73,7 +73,7 @@ def check_observability(data: Closure, edges: Edges, noise: Noise) -> tuple[Dire
     """
     if len(data) < FEWEST_VIEWS:
         raise _too_few(data)
-    held, still = replace(data, lens=None), replace(edges, lens=np.zeros(0))
+    held, still = replace(data, shared=None), replace(edges, shared=np.zeros(0))
     spread = spectrum(closure_information(held, still, noise))
     if spread.ratio < _NULL_RATIO:
         culprit = _null_direction(spread, edges, data.mount)

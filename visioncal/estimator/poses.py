@@ -5,14 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.corners import CornerStack, Reprojection, reproject
-from visioncal.estimator.linalg import covariance, damped_step
+from visioncal.estimator.linalg import damped_step
 from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray
 
 _ITERATIONS = 30
 # A step [rad or m] so small that the next, by quadratic convergence, is rounding.
-_SETTLED = 1e-8
-_START_DAMPING = 1e-4
+_SETTLED = 1e-7
+_START_DAMPING = 1e-6
+# At rest, costs differ by rounding: that is no reason to stay.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,13 +24,11 @@ class PoseFit:
     Attributes:
         cam_from_target: (v, 4, 4).
         information: (v, 6, 6) of each pose's right perturbation, for corners of 1 px noise.
-        by_intrinsics: (v, 6, k) how each pose moves with the intrinsics that it was fitted with.
         residuals: (n, 2) of the stack [px].
     """
 
     cam_from_target: FloatArray
     information: FloatArray
-    by_intrinsics: FloatArray
     residuals: FloatArray
 
 
@@ -45,30 +45,27 @@ def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -
     """
     poses = cam_from_target
     damping = np.full(len(poses), _START_DAMPING)
-    now = reproject(stack, camera, poses)
+    now = reproject(stack, camera, poses, lens=False)
     cost = stack.sum_by_view(np.sum(now.residuals**2, axis=1))
     for _ in range(_ITERATIONS):
         information, gradient = _normal_equations(stack, now)
         step = damped_step(information, gradient, damping[:, None])
         candidate = poses @ exp(step)
-        then = reproject(stack, camera, candidate)
+        then = reproject(stack, camera, candidate, lens=False)
         cost_then = stack.sum_by_view(np.sum(then.residuals**2, axis=1))
-        better = cost_then <= cost
+        better = cost_then <= cost * (1.0 + _ROUNDING)
         poses = np.where(better[:, None, None], candidate, poses)
         cost = np.where(better, cost_then, cost)
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e6)
-        now = then if better.all() else reproject(stack, camera, poses)
+        now = then if better.all() else reproject(stack, camera, poses, lens=False)
         if np.all(np.abs(step).max(axis=1) < _SETTLED):
             break
     information, _ = _normal_equations(stack, now)
-    between = stack.sum_by_view(np.swapaxes(now.by_pose, 1, 2) @ now.by_intrinsics)
-    return PoseFit(poses, information, -covariance(information) @ between, now.residuals)
+    return PoseFit(poses, information, now.residuals)
 
 
 def _normal_equations(stack: CornerStack, at: Reprojection) -> tuple[FloatArray, FloatArray]:
     """Sums (v, 6, 6) information and (v, 6) gradient over each view's corners."""
-    transposed = np.swapaxes(at.by_pose, 1, 2)
-    return (
-        stack.sum_by_view(transposed @ at.by_pose),
-        stack.sum_by_view((transposed @ at.residuals[:, :, None])[:, :, 0]),
-    )
+    both = np.concatenate([at.by_pose, at.residuals[:, :, None]], axis=2)
+    products = stack.products_by_view(at.by_pose, both)
+    return products[:, :, :6], products[:, :, 6]

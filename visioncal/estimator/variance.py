@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.linalg import covariance
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mask
 
 # Standard deviations stay within these, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
@@ -38,11 +38,11 @@ class Knowledge:
 
     Attributes:
         information: (p, p), zero on those of which nothing is known.
-        offset: (p,) how far the present state is from what is known.
+        pull: (p,) half the gradient of what is known, at the present state.
     """
 
     information: FloatArray
-    offset: FloatArray
+    pull: FloatArray
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ def estimate_sigmas(
     known: Knowledge,
     start: FloatArray,
     prior: RatioPrior,
-) -> FloatArray:
+    free: Mask | None = None,
+) -> tuple[FloatArray, float]:
     """Estimates the standard deviations of variance components.
 
     Maximises the restricted likelihood (Patterson and Thompson 1971; in the form of Harville 1977,
@@ -81,16 +82,21 @@ def estimate_sigmas(
         start: (k,) sigmas to start from.
         prior: Of the first two sigmas' ratio: it decides where the residuals cannot, because one
             kind of them can be fitted away altogether.
+        free: (k,) which sigmas to estimate; the others stay at their start. All where None.
 
     Returns:
-        (k,) standard deviations.
+        (k,) standard deviations, and the negative log-likelihood there.
     """
     limits = np.log([LEAST_SIGMA, MOST_SIGMA])
     logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), *limits)
     now, damping = _likelihood(residuals, jacobian, components, known, logs, prior), 1e-3
     for _ in range(_ITERATIONS):
         curvature = now.curvature + damping * np.eye(len(logs))
-        step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
+        slope = now.slope
+        if free is not None:
+            curvature = np.where(np.outer(free, free), curvature, np.eye(len(logs)))
+            slope = np.where(free, slope, 0.0)
+        step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST_STEP, _LONGEST_STEP)
         candidate = np.clip(logs + step, *limits)
         then = _likelihood(residuals, jacobian, components, known, candidate, prior)
         if then.value <= now.value:
@@ -102,7 +108,7 @@ def estimate_sigmas(
             damping *= 10
             if damping > _WORST_DAMPING:
                 break
-    return np.asarray(np.exp(logs), dtype=float)
+    return np.asarray(np.exp(logs), dtype=float), now.value
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +133,7 @@ def _likelihood(
     weights = np.linalg.inv(total)
     weighted = weights @ jacobian
     spread = covariance(np.einsum("mij,mik->jk", jacobian, weighted) + known.information)
-    pull = np.einsum("mij,mi->j", weighted, residuals) + known.information @ known.offset
+    pull = np.einsum("mij,mi->j", weighted, residuals) + known.pull
     best = spread @ pull
     left = residuals - jacobian @ best
     pulled = (weights @ left[:, :, None])[:, :, 0]
@@ -135,7 +141,7 @@ def _likelihood(
         np.linalg.slogdet(total)[1].sum()
         - np.linalg.slogdet(spread)[1]
         + np.einsum("mi,mi->", left, pulled)
-        + (known.offset - best) @ known.information @ (known.offset - best)
+        + best @ (known.information @ best - 2 * known.pull)
     )
     # How the residuals' covariance grows with the logarithm of each sigma.
     growth = 2 * sigmas[:, None, None, None] ** 2 * components.parts

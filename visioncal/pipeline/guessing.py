@@ -132,7 +132,8 @@ def is_suspect(known: Known) -> bool:
     verdict, findings = known.verdict, known.findings
     if verdict is None or findings is None or verdict.status == "good":
         return False
-    return is_scattered(findings) or known.robot is not None
+    out = known.agreed is not None and not known.agreed.mask.all()
+    return out or is_scattered(findings) or known.robot is not None
 
 
 def _seen(known: Known) -> Known:

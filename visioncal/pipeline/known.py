@@ -8,22 +8,23 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration import CameraResult, Rms, Verdict
-from visioncal.estimator.closure import Closure, Lens, Noise
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.appearance import Free
+from visioncal.estimator.arm import ArmErrors, link_basis, pose_basis
+from visioncal.estimator.closure import Closure, Noise
+from visioncal.estimator.joint import Scene
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.stages.agree import Agreed
+from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.judge import Findings
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.refine import Refined, remade
 from visioncal.stages.validate import HeldOut
-from visioncal.targets import corner_positions
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
 
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
-
-# A view's corners with their (n, 3) places on the target [m]; None where it has no image.
-Seen = tuple[Corners, FloatArray] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +37,19 @@ class Known:
         progress: Told of long work.
         robot: The nominal robot, where the session names a known one.
         base_from_flange: (4, 4) by view, as the robot reported it.
+        joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         corners: What was found of the target, by view.
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
         poses: The target's pose by view; several candidates until they are chosen from.
         pixel_px: Noise of a corner's coordinate [px].
         used: The views in the fit, in the session's order.
+        candidates: The views that could be in the fit, if they agree.
+        agreed: Which of them do.
+        free: Lens and board as all views see them together; None without corners.
+        arm: Errors that follow the arm's posture, where they are significant.
         hand_eye: Both unknown edges.
+        diagnosis: What the residuals show beyond noise.
         held_out: Residuals of used views, left out of the fit.
         findings: What the verdict is made of.
         verdict: Whether to trust it all.
@@ -55,13 +62,19 @@ class Known:
     progress: Progress | None = None
     robot: Robot | None = None
     base_from_flange: Mapping[int, FloatArray] = field(default_factory=dict)
+    joints_rad: Mapping[int, FloatArray] | None = None
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     pixel_px: float | None = None
     used: tuple[int, ...] = ()
+    candidates: tuple[int, ...] = ()
+    agreed: Agreed | None = None
+    free: Free | None = None
+    arm: ArmErrors | None = None
     hand_eye: HandEyeResult | None = None
+    diagnosis: Diagnosis | None = None
     held_out: HeldOut | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None
@@ -72,6 +85,47 @@ class Known:
         """Adds rejected views, of which the first reason counts, and warnings."""
         reasons = {it.view: it.reason for it in rejections} | dict(self.reasons)
         return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))
+
+    def agreeing(self, agreed: Agreed) -> Self:
+        """Takes the candidates that agree into the fit; the others are rejected."""
+        used = tuple(it for it, ok in zip(self.candidates, agreed.mask, strict=True) if ok)
+        reasons = {it: why for it, why in self.reasons.items() if it not in self.candidates}
+        known = replace(self, used=used, agreed=agreed, reasons=reasons)
+        return known.noting(agreed.rejections)
+
+    def seeing(self, refined: Refined) -> Self:
+        """Takes over lens, board and poses, and makes the poses of all other views anew."""
+        made = {it.view: it for it in refined.views}
+        rest = [
+            pose
+            for view, pose in self.poses.items()
+            if view not in made and pose.corners is not None and len(pose.cam_from_target) == 1
+        ]
+        made |= {it.view: it for it in remade(rest, refined.free, refined.sigma_px)}
+        return replace(
+            self,
+            free=refined.free,
+            poses={**self.poses, **made},
+            pixel_px=refined.sigma_px,
+            arm=refined.arm,
+        )
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is looked at, and with what; None where there are no corners."""
+        session, camera = self.session, self.camera
+        if camera is None or session.target is None or self.pixel_px is None:
+            return None
+        table = session.declaration.camera
+        sigma_px = None if table is None else table.matrix_sigma_px
+        return Scene(
+            session.mount,
+            session.target,
+            camera.camera,
+            camera.estimated,
+            session.intrinsics_mode,
+            sigma_px,
+        )
 
     @property
     def lost_views(self) -> tuple[str, ...]:
@@ -101,23 +155,30 @@ class Known:
             robot_part(robot, mount),
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
         )
-        if not poses or any(pose.corners is None for pose in poses):
-            return data
-        return replace(
-            data,
-            camera_covariance=np.array([pose.covariance[0] for pose in poses]),
-            lens=self._lens(poses),
-        )
+        if poses and all(pose.corners is not None for pose in poses):
+            shift = [pose.by_shared[0] for pose in poses]
+            data = replace(
+                data,
+                camera_covariance=np.array([pose.covariance[0] for pose in poses]),
+                shared=None if self.free is None else self.free.shared(np.array(shift)),
+            )
+        if self.arm is not None and self.arm.of_links and poses:
+            data = data.with_more(replace(self.arm, basis=self.arm_basis(views)).shared())
+        return data
 
-    def _lens(self, poses: Sequence[ViewPoses]) -> Lens | None:
-        if self.camera is None or self.camera.covariance is None:
-            return None
-        shift = np.array([pose.by_intrinsics[0] for pose in poses])
-        return Lens(covariance(self.camera.covariance), shift)
+    def arm_basis(self, views: Sequence[int]) -> FloatArray:
+        """How errors of the arm move each view's flange: of its links where these are known."""
+        if self.joints_rad is not None and self.robot is not None:
+            return link_basis(self.robot, np.array([self.joints_rad[view] for view in views]))
+        return pose_basis(np.array([self.base_from_flange[view] for view in views]))
 
     @property
     def stops(self) -> IntArray:
-        """(m,) which stop of the robot each used view was taken at, numbered from 0.
+        """(m,) which stop of the robot each used view was taken at; see `stops_of`."""
+        return self.stops_of(self.used)
+
+    def stops_of(self, views: Sequence[int]) -> IntArray:
+        """(m,) which stop of the robot each view was taken at, numbered from 0.
 
         Views of one stop share the robot's error. Where the session does not number its stops,
         views with the same reported pose are of one.
@@ -132,19 +193,14 @@ class Known:
                     else stop,
                     len(keys),
                 )
-                for view in self.used
+                for view in views
             ],
             dtype=np.int64,
         )
 
-    def seen(self, views: Sequence[int]) -> list[Seen]:
-        """The corners of some views with their places on the target."""
-        target = self.session.target
-        positions = None if target is None else corner_positions(target)
-        corners = [self.poses[view].corners for view in views]
-        return [
-            None if it is None or positions is None else (it, positions[it.ids]) for it in corners
-        ]
+    def seen(self, views: Sequence[int]) -> list[Corners | None]:
+        """The corners of some views that their poses were made from."""
+        return [self.poses[view].corners for view in views]
 
     @property
     def robot_noise(self) -> Noise | None:

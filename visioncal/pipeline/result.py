@@ -3,11 +3,14 @@
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult, Validation
 from visioncal.errors import DataError, VisioncalError
+from visioncal.estimator.appearance import BOARD_NAMES, Free
+from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.guessing import is_suspect, reading_hint
@@ -15,8 +18,8 @@ from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.pipeline.views import view_evidence
 from visioncal.session import Session
+from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES
-from visioncal.stages.validate import changed_lens
 from visioncal.types import Progress, SolverName
 
 _LEVELS = ("auto", "hand-eye")
@@ -142,18 +145,68 @@ def _calibration(known: Known) -> Calibration:
         verdict=verdict,
         camera=_camera(known),
         robot=known.robot,
+        stages=_further(known),
     )
+
+
+def _further(known: Known) -> dict[str, dict[str, Any]]:
+    """What was refined beside the edges, and where the uncertainty comes from."""
+    documents = {}
+    if known.free is not None:
+        documents["board"] = _board(known, known.free)
+    if known.arm is not None:
+        documents["arm_errors"] = {
+            "sigma_mm": 1e3 * LEVER_M * known.arm.sigma,
+            "sigma_deg": float(np.rad2deg(known.arm.sigma)),
+            "likelihood_ratio": known.arm.gain,
+            "estimated": known.arm.of_links,
+        }
+    if known.diagnosis is not None:
+        documents["uncertainty"] = _uncertainty(known, known.diagnosis)
+    return documents
+
+
+def _board(known: Known, free: Free) -> dict[str, Any]:
+    """The board as it was found to be, and how well that is known."""
+    board = free.columns >= free.lens_count
+    shape = free.after(known.solved.edges.shared).board
+    bend = free.corners_after(known.solved.edges.shared)[:, 2]
+    sigmas = np.sqrt(np.diag(known.solved.covariance))[12 : 12 + len(free.columns)][board]
+    names = [BOARD_NAMES[at - free.lens_count] for at in free.columns[board]]
+    return {
+        "shape": dict(zip(BOARD_NAMES, shape.tolist(), strict=True)),
+        "sigma": dict(zip(names, sigmas.tolist(), strict=True)),
+        "estimated": [name for name, it in zip(names, free.anchored[board], strict=True) if not it],
+        "bend_mm": 1e3 * float(np.ptp(bend)),
+    }
+
+
+def _uncertainty(known: Known, diagnosis: Diagnosis) -> dict[str, Any]:
+    of = "combined" if known.robot_noise is None else "robot"
+    degrees, millimetres = np.rad2deg(diagnosis.intervals[0]), 1e3 * diagnosis.intervals[1]
+    return {
+        "point_cam_m": diagnosis.point_cam.tolist(),
+        "budget_mm": dict(diagnosis.budget_mm),
+        "radius95_mm": diagnosis.radius95_mm,
+        "noise_95": {
+            f"{of}_translation_mm": millimetres.tolist(),
+            f"{of}_rotation_deg": degrees.tolist(),
+        },
+        "spectrum": diagnosis.spectrum.tolist(),
+        "inflation": diagnosis.inflation,
+    }
 
 
 def _camera(known: Known) -> CameraResult | None:
     """The camera as the whole chain left it."""
-    result, camera = known.solved, known.camera
-    if camera is None or not len(result.edges.lens):
-        return camera
+    result, free = known.solved, known.free
+    if known.camera is None or free is None or not free.lens_is_free:
+        return known.camera
+    lens = 12 + np.flatnonzero(free.columns < free.lens_count)
     return CameraResult(
-        changed_lens(camera.camera, result.edges.lens),
+        free.after(result.edges.shared).camera,
         estimated=True,
-        covariance=result.covariance[12:, 12:],
+        covariance=result.covariance[np.ix_(lens, lens)],
     )
 
 

@@ -11,19 +11,28 @@ import numpy as np
 
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
+from visioncal.estimator.arm import ArmErrors
+from visioncal.estimator.joint import Arm
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by, choose_poses
 from visioncal.stages.detect import detect
+from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
-from visioncal.stages.reported import reported_poses
+from visioncal.stages.refine import held, look, refine
+from visioncal.stages.reported import reported_poses, usable_joints
 from visioncal.stages.validate import validate
+from visioncal.targets import corner_positions
 from visioncal.types import Rejection
+
+# Views move in and out of the fit at most so often; they settle after one or two.
+_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,12 @@ def _read_robot(known: Known) -> Known:
     document = known.session.robot_document
     robot = None if document is None else Robot.from_document(document)
     reported = reported_poses(known.session, robot)
-    known = replace(known, robot=robot, base_from_flange=reported.base_from_flange)
+    known = replace(
+        known,
+        robot=robot,
+        base_from_flange=reported.base_from_flange,
+        joints_rad=usable_joints(known.session, robot, reported.base_from_flange),
+    )
     warnings = (*known.session.warnings, *reported.warnings, *_not_used(known.session))
     known = known.noting(reported.rejections, warnings)
     if not reported.base_from_flange:
@@ -56,8 +70,6 @@ def _not_used(session: Session) -> Iterator[str]:
     declared = session.declaration
     if declared.prior:
         yield f"[prior.{next(iter(declared.prior))}] was not used: this version knows no priors."
-    if declared.camera is not None and declared.camera.intrinsics == "refine":
-        yield 'intrinsics = "refine" was not done: this version holds given intrinsics.'
     if any(name.startswith("meas_") for view in session.views for name in view.numbers):
         yield "The instrument's readings (meas_ columns) were not used by this version."
 
@@ -131,27 +143,85 @@ def _choose(known: Known) -> Known:
     return replace(known, poses=poses, used=used, reasons=reasons).noting(choice.rejections)
 
 
-def _hand_eye(known: Known) -> Known:
-    data = known.closure(known.used)
-    result = solve_hand_eye(data.merged(known.stops), known.solver)
+def _look(known: Known) -> Known:
+    scene, views = known.scene, [known.poses[view] for view in known.used]
+    if scene is None:
+        return known
+    if any(view.corners is None for view in views):
+        return replace(known, free=held(scene))
+    return known.seeing(look(scene, views, closed_form=known.solver != "joint"))
+
+
+def _agree(known: Known) -> Known:
+    agreed = agree(known.closure(known.used), known.used, known.stops)
     poses = dict(known.poses)
     for view in known.held_back & poses.keys() & known.base_from_flange.keys():
         robot = known.closure([view]).robot[0]
-        poses[view] = choose_by(poses[view], robot, result.edges, known.session.target)
-    return replace(known, hand_eye=result, poses=poses)
+        poses[view] = choose_by(poses[view], robot, agreed.edges, known.session.target)
+    return replace(known, poses=poses, candidates=known.used).agreeing(agreed)
+
+
+def _refine(known: Known) -> Known:
+    """Refines with the views that agree, and looks again which do, until they stay the same."""
+    scene, free, agreed = known.scene, known.free, known.agreed
+    if scene is None or free is None or not len(free.columns) or agreed is None:
+        return known
+    if known.solver != "joint":
+        return known
+    for _ in range(_ROUNDS):
+        views = [known.poses[view] for view in known.used]
+        result = refine(scene, views, _arm(known), agreed.edges)
+        known = known.seeing(result)
+        before, all_of = agreed.mask, known.candidates
+        agreed = agree(known.closure(all_of), all_of, known.stops_of(all_of), agreed)
+        known = known.agreeing(agreed)
+        if np.array_equal(before, agreed.mask):
+            break
+    return known.noting((), result.warnings)
+
+
+def _arm(known: Known) -> Arm:
+    return Arm(
+        known.closure(known.used).robot,
+        known.stops,
+        known.arm_basis(known.used),
+        known.joints_rad is not None,
+    )
+
+
+def _hand_eye(known: Known) -> Known:
+    data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
+    return replace(known, hand_eye=solve_hand_eye(data, known.solver, arm))
+
+
+def _arm_by_stop(known: Known) -> ArmErrors | None:
+    if known.arm is None:
+        return None
+    first = np.unique(known.stops, return_index=True)[1]
+    return replace(known.arm, basis=known.arm_basis(known.used)[first])
+
+
+def _diagnose(known: Known) -> Known:
+    data, result = known.closure(known.used).merged(known.stops), known.solved
+    target = known.session.target
+    middle = np.zeros(3) if target is None else corner_positions(target).mean(axis=0)
+    diagnosis = diagnose(data, result, known.free, _arm_by_stop(known), middle)
+    wider = replace(result, covariance=diagnosis.inflation * result.covariance)
+    known = replace(known, hand_eye=wider, diagnosis=diagnosis)
+    return known.noting((), diagnosis.warnings)
 
 
 def _validate(known: Known) -> Known:
     result, data = known.solved, known.closure(known.used)
-    camera = None if known.camera is None else known.camera.camera
-    held_out = validate(data, known.stops, result, known.solver, known.seen(known.used), camera)
+    seen = known.seen(known.used)
+    held_out = validate(data, known.stops, result, known.solver, seen, known.free)
     return replace(known, held_out=held_out)
 
 
 def _judge(known: Known) -> Known:
-    held = known.held_out
-    if held is None:
-        raise RuntimeError("the verdict comes before the validation")
+    held, diagnosis, agreed = known.held_out, known.diagnosis, known.agreed
+    if held is None or diagnosis is None or agreed is None:
+        raise RuntimeError("the verdict comes before what it is made of")
     findings = Findings(
         views=view_results(known),
         stops=len(np.unique(known.stops)),
@@ -160,12 +230,14 @@ def _judge(known: Known) -> Known:
             for view, reason in known.reasons.items()
             if view not in known.held_back
         ],
+        disagreeing=agreed.rejections,
         hand_eye=known.solved,
         rms=used_rms(known),
         held_out=rms_of(held.away_m, held.away_rad, held.rms_px),
         holdout=holdout_rms(known),
         pixel_px=known.pixel_px,
         robot=known.robot_noise,
+        diagnosis=diagnosis,
         warnings=known.warnings,
     )
     return replace(known, findings=findings, verdict=judge(findings))
@@ -177,7 +249,11 @@ STAGES: tuple[Stage, ...] = (
     Stage("intrinsics", _intrinsics),
     Stage("pnp", _pnp),
     Stage("choose", _choose),
+    Stage("look", _look),
+    Stage("agree", _agree),
+    Stage("refine", _refine),
     Stage("hand-eye", _hand_eye),
+    Stage("diagnose", _diagnose),
     Stage("validate", _validate),
     Stage("judge", _judge),
 )

@@ -8,8 +8,7 @@ from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import distances
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import HELD_BACK, Known, rms_of
-from visioncal.stages.validate import chain_rms_px, changed_lens, predict_corners
-from visioncal.targets import corner_positions
+from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import mean_transform
 from visioncal.types import Corners, FloatArray
 
@@ -53,18 +52,17 @@ def view_evidence(known: Known) -> tuple[ViewEvidence, ...]:
 
 
 def _measurable(known: Known) -> list[int]:
-    """The views whose chain can be closed: used ones, and those held back."""
+    """The views whose chain can be closed: used ones, those left out, and those held back."""
     held = known.held_back & known.poses.keys() & known.base_from_flange.keys()
-    return [it.number for it in known.session.views if it.number in {*known.used, *held}]
+    return [it.number for it in known.session.views if it.number in {*known.candidates, *held}]
 
 
 def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Deviations (m,) [m], [rad] from the used views' mean, and through the chain [px]."""
     edges, data = known.solved.edges, known.closure(views)
-    centre = mean_transform(known.closure(known.used).through(edges.lens).placed(edges.x))
-    camera = None if known.camera is None else known.camera.camera
-    rms_px = chain_rms_px(data, edges, known.seen(views), camera)
-    return (*distances(data.through(edges.lens).placed(edges.x), centre), rms_px)
+    centre = mean_transform(known.closure(known.used).under(edges.shared).placed(edges.x))
+    rms_px = chain_rms_px(data, edges, known.seen(views), known.free)
+    return (*distances(data.under(edges.shared).placed(edges.x), centre), rms_px)
 
 
 def _reason(known: Known, view: int) -> str:
@@ -81,15 +79,15 @@ def _corners(known: Known, view: int) -> int | None:
 
 
 def _evidence(known: Known, view: int) -> ViewEvidence:
-    poses, target, edges = known.poses.get(view), known.session.target, known.solved.edges
+    poses, edges = known.poses.get(view), known.solved.edges
     corners = known.corners.get(view) if poses is None else poses.corners
     base_from_flange = known.base_from_flange.get(view)
     predicted = cam_from_target = None
     if poses is not None and base_from_flange is not None:
-        data = known.closure([view]).through(edges.lens)
+        data = known.closure([view]).under(edges.shared)
         cam_from_target = data.camera[0]
         # Of several poses that were never chosen from, the corners' numbering is not known.
-        if corners is not None and target is not None and len(poses.cam_from_target) == 1:
+        if corners is not None and len(poses.cam_from_target) == 1:
             predicted = _predicted(known, data.predicted_camera(edges.x, edges.z)[0], corners)
     return ViewEvidence(
         view=view,
@@ -101,8 +99,8 @@ def _evidence(known: Known, view: int) -> ViewEvidence:
 
 
 def _predicted(known: Known, cam_from_target: FloatArray, corners: Corners) -> FloatArray | None:
-    if known.camera is None or known.session.target is None:
+    if known.free is None:
         return None
-    camera = changed_lens(known.camera.camera, known.solved.edges.lens)
-    positions = corner_positions(known.session.target)[corners.ids]
-    return predict_corners(camera, cam_from_target, positions)
+    change = known.solved.edges.shared
+    positions = known.free.corners_after(change)[corners.ids]
+    return predict_corners(known.free.after(change).camera, cam_from_target, positions)

@@ -1,11 +1,14 @@
 """Text and plots of a result: the verdict, the solvers, and the residuals of every view."""
 
+import math
 import re
+from collections.abc import Iterator, Mapping
 
 import rerun as rr
 
 from visioncal.calibration import Calibration, Edge, Rms, ViewResult
 from visioncal.recording import colours, paths
+from visioncal.recording.findings import SOURCES, Arm, Board, Findings, Uncertainty
 from visioncal.transforms import pose_difference
 
 _HEADLINES = {"good": "Good", "check": "Check before use", "bad": "Bad: do not use"}
@@ -14,6 +17,19 @@ _PLOTS = {
     paths.ORIENTATION_DEG: "residual_deg",
     paths.REPROJECTION_PX: "rms_px",
 }
+_MARKS = (
+    (paths.USED, "used", colours.USED, rr.components.MarkerShape.Circle, 3.5),
+    (paths.REJECTED, "not used", colours.REJECTED, rr.components.MarkerShape.Cross, 6.0),
+    (
+        paths.BEYOND,
+        "not used, beyond the scale",
+        colours.REJECTED,
+        rr.components.MarkerShape.Up,
+        6.0,
+    ),
+)
+# The scale of a plot ends here, in largest residuals of the used views.
+_ROOM = 1.25
 
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
@@ -25,22 +41,35 @@ def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
     ):
         stream.log(entity, _markdown(text), static=True)
     for plot in _PLOTS:
-        for name, label, colour, marker, size in (
-            (paths.USED, "used", colours.USED, rr.components.MarkerShape.Circle, 3.5),
-            (paths.REJECTED, "not used", colours.REJECTED, rr.components.MarkerShape.Cross, 6.0),
-        ):
+        for name, label, colour, marker, size in _MARKS:
             points = rr.SeriesPoints(colors=colour, markers=marker, marker_sizes=size, names=label)
             stream.log(f"{plot}/{name}", points, static=True)
 
 
-def log_view(stream: rr.RecordingStream, view: ViewResult) -> None:
-    """Logs one view's residuals and what became of it, at the stream's current time."""
-    name = paths.USED if view.used else paths.REJECTED
+def scales(calibration: Calibration) -> dict[str, float]:
+    """By plot, where its scale ends: views that were not used must not flatten the others."""
+    ends = {}
     for plot, attribute in _PLOTS.items():
-        value = getattr(view, attribute)
+        known = [getattr(view, attribute) for view in calibration.views if view.used]
+        ends[plot] = _ROOM * max((it for it in known if it is not None), default=math.inf)
+    return ends
+
+
+def log_view(stream: rr.RecordingStream, view: ViewResult, ends: Mapping[str, float]) -> None:
+    """Logs one view's residuals and what became of it, at the stream's current time.
+
+    Args:
+        stream: Where to.
+        view: What became of the view.
+        ends: Where the plots' scales end, of `scales`.
+    """
+    for plot, attribute in _PLOTS.items():
+        name, value = paths.USED if view.used else paths.REJECTED, getattr(view, attribute)
         if value is None and not view.used:
             # Marked on the axis: a gap would look as if there were no such view.
             value = 0.0
+        if not view.used and value > ends[plot]:
+            name, value = paths.BEYOND, ends[plot]
         if value is not None:
             stream.log(f"{plot}/{name}", rr.Scalars(float(value)))
     stream.log(paths.VIEW_NOTE, _markdown(view_markdown(view)))
@@ -57,6 +86,9 @@ def verdict_markdown(calibration: Calibration) -> str:
         "|---|---|---|---|",
     ]
     lines += [_edge_line(name, edge) for name, edge in calibration.edges.items()]
+    known = Findings.of(calibration).uncertainty
+    if known is not None:
+        lines += ["", _work_line(known)]
     rejected = [view for view in calibration.views if not view.used]
     used = len(calibration.views) - len(rejected)
     lines += ["", f"{used} of {len(calibration.views)} views used."]
@@ -71,19 +103,65 @@ def _edge_line(name: str, edge: Edge) -> str:
     return f"| {plain(name)} | {position} | {turn} | {sigma} |"
 
 
+def _work_line(known: Uncertainty) -> str:
+    largest = plain(next(iter(known.parts_mm)))
+    return (
+        f"Where the views look, a point is placed to {known.total_mm:.2g} mm (sigma; 95 % within "
+        f"{known.radius95_mm:.2g} mm); the largest part comes from the {largest}."
+    )
+
+
 def figures_markdown(calibration: Calibration) -> str:
-    """The residuals of the fit and of what it had not seen, and the noise."""
+    """The residuals of the fit and of what it had not seen, the noise, and what else was found."""
+    found = Findings.of(calibration)
     lines = ["# Residuals, rms", "", "| views | mm | deg | px |", "|---|---:|---:|---:|"]
     validation = calibration.validation
     lines.append(_rms_line("used, as fitted", calibration.rms))
     lines.append(_rms_line(f"left out in turn ({plain(validation.method)})", validation.held_out))
     if validation.holdout is not None:
         lines.append(_rms_line("declared hold-out", validation.holdout))
-    lines += ["", "# Noise, per axis", "", "| standard deviation | |", "|---|---:|"]
-    lines += [
-        f"| {_noise_label(name)} | {value:.2g} |" for name, value in calibration.noise.items()
-    ]
-    return "\n".join(lines)
+    intervals = {} if found.uncertainty is None else found.uncertainty.noise_95
+    lines += ["", "# Noise, per axis", "", "| standard deviation | | 95 % |", "|---|---:|---:|"]
+    for name, value in calibration.noise.items():
+        low_high = " to ".join(f"{it:.2g}" for it in intervals.get(name, ()))
+        lines.append(f"| {_noise_label(name)} | {value:.2g} | {low_high} |")
+    return "\n".join([*lines, *_findings_lines(found)])
+
+
+def _findings_lines(found: Findings) -> Iterator[str]:
+    known = found.uncertainty
+    if known is not None:
+        yield from ("", "# Where the uncertainty comes from", "", _work_line(known), "")
+        yield from ("| source | sigma mm | of the variance |", "|---|---:|---:|")
+        for name, value in known.parts_mm.items():
+            label = plain(SOURCES.get(name, name))
+            yield f"| {label} | {value:.2g} | {known.percent(name)} |"
+        yield f"| total | {known.total_mm:.2g} | |"
+    if found.board is not None and found.board.sigma:
+        yield from ("", "# Board", "", _board_line(found.board))
+    if found.arm is not None:
+        yield from ("", "# Arm", "", _arm_line(found.arm))
+
+
+def _board_line(board: Board) -> str:
+    scale = "as stated"
+    if "scale" in board.estimated:
+        sigma = board.sigma["scale"]
+        away = 100 * board.shape["scale"]
+        scale = f"{away:+.2g} % against the stated one (sigma {100 * sigma:.1g} %)"
+    bend = "none: flat within what is seen"
+    if board.is_bent:
+        bend = f"its corners lie within {board.bend_mm:.2g} mm of depth"
+    return f"Size: {scale}. Bend: {bend}."
+
+
+def _arm_line(arm: Arm) -> str:
+    treated = "were estimated along" if arm.estimated else "could not be estimated along"
+    return (
+        f"Residuals follow the arm's posture: its links are typically off by {arm.sigma_mm:.2g} mm "
+        f"and {arm.sigma_deg:.2g} deg (likelihood ratio {arm.likelihood_ratio:.0f}, noise stays "
+        f"under 15). These errors {treated}."
+    )
 
 
 def _noise_label(name: str) -> str:

@@ -22,12 +22,15 @@ class Overlay:
     """How residuals and corners are drawn, the same in all views.
 
     Attributes:
-        factor: How many times longer residuals are drawn than they are.
+        factor: How many times longer residuals of used views are drawn than they are. Those of
+            other views, which may be anything, are drawn to scale.
+        used: The views that the fit used.
         width: Width of the images [px].
         active: Whether there is anything to draw in any view.
     """
 
     factor: int
+    used: frozenset[int]
     width: float
     active: bool
 
@@ -43,10 +46,11 @@ class Overlay:
         if calibration is not None and calibration.camera is not None:
             resolution = calibration.camera.camera.resolution
         width = 1280 if resolution is None else resolution[0]
-        used = [] if calibration is None else [it.view for it in calibration.views if it.used]
-        shown = [evidence[view] for view in used if view in evidence]
+        views = () if calibration is None else calibration.views
+        used = frozenset(it.view for it in views if it.used)
+        shown = [it for view, it in evidence.items() if view in used]
         active = any(it.corners is not None for it in evidence.values())
-        return cls(magnification(shown, width), float(width), active)
+        return cls(magnification(shown, width), used, float(width), active)
 
     def log_view(self, stream: rr.RecordingStream, seen: ViewEvidence) -> None:
         """Logs one view's corners and residuals at the stream's current time."""
@@ -69,15 +73,15 @@ class Overlay:
                 predicted_px + _CENTRE, colors=colours.PREDICTED, radii=0.5 * _DOT * self.width
             ),
         )
-        paired = len(predicted_px) == len(px)
-        vectors = predicted_px - px if paired else np.zeros((0, 2))
-        stream.log(
-            paths.magnified_residuals(self.factor),
-            frame,
-            rr.Arrows2D(
-                vectors=self.factor * vectors,
+        for entity, factor, wanted in (
+            (paths.magnified_residuals(self.factor), self.factor, True),
+            (paths.RESIDUALS_TO_SCALE, 1, False),
+        ):
+            paired = len(predicted_px) == len(px) and (seen.view in self.used) is wanted
+            arrows = rr.Arrows2D(
+                vectors=factor * (predicted_px - px) if paired else np.zeros((0, 2)),
                 origins=px + _CENTRE if paired else np.zeros((0, 2)),
                 colors=colours.RESIDUAL,
                 radii=_LINE * self.width,
-            ),
-        )
+            )
+            stream.log(entity, frame, arrows)

@@ -37,6 +37,7 @@ ROTATION_AXES = "/coverage/rotation_axes"
 # In the image.
 DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
+RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 
 # Plots and text.
 RESIDUALS = "/residuals"
@@ -48,6 +49,8 @@ FIGURES = "/notes/figures"
 SOLVERS = "/notes/solvers"
 VIEW_NOTE = "/notes/view"
 USED, REJECTED, THIS_VIEW = "used", "rejected", "this_view"
+# Drawn where the scale ends, because it lies farther out.
+BEYOND = "rejected_beyond_the_scale"
 
 
 def magnified_residuals(factor: int) -> str:

@@ -70,7 +70,8 @@ def log_results(
     """Logs what was computed: first what is drawn of it, then what makes it count.
 
     Raises:
-        DataError: The evidence names a view that the session does not have.
+        DataError: The evidence names a view that the session does not have, or what was found
+            beside the edges cannot be read.
         OSError: The file cannot be written.
     """
     seen_of = {it.view: it for it in evidence}
@@ -152,13 +153,14 @@ def _draw(
     if calibration is not None:
         notes.log_static(stream, calibration)
     results = {} if calibration is None else {it.view: it for it in calibration.views}
+    ends = {} if calibration is None else notes.scales(calibration)
     for row, view in enumerate(session.views):
         recorder.at(row)
         seen = evidence.get(view.number, ViewEvidence(view.number))
         scene.log_view(stream, view, seen)
         overlay.log_view(stream, seen)
         if view.number in results:
-            notes.log_view(stream, results[view.number])
+            notes.log_view(stream, results[view.number], ends)
     recorder.keep()
 
 

@@ -223,13 +223,17 @@ class Scene:
         """Draws the target's outline where this view alone sees it."""
         if self.session.target is None:
             return
+        rejected = self.calibration is not None and any(
+            it.view == seen.view and not it.used for it in self.calibration.views
+        )
         strips = []
         if seen.cam_from_target is not None and base_from_cam is not None:
             base_from_target = base_from_cam @ seen.cam_from_target
             corners = board.closed_outline(self.session.target)
             strips.append(corners @ base_from_target[:3, :3].T + base_from_target[:3, 3])
         # Without strips, this takes those of the view before off the screen.
-        line = rr.LineStrips3D(strips, colors=colours.DETECTED, radii=self._radius(_LINE))
+        colour = colours.REJECTED if rejected else colours.DETECTED
+        line = rr.LineStrips3D(strips, colors=colour, radii=self._radius(_LINE))
         stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
 
 

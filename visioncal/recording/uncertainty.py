@@ -20,6 +20,8 @@ from visioncal.types import FloatArray
 _SIGMAS = 2.0
 # How large the largest of them is drawn, as a share of the cell's size.
 _SHARE = 0.07
+# Placements beyond this are drawn here, as shares of the same: wrong views lie anywhere.
+_REACH = 0.2
 _POINT, _LINE = 0.005, 0.0015
 # What lies at the child's end of each edge, whose frame its covariance is given in.
 _ENTITIES = {"cam": paths.CAMERA, "target": paths.TARGET}
@@ -86,6 +88,7 @@ class Uncertainty:
             some = [it for view, it in self.scatter_m.items() if (view in self.used) is wanted]
             if some:
                 self._log_scatter(stream, name, some, colour, static=True)
+        self._log_beyond(stream)
 
     def log_view(self, stream: rr.RecordingStream, view: int) -> None:
         """Marks one view's placement of the target, at the stream's current time."""
@@ -101,11 +104,31 @@ class Uncertainty:
         *,
         static: bool,
     ) -> None:
-        positions_m = self.factor * np.reshape(scatter_m, (-1, 3))
+        positions_m = np.reshape(
+            [self._within_reach(self.factor * it) for it in scatter_m], (-1, 3)
+        )
         larger = 1.5 if name == paths.THIS_VIEW else 1.0
         points = rr.Points3D(positions_m, colors=colour, radii=larger * _POINT * self.size_m)
         entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{name}"
         stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), points, static=static)
+
+    def _log_beyond(self, stream: rr.RecordingStream) -> None:
+        """Arrows towards the placements that lie too far out to be drawn."""
+        drawn_m = [self.factor * it for it in self.scatter_m.values()]
+        far = [it for it in drawn_m if np.linalg.norm(it) > _REACH * self.size_m]
+        if far:
+            arrows = rr.Arrows3D(
+                vectors=[self._within_reach(it) for it in far],
+                origins=np.zeros((len(far), 3)),
+                colors=colours.REJECTED,
+                radii=_LINE * self.size_m,
+            )
+            entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{paths.BEYOND}"
+            stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), arrows, static=True)
+
+    def _within_reach(self, drawn_m: FloatArray) -> FloatArray:
+        reach_m = _REACH * self.size_m
+        return drawn_m * min(1.0, reach_m / max(float(np.linalg.norm(drawn_m)), 1e-12))
 
 
 def _axes(edge: Edge) -> tuple[FloatArray, FloatArray]:

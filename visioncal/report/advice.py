@@ -16,6 +16,8 @@ _STANDS_OUT = 4.0
 _IMPERATIVE = re.compile("(Add|Check|Compare|Look|Measure|Move|Print|Record|Take|Use) ")
 # And one that starts so is about views that disagree.
 _CAUSES = "Possible causes: "
+# So begins the reason of a view that was left out because pose and image do not go together.
+_CONTRADICTS = "disagrees with the other views"
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,11 @@ class Suspects:
     views: tuple[int, ...]
     used: bool
     why: str
+
+    @property
+    def contradict(self) -> bool:
+        """Whether they were left out because they contradict the others."""
+        return not self.used and self.why.startswith(_CONTRADICTS)
 
 
 def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
@@ -53,6 +60,11 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
 def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
     """Numbers of the used views among suspects, ascending."""
     return tuple(sorted(view for it in found if it.used for view in it.views))
+
+
+def contradicts(view: ViewResult) -> bool:
+    """Whether a view was left out because it contradicts the others."""
+    return not view.used and view.reason.startswith(_CONTRADICTS)
 
 
 def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
@@ -110,6 +122,14 @@ def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str
         )
     elif causes:
         advice.insert(0, f"No view stands out, so look for what all of them share: {causes[0]}")
+    contradicting = [view.view for view in calibration.views if contradicts(view)]
+    if contradicting:
+        advice.insert(
+            0,
+            f"Find out what went wrong with {listed(contradicting)}, which the result does not "
+            "use: does the pose belong to the image, and did anything move? Repeat them where the "
+            "others leave gaps.",
+        )
     return tuple(advice) or ("Settle the points above, and calibrate again.",)
 
 

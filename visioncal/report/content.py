@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.calibration import Calibration, Edge, Rms, SolverResult, ViewResult
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
-from visioncal.report.advice import Suspects, outlying_views
+from visioncal.report.advice import Suspects, contradicts, outlying_views
 from visioncal.report.numbers import decimals_for, matched, significant
 from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray
@@ -72,7 +72,11 @@ class SolverRow:
 
 @dataclass(frozen=True)
 class ViewRow:
-    """One view, as text; `mark` is `used`, `look` (used, but outlying) or `rejected`."""
+    """One view, as text.
+
+    `mark` is `used`, `look` (used, but outlying), `left-out` (it contradicts the others) or
+    `rejected`.
+    """
 
     number: int
     mark: str
@@ -142,7 +146,7 @@ def _edge_card(name: str, edge: Edge) -> EdgeCard:
     ]
     return EdgeCard(
         name,
-        f"The pose of {_words(child)} in the frame of {_words(parent)}.",
+        f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}.",
         _rounded(edge.sigma_mm),
         _rounded(edge.sigma_deg),
         tuple(rows),
@@ -150,7 +154,8 @@ def _edge_card(name: str, edge: Edge) -> EdgeCard:
     )
 
 
-def _words(frame: str) -> str:
+def frame_words(frame: str) -> str:
+    """What a frame is the frame of."""
     return {"cam": "the camera", "base": "the robot's base"}.get(frame, f"the {frame}")
 
 
@@ -260,8 +265,7 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         camera = calibration.camera.camera
         width, height = camera.resolution
         facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
-    noise = [_noise_fact(name, value) for name, value in calibration.noise.items()]
-    return (*facts, *noise)
+    return tuple(facts)
 
 
 def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:
@@ -289,19 +293,6 @@ def lens_origin(calibration: Calibration) -> str:
     return "estimated from this session" if estimated else "as given by the session"
 
 
-_UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
-
-
-def _noise_fact(name: str, value: float) -> Fact:
-    stem, unit = name, ""
-    for suffix, word in _UNITS.items():
-        if name.endswith(suffix):
-            stem, unit = name.removesuffix(suffix), word
-    return Fact(
-        f"noise, {stem.replace('_', ' ')}", f"{significant(value)} {unit}".strip(), "per axis"
-    )
-
-
 def view_columns(
     views: Sequence[ViewResult], found: Sequence[Suspects]
 ) -> tuple[tuple[ViewRow, ...], ...]:
@@ -313,15 +304,20 @@ def view_columns(
 
 
 def _view_row(view: ViewResult, outlying: Collection[int]) -> ViewRow:
-    mark = "rejected" if not view.used else "look" if view.view in outlying else "used"
     return ViewRow(
         view.view,
-        mark,
+        _mark(view, outlying),
         significant(None) if view.corners is None else str(view.corners),
         significant(view.rms_px),
         significant(view.residual_mm),
         significant(view.residual_deg),
     )
+
+
+def _mark(view: ViewResult, outlying: Collection[int]) -> str:
+    if view.used:
+        return "look" if view.view in outlying else "used"
+    return "left-out" if contradicts(view) else "rejected"
 
 
 def dependency_versions() -> tuple[Fact, ...]:

@@ -12,7 +12,8 @@ from visioncal.calibration import Calibration, ViewResult
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence, magnification
 from visioncal.files import write_atomically
-from visioncal.report import advice, content, plots
+from visioncal.recording.findings import Findings
+from visioncal.report import advice, content, plots, sources, uncertainty
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
@@ -38,7 +39,7 @@ def write_report(
         note: What the reader should know of this report itself.
 
     Raises:
-        DataError: The file cannot be written.
+        DataError: The file cannot be written, or what was found beside the edges cannot be read.
     """
     write_atomically(path, render(calibration, session, evidence, note))
 
@@ -64,6 +65,7 @@ def render(
         python=platform.python_version(),
         versions=content.dependency_versions(),
         **_words(calibration),
+        **_uncertainty(calibration, session),
         **_plots(calibration, session, evidence),
         **_pictures(calibration, session, evidence),
     )
@@ -77,6 +79,7 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "next_steps": advice.next_steps(calibration, found),
         "suspects": [(advice.listed(it.views), it) for it in found],
         "has_outliers": any(it.used for it in found),
+        "has_contradicting": any(it.contradict for it in found),
         "key_figures": content.key_figures(calibration),
         "edges": content.edge_cards(calibration),
         "method": content.method_facts(calibration),
@@ -86,6 +89,22 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "solvers": content.solver_rows(calibration),
         "has_pixels": calibration.rms.px is not None,
         "view_columns": content.view_columns(calibration.views, found),
+    }
+
+
+def _uncertainty(calibration: Calibration, session: Session | None) -> dict[str, object]:
+    found = Findings.of(calibration)
+    board, arm, known = found.board, found.arm, found.uncertainty
+    target = None if session is None else session.target
+    return {
+        "uncertainty": () if known is None else uncertainty.summary(calibration, known),
+        "noise": uncertainty.noise_facts(calibration, known),
+        "board": () if board is None else uncertainty.board_facts(calibration, board, target),
+        "arm": () if arm is None else uncertainty.arm_facts(arm),
+        "arm_is_estimated": arm is not None and arm.estimated,
+        "budget_plot": "" if known is None else sources.budget(known),
+        "spectrum_plot": "" if known is None else sources.directions(known),
+        "board_plot": "" if not (board and target) else sources.board_shape(board, target),
     }
 
 
@@ -161,7 +180,12 @@ class _Pictures:
     def of_rejected(self, views: Sequence[ViewResult]) -> list[Thumbnail]:
         """The first few of the views that were not used, with their reasons."""
         found = (
-            self._of(view, f"View {view.view}: {view.reason}", None, 1)
+            self._of(
+                view,
+                f"View {view.view}: {view.reason}",
+                self.seen.get(view.view) if advice.contradicts(view) else None,
+                1,
+            )
             for view in views
             if not view.used
         )

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.calibration import Calibration, ViewResult
 from visioncal.evidence import ViewEvidence
 from visioncal.report import svg
+from visioncal.report.advice import contradicts
 from visioncal.report.numbers import significant
 from visioncal.transforms import nearest_rotation
 from visioncal.types import FloatArray
@@ -62,25 +63,27 @@ def _residual_panel(
     known = [(place, view, value_of(view)) for place, view in enumerate(views)]
     values = [(place, view.used, value) for place, view, value in known if value is not None]
     unknown = [place for place, view, value in known if value is None and not view.used]
+    of_unused = {it.view: svg.BAD if contradicts(it) else svg.MUTED for it in views if not it.used}
     used = [value for _, is_used, value in values if is_used]
     top = _ROOM * max(used or [value for _, _, value in values], default=1.0) or 1.0
     if values:
-        places, flags, heights = zip(*values, strict=True)
+        places, _, heights = zip(*values, strict=True)
         colours = [
-            svg.BAD if not is_used else svg.CHECK if views[place].view in outlying else svg.ACCENT
-            for place, is_used in zip(places, flags, strict=True)
+            of_unused.get(view, svg.CHECK if view in outlying else svg.ACCENT)
+            for view in (views[place].view for place in places)
         ]
         axes.bar(places, np.minimum(heights, top), width=0.7, color=colours, alpha=0.9)
     for place, is_used, value in values:
         if not is_used:
             clipped = value > top
-            axes.plot(place, min(value, top), "^" if clipped else "x", color=svg.BAD, markersize=5)
+            colour = of_unused[views[place].view]
+            axes.plot(place, min(value, top), "^" if clipped else "x", color=colour, markersize=5)
             if clipped:
                 axes.annotate(
-                    f"{value:.3g}", (place, top), (0, 5), textcoords="offset points",
-                    fontsize=8, color=svg.BAD, ha="center",
+                    significant(value), (place, top), (0, 5), textcoords="offset points",
+                    fontsize=8, color=colour, ha="center",
                 )  # fmt: skip
-    axes.plot(unknown, [0.05 * top] * len(unknown), "x", color=svg.BAD, markersize=5)
+    axes.plot(unknown, [0.05 * top] * len(unknown), "x", color=svg.MUTED, markersize=5)
     if rms is not None:
         axes.axhline(rms, color=svg.INK, linewidth=0.9, linestyle=(0, (4, 3)))
         axes.annotate(

@@ -205,5 +205,5 @@ def _chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
         cam_from_target=view.cam_from_target[pick : pick + 1],
         turns=(turn,),
         covariance=view.covariance[pick : pick + 1],
-        by_intrinsics=view.by_intrinsics[pick : pick + 1],
+        by_shared=view.by_shared[pick : pick + 1],
     )

@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 
 from visioncal.errors import ConvergenceError
+from visioncal.estimator.arm import ArmErrors, misfit_covariance
 from visioncal.estimator.closure import (
     Closure,
     ClosureFit,
@@ -65,7 +66,9 @@ def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
     return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
 
 
-def solve_hand_eye(data: Closure, solver: SolverName = "joint") -> HandEyeResult:
+def solve_hand_eye(
+    data: Closure, solver: SolverName = "joint", arm: ArmErrors | None = None
+) -> HandEyeResult:
     """Solves for both unknown edges.
 
     The covariance is that of the joint fit at the noise which the answer leaves. A closed form uses
@@ -74,6 +77,8 @@ def solve_hand_eye(data: Closure, solver: SolverName = "joint") -> HandEyeResult
     Args:
         data: The used views.
         solver: `joint` for the whitened fit of both edges, or a closed form's name.
+        arm: Errors that follow the arm's posture, at the same views. Those of its links are among
+            what the views share; others are noise to the fit and count in the covariance.
 
     Returns:
         The answer with its covariance.
@@ -85,17 +90,19 @@ def solve_hand_eye(data: Closure, solver: SolverName = "joint") -> HandEyeResult
     with one_blas_thread():
         if len(data) < FEWEST_VIEWS:
             # Raises, and says what is missing: no solver can answer.
-            nowhere = Edges(np.eye(4), np.eye(4), data.unchanged_lens)
+            nowhere = Edges(np.eye(4), np.eye(4), data.unchanged)
             check_observability(data, nowhere, Noise(1.0, 1.0))
         closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
         start = closed[_START if solver == "joint" else solver]
-        edges = Edges(start.x, start.z, data.unchanged_lens)
+        edges = Edges(start.x, start.z, data.unchanged)
         if solver == "joint":
             fit = fit_closure(data, edges)
         else:
             fit = ClosureFit(edges, estimate_noise(data, edges))
         worst = check_observability(data, fit.edges, fit.noise)
         spread = covariance(closure_information(data, fit.edges, fit.noise))
+        if arm is not None and not arm.of_links:
+            spread = spread + misfit_covariance(data, fit.edges, fit.noise, arm)
     if not fit.settled:
         raise ConvergenceError(
             f"hand-eye: the joint fit of {len(data)} views does not come to rest.",
@@ -103,7 +110,7 @@ def solve_hand_eye(data: Closure, solver: SolverName = "joint") -> HandEyeResult
         )
     solutions = {"joint": _solution(data, fit.edges)} if solver == "joint" else {}
     solutions |= {
-        name: _solution(data, Edges(it.x, it.z, data.unchanged_lens)) for name, it in closed.items()
+        name: _solution(data, Edges(it.x, it.z, data.unchanged)) for name, it in closed.items()
     }
     return HandEyeResult(fit.edges, spread, fit.noise, solutions, worst)
 
@@ -113,11 +120,11 @@ def refit(data: Closure, result: HandEyeResult, solver: SolverName) -> Edges:
     if solver == "joint":
         return solve_closure(data, result.edges, result.noise)[0]
     again = SOLVERS[solver](data.robot, data.camera)
-    return Edges(again.x, again.z, data.unchanged_lens)
+    return Edges(again.x, again.z, data.unchanged)
 
 
 def _solution(data: Closure, edges: Edges) -> Solution:
-    away_m, away_rad = deviations(data.through(edges.lens).placed(edges.x))
+    away_m, away_rad = deviations(data.under(edges.shared).placed(edges.x))
     return Solution(
         edges.x,
         edges.z,

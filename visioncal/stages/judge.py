@@ -7,13 +7,14 @@ import numpy as np
 
 from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
 from visioncal.estimator.closure import Noise
+from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.transforms import pose_difference
 from visioncal.types import Rejection
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
 _ROUNDING = 1e-6
-_LISTED_VIEWS = 3
+_LISTED_VIEWS, _LISTED_PARTS = 3, 3
 
 
 @dataclass(frozen=True)
@@ -60,24 +61,28 @@ class Findings:
         views: What became of each view.
         stops: Number of the robot's stops in the fit.
         lost: Views that could not be used; those held back on purpose are not among them.
+        disagreeing: Those of them whose robot pose and image do not belong together.
         hand_eye: The fit.
         rms: Residuals of the used views.
         held_out: Residuals of views left out in turn.
         holdout: Residuals of views held back by the session; None where there are none.
         pixel_px: Noise of a corner's coordinate; None without images [px].
         robot: Noise of the flange; None where it cannot be told from the camera's.
+        diagnosis: What the residuals show beyond noise, and where the uncertainty comes from.
         warnings: What earlier stages had to say.
     """
 
     views: Sequence[ViewResult]
     stops: int
     lost: Sequence[Rejection]
+    disagreeing: Sequence[Rejection]
     hand_eye: HandEyeResult
     rms: Rms
     held_out: Rms
     holdout: Rms | None
     pixel_px: float | None
     robot: Noise | None
+    diagnosis: Diagnosis
     warnings: Sequence[str]
 
 
@@ -103,10 +108,12 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
     scatter = list(_scatter_doubts(findings, options))
     doubts = [
         *scatter,
+        *_disagreement_doubts(findings),
         *_outlier_doubts(findings, options),
         *_holdout_doubts(findings, options),
         # Views that disagree wildly have no sigma worth a word about the motion.
         *([] if any(it.is_fatal for it in scatter) else _sigma_doubts(findings, options)),
+        *_budget_doubts(findings, options),
         *_view_doubts(findings, options),
         *_pixel_doubts(findings, options),
         *([] if scatter else _robot_doubts(findings, options)),
@@ -176,6 +183,18 @@ def _worst_views(views: Sequence[ViewResult]) -> str:
     )
 
 
+def _disagreement_doubts(findings: Findings) -> Iterator[_Doubt]:
+    """Names the views that were left out because they contradict the others."""
+    out = findings.disagreeing
+    if not out:
+        return
+    if len(out) == 1:
+        yield _Doubt(f"View {out[0].view} was left out: it {out[0].reason}.")
+        return
+    named = ", ".join(str(it.view) for it in out)
+    yield _Doubt(f"Views {named} were left out; view {out[0].view} {out[0].reason}.")
+
+
 def _outlier_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
     """Names single views whose residual stands out from the others'."""
     used = [view for view in findings.views if view.used]
@@ -205,6 +224,7 @@ def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
 
 
 def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    weak, is_fatal = [], False
     for direction in findings.hand_eye.worst:
         scale, unit, (check, bad) = (
             (np.rad2deg(1.0), "deg", options.sigma_deg)
@@ -213,12 +233,29 @@ def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
         )
         sigma = direction.sigma * scale
         if sigma > check:
-            yield _Doubt(
-                f"{direction.words[0].upper()}{direction.words[1:]} is weakly determined: its "
-                f"sigma is {sigma:.2g} {unit} (doubt begins at {check:g}). Add views tilted by 20 "
-                "to 40 degrees about axes across that direction.",
-                sigma > bad,
-            )
+            weak.append(f"{direction.words} ({sigma:.2g} {unit})")
+            is_fatal |= bool(sigma > bad)
+    if weak:
+        yield _Doubt(
+            f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt begins "
+            f"at {options.sigma_mm[0]:g} mm and {options.sigma_deg[0]:g} deg. Add views tilted by "
+            "20 to 40 degrees about axes across these directions.",
+            is_fatal,
+        )
+
+
+def _budget_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    """Says what makes the result uncertain where it is to be used."""
+    budget = findings.diagnosis.budget_mm
+    if not budget["total"] > options.sigma_mm[0]:
+        return
+    parts = sorted((it for it in budget.items() if it[0] != "total"), key=lambda it: -it[1])
+    yield _Doubt(
+        f"Where the views look, a point is placed to {budget['total']:.2g} mm (sigma; 95 % within "
+        f"{findings.diagnosis.radius95_mm:.2g} mm): "
+        + ", ".join(f"{mm:.2g} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
+        + "."
+    )
 
 
 def _view_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
@@ -254,7 +291,7 @@ def _pixel_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
 
 def _robot_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
     """An arm is a good instrument: what looks like its error is often something else's."""
-    if findings.robot is None:
+    if findings.robot is None or findings.diagnosis.arm is not None:
         return
     away_mm, away_deg = 1e3 * findings.robot.sigma_m, np.rad2deg(findings.robot.sigma_rad)
     if away_mm > options.robot_mm or away_deg > options.robot_deg:
@@ -273,7 +310,7 @@ def _solver_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt
     question: what half of them agree on is meant.
     """
     result = findings.hand_eye
-    if len(result.edges.lens):
+    if findings.diagnosis.arm is not None or len(result.edges.shared) > 1:
         return
     sigma_mm = 1e3 * float(np.sqrt(np.trace(result.covariance[3:6, 3:6])))
     sigma_deg = float(np.rad2deg(np.sqrt(np.trace(result.covariance[:3, :3]))))

@@ -38,8 +38,8 @@ class ViewPoses:
         turns: (c,) which of the target's own symmetries each candidate has applied.
         covariance: (c, 6, 6) of the candidates' right perturbations; zero where the session gave
             the pose itself.
-        by_intrinsics: (c, 6, k) how each candidate moves with the intrinsics; k = 0 where the
-            session gave the pose itself.
+        by_shared: (c, 6, k) how each candidate moves with the unknowns that all views share, once
+            it is known which these are; k = 0 before.
     """
 
     view: int
@@ -47,7 +47,7 @@ class ViewPoses:
     cam_from_target: FloatArray
     turns: tuple[int, ...]
     covariance: FloatArray
-    by_intrinsics: FloatArray
+    by_shared: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _with_rivals(
                 np.concatenate([it.cam_from_target[at] @ turns for it in fits]),
                 tuple(range(len(turns))) * len(fits),
                 np.concatenate(spread),
-                np.concatenate([turned @ it.by_intrinsics[at] for it in fits]),
+                np.zeros((len(turns) * len(fits), 6, 0)),
             )
         )
     return tuple(views)
@@ -195,7 +195,6 @@ def _mirrored(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArr
     return PoseFit(
         _replaced(fit.cam_from_target, promising, part.cam_from_target),
         _replaced(fit.information, promising, part.information),
-        _replaced(fit.by_intrinsics, promising, part.by_intrinsics),
         _replaced(fit.residuals, of_corner, part.residuals),
     )
 
@@ -216,7 +215,6 @@ def _sorted(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFi
         return PoseFit(
             np.where(swap[:, None, None], b.cam_from_target, a.cam_from_target),
             np.where(swap[:, None, None], b.information, a.information),
-            np.where(swap[:, None, None], b.by_intrinsics, a.by_intrinsics),
             np.where(of_corner[:, None], b.residuals, a.residuals),
         )
 

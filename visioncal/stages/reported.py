@@ -9,12 +9,14 @@ from visioncal.errors import DataError
 from visioncal.estimator.closure import deviations
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.transforms import invert, mean_transform, pose_difference
+from visioncal.transforms import invert, mean_transform, pose_difference, rotation_angle
 from visioncal.types import FloatArray, Rejection
 
 # Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
 # another convention is off by far more.
 _AGREE_M, _AGREE_RAD = 1e-3, 2e-3
+# Beyond, the model is of another arm, or its base or its tip is another frame.
+_SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
 # Arms have at most seven joints in the models that ship; messages list no more columns than that.
 _LISTED_COLUMNS = 7
 
@@ -65,6 +67,33 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         else:
             rejections.append(Rejection(view.number, "no pose of the robot: x_m to qw are empty"))
     return Reported(poses, tuple(rejections), tuple(_disagreement(session, robot)))
+
+
+def usable_joints(
+    session: Session, robot: Robot | None, base_from_flange: Mapping[int, FloatArray]
+) -> Mapping[int, FloatArray] | None:
+    """Joint angles (n,) by view [rad], where they belong to the robot's model and to its poses.
+
+    Args:
+        session: The session.
+        robot: Its nominal robot, where it names a known one.
+        base_from_flange: (4, 4) by view.
+
+    Returns:
+        The angles of all views with a pose; None where one lacks them, or where they lead
+        elsewhere than the reported poses: then the model is another robot's.
+    """
+    if robot is None:
+        return None
+    joints = {it.number: it.joints_rad for it in session.views if it.number in base_from_flange}
+    known = {view: it for view, it in joints.items() if it is not None}
+    if len(known) < len(joints) or any(len(it) != robot.joint_count for it in known.values()):
+        return None
+    for view, angles in known.items():
+        away = invert(_forward(robot, angles)) @ base_from_flange[view]
+        if np.linalg.norm(away[:3, 3]) > _SAME_ARM_M or rotation_angle(away) > _SAME_ARM_RAD:
+            return None
+    return known
 
 
 def _forward(robot: Robot, joints: FloatArray) -> FloatArray:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.camera import intrinsics, project, with_intrinsics
+from visioncal.camera import project
+from visioncal.estimator.appearance import Free
 from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.stages.handeye import HandEyeResult, refit
@@ -38,8 +39,8 @@ def validate(
     stops: IntArray,
     result: HandEyeResult,
     solver: SolverName,
-    corners: Sequence[tuple[Corners, FloatArray] | None],
-    camera: Camera | None,
+    corners: Sequence[Corners | None],
+    free: Free | None,
 ) -> HeldOut:
     """Leaves stops out, one by one or in ten groups, and predicts their views from the others.
 
@@ -48,8 +49,8 @@ def validate(
         stops: (m,) which stop of the robot each was taken at; they are left out together.
         result: The fit to all of them.
         solver: The solver to fit again with.
-        corners: Each view's corners with their (n, 3) positions on the target [m], if any.
-        camera: The intrinsics, if any.
+        corners: Each view's corners, if any.
+        free: Lens and board, if there are corners.
 
     Returns:
         The residuals.
@@ -65,10 +66,10 @@ def validate(
             rest = data.subset(~held).merged(_renumbered(stops[~held]))
             edges = refit(rest, result, solver)
             left = data.subset(held)
-            placed = left.through(edges.lens).placed(edges.x)
+            placed = left.under(edges.shared).placed(edges.x)
             away_m[held], away_rad[held] = distances(placed, edges.z)
             seen = [corners[int(at)] for at in np.flatnonzero(held)]
-            rms_px[held] = chain_rms_px(left, edges, seen, camera)
+            rms_px[held] = chain_rms_px(left, edges, seen, free)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(data) else "stops of the robot"
     return HeldOut(f"{method} over {unit}, of the hand-eye fit", away_m, away_rad, rms_px)
@@ -79,32 +80,24 @@ def _renumbered(stops: IntArray) -> IntArray:
 
 
 def chain_rms_px(
-    data: Closure,
-    edges: Edges,
-    corners: Sequence[tuple[Corners, FloatArray] | None],
-    camera: Camera | None,
+    data: Closure, edges: Edges, corners: Sequence[Corners | None], free: Free | None
 ) -> FloatArray:
     """Reprojection error of each view through the whole chain, (m,) [px]; NaN where unseen.
 
-    The camera is the one that the views' poses were made with; the edges carry its change.
+    Lens and board are those that the views' poses were made with; the edges carry their change.
     """
     rms = np.full(len(data), np.nan)
-    if camera is None:
+    if free is None:
         return rms
-    changed = changed_lens(camera, edges.lens)
-    poses = data.predicted_camera(edges.x, edges.z)
+    camera, positions = free.after(edges.shared).camera, free.corners_after(edges.shared)
+    poses = data.under(edges.shared).predicted_camera(edges.x, edges.z)
     for at, (pose, seen) in enumerate(zip(poses, corners, strict=True)):
         if seen is not None:
-            away = predict_corners(changed, pose, seen[1]) - seen[0].px
+            away = predict_corners(camera, pose, positions[seen.ids]) - seen.px
             # A corner behind the camera counts as a whole image away.
             away = np.nan_to_num(away, nan=float(max(camera.resolution)))
             rms[at] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
     return rms
-
-
-def changed_lens(camera: Camera, change: FloatArray) -> Camera:
-    """The camera with its (k,) intrinsics changed; k = 0 where they are held."""
-    return with_intrinsics(camera, intrinsics(camera) + change) if len(change) else camera
 
 
 def predict_corners(

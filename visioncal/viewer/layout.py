@@ -21,6 +21,7 @@ class _Contents:
 
     images: bool
     joints: int
+    unused: bool
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
@@ -37,13 +38,18 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         The layout, to be written into the recording.
     """
     joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
-    contents = _Contents(any(view.image for view in session.views), min(joints, default=0))
+    results = () if calibration is None else calibration.views
+    contents = _Contents(
+        any(view.image for view in session.views),
+        min(joints, default=0),
+        not all(view.used for view in results),
+    )
     tabs = rrb.Tabs(
         _overview(contents, _eye(session, calibration)),
         _residuals(contents),
         _coverage(contents),
         rrb.Horizontal(
-            rrb.TextDocumentView(name="Residuals and noise", origin=paths.FIGURES),
+            rrb.TextDocumentView(name="Residuals, noise and uncertainty", origin=paths.FIGURES),
             rrb.TextDocumentView(name="Solvers", origin=paths.SOLVERS),
             name="Figures",
             column_shares=[2, 3],
@@ -177,13 +183,14 @@ def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
     ]
     if contents.images:
         wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
+    # A legend would hide the marks at the top and at the bottom, of just these views.
+    legend = "; red: not used, \N{BLACK UP-POINTING TRIANGLE} off scale" if contents.unused else ""
     return [
         rrb.TimeSeriesView(
-            name=name,
+            name=f"{name}{legend}",
             origin=entity,
             contents=["$origin/**"],
-            # At the left below are the marks of views that were not used.
-            plot_legend=rrb.Corner2D.RightTop,
+            plot_legend=rrb.PlotLegend(visible=False),
         )
         for name, entity in wanted
     ]

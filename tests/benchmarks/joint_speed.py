@@ -1,0 +1,147 @@
+"""Time of the joint fit of 60 images x 80 corners, against pyceres with a Python cost.
+
+The same problem for both: both edges and one error of the flange a view, lens and noise known, from
+the same start. pyceres is no part of the development environment: `pip install pyceres`.
+
+    PYTHONPATH=tests python tests/benchmarks/joint_speed.py
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pyceres
+from results import write_section
+
+from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
+from visioncal.estimator.corners import CornerStack, reproject
+from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.poses import fit_poses
+from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
+from visioncal.targets import corner_positions
+from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
+from visioncal.types import FloatArray
+
+PIXEL_PX, NOISE = 0.1, Noise(5e-5, 3e-5)
+REPEATS = 15
+
+
+def cell_of(seed: int) -> Cell:
+    target = replace(charuco_target(), columns=11, rows=9, square_m=0.025, marker_m=0.018)
+    return simulate(
+        CellOptions(
+            views=60,
+            camera=fine_camera(),
+            pixel_sigma_px=PIXEL_PX,
+            target=replace(target, name="charuco_11x9_25mm", square_sigma_m=2.5e-5),
+            cut_views=0.0,
+            seed=seed,
+        )
+    )
+
+
+class ViewCost(pyceres.CostFunction):
+    """One view's corners: 2 n residuals by x, z and the flange's error, all as right steps."""
+
+    def __init__(self, stack: CornerStack, cell: Cell, robot: FloatArray, start: Edges) -> None:
+        pyceres.CostFunction.__init__(self)
+        self.stack, self.camera, self.robot, self.start = stack, cell.options.camera, robot, start
+        self.set_num_residuals(2 * len(stack.px))
+        self.set_parameter_block_sizes([6, 6, 6])
+
+    def Evaluate(self, parameters, residuals, jacobians) -> bool:  # noqa: N802 - its interface
+        """Fills in residuals and derivatives, as Ceres asks for them."""
+        steps = np.array(parameters)
+        by_x, by_z, by_flange = exp(steps)
+        from_x = self.start.x @ by_x
+        pose = invert(self.robot @ by_flange @ from_x) @ self.start.z @ by_z
+        at = reproject(self.stack, self.camera, pose[None], lens=False)
+        residuals[:] = at.residuals.ravel() / PIXEL_PX
+        if jacobians is not None:
+            slope = at.by_pose.reshape(-1, 6) / PIXEL_PX
+            target_from_cam = adjoint(invert(pose))
+            moves = (
+                -slope @ target_from_cam,
+                slope,
+                -slope @ target_from_cam @ adjoint(invert(from_x)),
+            )
+            for jacobian, move, step in zip(jacobians, moves, steps, strict=True):
+                if jacobian is not None:
+                    jacobian[:] = (move @ np.linalg.inv(inverse_right_jacobian(step))).ravel()
+        return True
+
+
+def by_pyceres(cell: Cell, stacks: list[CornerStack], start: Edges) -> Edges:
+    problem = pyceres.Problem()
+    x, z = np.zeros(6), np.zeros(6)
+    flanges = [np.zeros(6) for _ in stacks]
+    spread = np.diag(np.repeat(NOISE.sigmas**2, 3))
+    for stack, robot, flange in zip(stacks, cell.base_from_flange, flanges, strict=True):
+        problem.add_residual_block(ViewCost(stack, cell, robot, start), None, [x, z, flange])
+        prior = pyceres.factors.NormalPrior(np.zeros(6), spread)
+        problem.add_residual_block(prior, None, [flange])
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
+    options.minimizer_progress_to_stdout = False
+    options.num_threads = 1
+    pyceres.solve(options, problem, pyceres.SolverSummary())
+    return Edges(start.x @ exp(x), start.z @ exp(z), start.shared)
+
+
+def by_visioncal(cell: Cell, stack: CornerStack, start: Edges) -> Edges:
+    with one_blas_thread():
+        predicted = invert(cell.base_from_flange @ start.x) @ start.z
+        fit = fit_poses(stack, cell.options.camera, predicted)
+        spread = PIXEL_PX**2 * covariance(fit.information)
+        data = Closure("eye-in-hand", cell.base_from_flange, fit.cam_from_target, spread)
+        return solve_closure(data, start, NOISE)[0]
+
+
+def seconds(solve: Callable[[], Edges]) -> float:
+    begun = time.perf_counter()
+    solve()
+    return time.perf_counter() - begun
+
+
+def main() -> None:
+    """Prints the table and keeps it."""
+    rows = []
+    for seed in range(3):
+        cell = cell_of(seed)
+        positions = corner_positions(cell.options.target)
+        stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
+        stacks = [CornerStack.of({it.view: it}, positions) for it in cell.corners]
+        rng = np.random.default_rng(seed)
+        x, z = (it @ exp(2e-3 * rng.standard_normal(6)) for it in cell.transforms.values())
+        start = Edges(x, z, np.zeros(0))
+        ours, theirs = by_visioncal(cell, stack, start), by_pyceres(cell, stacks, start)
+        apart = np.linalg.norm(log(invert(theirs.x) @ ours.x)[3:])
+        times = np.array(
+            [
+                (
+                    seconds(lambda: by_visioncal(cell, stack, start)),  # noqa: B023 - called at once
+                    seconds(lambda: by_pyceres(cell, stacks, start)),  # noqa: B023
+                )
+                for _ in range(REPEATS)
+            ]
+        )
+        mine, peer = 1e3 * np.median(times, axis=0)
+        rows.append(
+            f"| {len(stack.px)} | {mine:.1f} | {peer:.0f} | {peer / mine:.0f} | {1e6 * apart:.2f} |"
+        )
+    text = "\n".join(
+        (
+            f"Median of {REPEATS} interleaved solves, one thread each; three cells.\n",
+            "| corners | visioncal [ms] | pyceres [ms] | times faster | answers apart [um] |",
+            "| --- | --- | --- | --- | --- |",
+            *rows,
+        )
+    )
+    print(text)
+    command = "PYTHONPATH=tests python tests/benchmarks/joint_speed.py"
+    write_section("Speed of the joint fit", command, text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Wrong views are found, named and left out; right ones are kept."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cells import calibrated, error_of
+
+from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, solve_closure
+from visioncal.estimator.consensus import surprises
+from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
+from visioncal.stages.agree import agree
+
+WORLDS = {
+    "fine, given": CellOptions(camera=fine_camera(), pixel_sigma_px=0.1),
+    "wide, estimated": CellOptions(
+        camera=wide_camera(), pixel_sigma_px=0.1, state_intrinsics=False, mount="eye-to-hand"
+    ),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("wrong", [0, 2, 6])
+def test_just_the_wrong_views_are_left_out(world, wrong):
+    for seed in range(4):
+        cell = simulate(replace(WORLDS[world], wrong_views=wrong, seed=seed))
+        known = calibrated(cell)
+        assert set(range(20)) - set(known.used) == set(cell.wrong_views)
+        for view in cell.wrong_views:
+            assert "times the noise" in known.reasons[view]
+        error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
+        # Chi-square of 12 stays under 39 in all but one case of ten thousand.
+        assert error @ np.linalg.solve(spread, error) < 39.0
+
+
+def test_two_exchanged_rows_are_found():
+    cell = simulate(replace(WORLDS["fine, given"], seed=2))
+    poses = cell.base_from_flange.copy()
+    poses[[4, 11]] = poses[[11, 4]]
+    known = calibrated(replace(cell, base_from_flange=poses), joints=False)
+    assert set(range(20)) - set(known.used) == {4, 11}
+
+
+def test_where_nothing_agrees_nothing_is_left_out():
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
+    data = replace(known.closure(known.used), shared=None)
+    mixed = replace(data, robot=np.roll(data.robot, 1, axis=0))
+    assert agree(mixed, range(20), np.arange(20)).mask.all()
+
+
+def test_a_stop_is_right_or_wrong_as_a_whole():
+    cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
+    known = calibrated(cell)
+    (wrong,) = cell.wrong_views
+    data = replace(known.closure(known.candidates), shared=None)
+    twice = np.repeat(np.arange(20), 2)
+    doubled = Closure(
+        data.mount, data.robot[twice], data.camera[twice], data.camera_covariance[twice]
+    )
+    found = agree(doubled, list(range(40)), twice)
+    assert [it.view for it in found.rejections] == [2 * wrong, 2 * wrong + 1]
+
+
+def test_a_surprise_is_the_distance_from_what_the_others_predict():
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
+    data = replace(known.closure(known.used), shared=None)
+    start = Edges(known.solved.edges.x, known.solved.edges.z, np.zeros(0))
+    fit = fit_closure(data, start)
+    everything = np.ones(12, dtype=bool)
+    inside = surprises(data, everything, fit)
+    for view in (0, 7):
+        others = everything.copy()
+        others[view] = False
+        # The same noise, so that the deletion identity holds to the fit's own curvature.
+        without = ClosureFit(solve_closure(data.subset(others), fit.edges, fit.noise)[0], fit.noise)
+        assert surprises(data, others, without)[view] == pytest.approx(inside[view], rel=1e-3)

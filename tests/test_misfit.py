@@ -1,0 +1,126 @@
+"""Whether residuals are noise, how sure the noise's levels are, and the error budget."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cells import calibrated, error_of
+
+from visioncal.estimator.budget import covariance_by_source, point_covariance
+from visioncal.estimator.closure import closure_information
+from visioncal.estimator.intervals import noise_intervals
+from visioncal.estimator.linalg import covariance
+from visioncal.estimator.misfit import drift, neighbours
+from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.stages.diagnose import _radius95
+from visioncal.transforms import exp
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def with_moving_base(cell, twist):
+    """The cell with its base creeping by a twist from the first view to the last."""
+    share = np.linspace(-0.5, 0.5, len(cell.base_from_flange))[:, None]
+    return replace(cell, base_from_flange=exp(share * twist) @ cell.base_from_flange)
+
+
+def answered(cell):
+    known = calibrated(cell, joints=False)
+    data = known.closure(known.used).merged(known.stops)
+    return data, known.solved, known
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_creeping_base_is_noticed_and_its_way_told(mount):
+    for seed in range(4):
+        cell = simulate(replace(FINE, mount=mount, seed=seed))
+        data, result, _ = answered(cell)
+        assert drift(data, result.edges, result.noise) is None
+        moved = with_moving_base(cell, np.array([0, 0, 0, 0.0, 3e-4, 0]))
+        data, result, known = answered(moved)
+        found = drift(data, result.edges, result.noise)
+        # A turn of the base by its sigma of some 0.1 mrad moves the place of work by 0.1 mm.
+        assert found.moved_m == pytest.approx(3e-4, abs=2.5e-4)
+        assert any("drift with time" in it for it in known.warnings)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_independent_noise_gives_neighbours_no_more_than_their_share(mount):
+    factors = []
+    for seed in range(12):
+        data, result, _ = answered(simulate(replace(FINE, mount=mount, seed=seed)))
+        found = neighbours(data, result.edges, result.noise)
+        assert not found.is_significant
+        factors.append(found.factor)
+    # One on average; a single one scatters by 0.16.
+    assert np.mean(factors) == pytest.approx(1.0, abs=0.2)
+
+
+def test_stops_that_err_in_groups_are_noticed():
+    rng = np.random.default_rng(0)
+    cell = simulate(replace(FINE, views=30, seed=1))
+    group = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 3, axis=0)
+    together = replace(cell, base_from_flange=cell.base_from_flange @ exp(group))
+    data, result, known = answered(together)
+    found = neighbours(data, result.edges, result.noise)
+    assert found.is_significant
+    assert known.diagnosis.inflation == found.factor > 1.5
+    assert any("Neighbouring stops err alike" in it for it in known.warnings)
+
+
+def test_intervals_of_the_noise_hold_the_truth():
+    inside, count = np.zeros(2), 30
+    truth = np.array([5e-5, 3e-5])
+    for seed in range(count):
+        data, result, _ = answered(simulate(replace(FINE, seed=seed, views=12)))
+        low, high = noise_intervals(data, result.edges, result.noise).T
+        assert np.all(low <= result.noise.sigmas)
+        assert np.all(result.noise.sigmas <= high)
+        inside += (low <= truth) & (truth <= high)
+    # 95 % of 30 are 28.5; under 24 comes in one run of four hundred.
+    assert np.all(inside >= 24)
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_the_budget_adds_up(given):
+    data, result, known = answered(simulate(replace(FINE, state_intrinsics=given, seed=2)))
+    rows = np.arange(len(result.edges.shared))
+    parts = covariance_by_source(data, result.edges, result.noise, {"shared": rows})
+    whole = covariance(closure_information(data, result.edges, result.noise))[:12, :12]
+    # An identity; what is left is rounding of an inverse with a condition of 1e10.
+    np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
+    budget = dict(known.diagnosis.budget_mm)
+    total = budget.pop("total")
+    assert np.sqrt(np.sum(np.square(list(budget.values())))) == pytest.approx(total, rel=0.05)
+    assert ("intrinsics" in budget) == (not given)
+
+
+def test_a_point_is_as_uncertain_as_its_scatter():
+    rng = np.random.default_rng(3)
+    edge, point = exp(rng.normal(size=6)), np.array([0.1, -0.2, 0.6])
+    root = rng.normal(size=(6, 6)) * 1e-4
+    steps = rng.standard_normal((20000, 6)) @ root.T
+    seen = (edge @ exp(steps))[:, :3, :3] @ point + (edge @ exp(steps))[:, :3, 3]
+    # 20000 draws tell a variance to 1 %.
+    expected = point_covariance(edge, root @ root.T, point)
+    np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.04 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("variances", [(1, 1, 1), (1, 0.1, 0.01), (1, 0, 0)])
+def test_95_percent_lie_within_the_radius(variances):
+    draws = np.random.default_rng(0).standard_normal((200000, 3)) ** 2 @ np.array(variances, float)
+    radius = _radius95(np.diag(np.array(variances, float)))
+    # Imhof's fit is good to 1 %; 200000 draws to 0.1 %.
+    assert np.mean(draws < radius**2) == pytest.approx(0.95, abs=0.004)
+
+
+def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
+    surprises = []
+    for seed in range(12):
+        cell = simulate(replace(FINE, seed=seed, robot_sigma_m=3e-4, robot_sigma_rad=5e-4))
+        _, result, _ = answered(cell)
+        error = error_of(cell, calibrated(cell))
+        surprises.append(error @ np.linalg.solve(result.covariance[:12, :12], error) / 12)
+    # Mean of 12 chi-square of 12: 0.12; the board's scale, held at the truth, takes one of them.
+    assert np.mean(surprises) == pytest.approx(0.95, abs=0.35)

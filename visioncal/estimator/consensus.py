@@ -1,0 +1,245 @@
+"""Which views belong together: swapped rows, slipped boards and wrong images, told from noise.
+
+A wrong view is wrong as a whole: the unit of rejection is the 6-vector by which a view places the
+target away from where the others place it. The start is a consensus of small sets of views
+(Fischler and Bolles 1981) under the least median (Rousseeuw 1984); what follows works on squared
+Mahalanobis distances with the noise estimated from the views that agree.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from visioncal.estimator.closure import (
+    Closure,
+    ClosureFit,
+    Edges,
+    Noise,
+    fit_closure,
+    knowledge_of,
+    residual_blocks,
+)
+from visioncal.estimator.linalg import covariance
+from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.solvers import SOLVERS
+from visioncal.transforms import invert, rotation_angle
+from visioncal.types import FloatArray, IntArray, Mask
+
+# A sound view is lost in one session of a thousand.
+_FALSE_ALARM = 1e-3
+# With 40 % of the views wrong, all 60 sets of three contain a wrong one with probability 3e-7.
+_SETS, _SET_SIZE = 60, 3
+_REFINED, _ROUNDS = 5, 10
+# The noise of measured poses differs by so much from view to view: with tilt and distance.
+_UNEVEN = 3.0
+# Lever by which an angle counts as a distance when sets are compared [m].
+_LEVER_M = 0.5
+# Where fewer than this share of the views agree, nothing tells which of them are right.
+_LEAST_SHARE = 0.5
+# Views that agree, at the least: with fewer, wrong ones cannot be told from noise.
+_LEAST_VIEWS = 5
+# Distances are compared with the limit once more, without the view's own say in the noise, when
+# they come this near.
+_SUSPECT_SHARE = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """The views that agree, and their fit.
+
+    Attributes:
+        fit: Edges and noise from the views that agree.
+        agrees: (m,) mask of them.
+        surprise: (m,) squared Mahalanobis distance of each view from what the others predict; six
+            on average where it is noise.
+        limit: What it may be.
+    """
+
+    fit: ClosureFit
+    agrees: Mask
+    surprise: FloatArray
+    limit: float
+
+
+def agreeing_views(data: Closure, start: Mask | None = None) -> Agreement:
+    """Finds the views that agree with each other, and fits both edges to them.
+
+    Args:
+        data: The views.
+        start: (m,) those that are thought to agree; None for a search without any idea.
+
+    Returns:
+        The views that agree. Where fewer than half do, or those only to within more than any
+        result may be off, nothing tells which are right: all stay.
+    """
+    everything = np.ones(len(data), dtype=bool)
+    if len(data) > _LEAST_VIEWS:
+        agrees, fit = _widened(data, *_core(data)) if start is None else _fitted(data, start)
+        agrees, fit = _settled(data, agrees, fit)
+        if agrees.sum() >= max(_LEAST_SHARE * len(data), _LEAST_VIEWS) and _is_noise(fit.noise):
+            return _kept(data, agrees, fit)
+    return _kept(data, *_fitted(data, everything))
+
+
+def _is_noise(noise: Noise) -> bool:
+    return noise.sigma_m < SIGMA_LIMIT_M and noise.sigma_rad < SIGMA_LIMIT_RAD
+
+
+def _fitted(data: Closure, mask: Mask) -> tuple[Mask, ClosureFit]:
+    return mask, fit_closure(data.subset(mask), _closed_form(data, np.flatnonzero(mask)))
+
+
+def _kept(data: Closure, agrees: Mask, fit: ClosureFit) -> Agreement:
+    return Agreement(fit, agrees, surprises(data, agrees, fit), _limit(data, agrees))
+
+
+def surprises(data: Closure, agrees: Mask, fit: ClosureFit) -> FloatArray:
+    """Squared Mahalanobis distance (m,) of each view from what the other views predict.
+
+    For a view inside the fit this is the deletion residual's, by the identity of Cook and Weisberg
+    (1982, section 2.2): its covariance is that of the noise less what the fit has taken.
+
+    Args:
+        data: The views.
+        agrees: (m,) those that the fit was made from.
+        fit: The edges and the noise.
+    """
+    residuals, jacobian, spread = residual_blocks(data, fit.edges, fit.noise)
+    inside = residual_information(jacobian[agrees], spread[agrees])
+    taken = jacobian @ covariance(inside + knowledge_of(data, fit.edges).information)
+    taken = taken @ np.swapaxes(jacobian, 1, 2)
+    left = spread + np.where(agrees, -1.0, 1.0)[:, None, None] * taken
+    return _squared(residuals, left, spread)
+
+
+def residual_information(jacobian: FloatArray, spread: FloatArray) -> FloatArray:
+    """Information (p, p) that (m, d) residuals of (m, d, d) covariance have on p unknowns."""
+    return np.asarray(np.einsum("mij,mik->jk", jacobian, np.linalg.solve(spread, jacobian)))
+
+
+def _squared(residuals: FloatArray, left: FloatArray, spread: FloatArray) -> FloatArray:
+    """Squared lengths of residuals in units of a covariance, where that has not vanished.
+
+    A view that alone determines a direction has no residual there, and no variance either.
+    """
+    root = np.linalg.cholesky(spread)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ left @ np.swapaxes(inverse, 1, 2))
+    white = (np.swapaxes(vectors, 1, 2) @ inverse @ residuals[:, :, None])[:, :, 0]
+    counts = values > 1e-6
+    return np.asarray(
+        np.sum(np.where(counts, white**2 / np.where(counts, values, 1.0), 0.0), axis=1)
+    )
+
+
+def _limit(data: Closure, agrees: Mask) -> float:
+    """Largest surprise that noise may give, corrected for the number of views.
+
+    The noise's two levels are estimated from half of the residuals each, which gives the surprise
+    the tails of an F distribution. Poses that were measured by others are better in some views than
+    in others, and nobody says how much.
+    """
+    freedom = max(3.0 * agrees.sum() - 6.0, 6.0)
+    limit = 6.0 * float(f_distribution.ppf(1.0 - _FALSE_ALARM / len(data), 6, freedom))
+    return limit if data.camera_covariance is not None else _UNEVEN**2 * limit
+
+
+def _core(data: Closure) -> tuple[Mask, Edges]:
+    """The half of the views that agree best, and their edges."""
+    half = (len(data) + 1) // 2 + 1
+    found = [(float(np.sort(away)[:half].sum()), edges, away) for edges, away in _candidates(data)]
+    found.sort(key=lambda item: item[0])
+    refined = [_concentrated(data, edges, away, half) for _, edges, away in found[:_REFINED]]
+    _, chosen, edges = min(refined, key=lambda item: item[0])
+    return chosen, edges
+
+
+def _candidates(data: Closure) -> Iterator[tuple[Edges, FloatArray]]:
+    """Edges from all views and from small sets, each with all views' distances."""
+    rng = np.random.default_rng(0)
+    sets = [np.arange(len(data))]
+    sets += [rng.choice(len(data), _SET_SIZE, replace=False) for _ in range(_SETS)]
+    for rows in sets:
+        edges = _closed_form(data, rows)
+        yield edges, _distances(data, edges)
+
+
+def _concentrated(
+    data: Closure, edges: Edges, away: FloatArray, half: int
+) -> tuple[float, Mask, Edges]:
+    """Solves from the nearest half, again and again (Rousseeuw and Van Driessen 1999)."""
+    chosen = np.sort(np.argsort(away)[:half])
+    for _ in range(_ROUNDS):
+        edges = _closed_form(data, chosen)
+        away = _distances(data, edges)
+        before, chosen = chosen, np.sort(np.argsort(away)[:half])
+        if np.array_equal(before, chosen):
+            break
+    mask = np.zeros(len(data), dtype=bool)
+    mask[chosen] = True
+    return float(away[chosen].sum()), mask, edges
+
+
+def _closed_form(data: Closure, rows: IntArray) -> Edges:
+    solution = SOLVERS["park"](data.robot[rows], data.camera[rows])
+    return Edges(solution.x, solution.z, data.unchanged)
+
+
+def _distances(data: Closure, edges: Edges) -> FloatArray:
+    """Distance (m,) [m] between where each view places the target, and where the edges do."""
+    placed = data.placed(edges.x)
+    away = np.linalg.norm(placed[:, :3, 3] - edges.z[:3, 3], axis=1)
+    return np.asarray(away + _LEVER_M * rotation_angle(invert(edges.z) @ placed))
+
+
+def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]:
+    """Grows the core to all views within reach of its noise, which is scaled by the median.
+
+    The noise of the half that agrees best is less than that of all.
+    """
+    agrees, fit = core, fit_closure(data.subset(core), edges)
+    allowed, typical = chi2.ppf(0.999, 6), chi2.median(6)
+    for _ in range(_ROUNDS):
+        surprise = surprises(data, agrees, fit)
+        scale = max(float(np.median(surprise)) / typical, 1.0)
+        before, agrees = agrees, surprise < allowed * scale
+        if np.array_equal(before, agrees) or agrees.sum() < _LEAST_VIEWS:
+            break
+        fit = fit_closure(data.subset(agrees), fit.edges)
+    return agrees, fit
+
+
+def _settled(data: Closure, agrees: Mask, fit: ClosureFit) -> tuple[Mask, ClosureFit]:
+    """Takes views in and out one at a time, with the noise estimated anew, until none moves."""
+    for _ in range(len(data)):
+        if agrees.sum() < _LEAST_VIEWS:
+            break
+        surprise, limit = surprises(data, agrees, fit), _limit(data, agrees)
+        outside = np.flatnonzero(~agrees & (surprise < limit))
+        if len(outside):
+            agrees = agrees.copy()
+            agrees[outside[surprise[outside].argmin()]] = True
+            fit = fit_closure(data.subset(agrees), fit.edges)
+            continue
+        without = _without_the_worst(data, agrees, surprise, limit, fit)
+        if without is None:
+            break
+        agrees, fit = without
+    return agrees, fit
+
+
+def _without_the_worst(
+    data: Closure, agrees: Mask, surprise: FloatArray, limit: float, fit: ClosureFit
+) -> tuple[Mask, ClosureFit] | None:
+    """Leaves the worst view out where noise that it has no say in does not explain it."""
+    worst = int(np.where(agrees, surprise, -1.0).argmax())
+    if surprise[worst] < _SUSPECT_SHARE * limit or agrees.sum() <= _LEAST_VIEWS:
+        return None
+    fewer = agrees.copy()
+    fewer[worst] = False
+    again = fit_closure(data.subset(fewer), fit.edges)
+    beyond = surprises(data, fewer, again)[worst] > limit
+    return (fewer, again) if beyond else None

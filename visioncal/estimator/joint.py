@@ -1,0 +1,318 @@
+"""The joint fit of corners, lens, board and both edges: its unknowns, and its linearisation.
+
+Each view's corners are compressed to its pose and to how that moves with lens and board; the chain
+of frames is closed over all stops with what is left open of these. Linearising anew at the answer,
+until it stays, is Gauss-Newton's method on the whole problem.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from visioncal.estimator.appearance import (
+    SCALE,
+    Appearance,
+    Compressed,
+    Free,
+    board_basis,
+    board_prior,
+    compress,
+)
+from visioncal.estimator.arm import ArmErrors
+from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
+from visioncal.estimator.corners import CornerStack
+from visioncal.estimator.linalg import covariance
+from visioncal.targets import corner_positions
+from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
+
+# Freeing unknowns must gain more than noise does in one session of ten thousand.
+_FALSE_ALARM = 1e-4
+# Values that move by less than this share of their sigma have settled.
+_SETTLED, _ROUNDS = 0.02, 8
+# Given intrinsics that are set free are known to so much without the session: the focal length and
+# the centre as shares of the focal length, and the distortion's coefficients.
+_FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is looked at, and with what.
+
+    Attributes:
+        mount: Where the camera is.
+        target: What was printed, as stated.
+        camera: The intrinsics.
+        estimated: Whether they were estimated from these corners.
+        mode: What to do with given ones: `hold`, `refine` or `auto`.
+        matrix_sigma_px: What given fx, fy, cx, cy are known to; None where that is not said.
+    """
+
+    mount: Mount
+    target: Target
+    camera: Camera
+    estimated: bool
+    mode: str = "auto"
+    matrix_sigma_px: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """The robot's side of the chain.
+
+    Attributes:
+        robot: (m, 4, 4) the robot's part of the chain, one a view.
+        stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
+        basis: (m, 6, p) how its errors move each view's flange.
+        of_links: Whether these are errors of its own links.
+        errors: Their size, where they are free.
+    """
+
+    robot: FloatArray
+    stops: IntArray
+    basis: FloatArray
+    of_links: bool
+    errors: ArmErrors | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The corners of m views with what is known of the scene beforehand."""
+
+    scene: Scene
+    stack: CornerStack
+    positions: FloatArray
+    basis: FloatArray
+    prior_sigma: FloatArray
+
+    @classmethod
+    def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "Problem":
+        """Puts the problem together from the corners by view."""
+        positions = corner_positions(scene.target)
+        return cls(
+            scene,
+            CornerStack.of(corners, positions),
+            positions,
+            board_basis(positions),
+            np.concatenate([_lens_prior(scene), board_prior(scene.target, positions)]),
+        )
+
+    def without_prior(self, columns: IntArray) -> "Problem":
+        """The same problem, some values of which nobody has stated."""
+        sigma = self.prior_sigma.copy()
+        sigma[columns] = np.inf
+        return replace(self, prior_sigma=sigma)
+
+    @property
+    def stated(self) -> Appearance:
+        """Lens and board as they are given or were estimated before."""
+        return Appearance(self.scene.camera, np.zeros(self.basis.shape[2]))
+
+    @property
+    def lens(self) -> IntArray:
+        """Places of the intrinsics among the values; they come first."""
+        return np.arange(len(self.prior_sigma) - self.basis.shape[2])
+
+    @property
+    def scale(self) -> IntArray:
+        """Place of the board's scale."""
+        return np.array([len(self.lens) + SCALE])
+
+    @property
+    def shape(self) -> IntArray:
+        """The board's aspect and bend."""
+        return np.arange(len(self.lens) + SCALE + 1, len(self.prior_sigma))
+
+    @property
+    def first(self) -> IntArray:
+        """What is free from the start."""
+        if self.scene.estimated:
+            return self.lens
+        if self.scene.mode == "refine":
+            return np.union1d(self.lens, self.shape)
+        return self.lens[:0]
+
+    @property
+    def counted(self) -> IntArray:
+        """What is open and counts in the covariance, whether it is free or not."""
+        if self.scene.estimated:
+            return np.union1d(self.lens, self.scale)
+        stated = self.scene.matrix_sigma_px is not None
+        return np.union1d(self.lens[:4] if stated else self.lens[:0], self.scale)
+
+
+def _lens_prior(scene: Scene) -> FloatArray:
+    camera = scene.camera
+    if scene.estimated:
+        return np.full(4 + len(camera.distortion), np.inf)
+    matrix = np.full(4, _FOCAL_SHARE * float(camera.matrix[:2].max()))
+    if scene.matrix_sigma_px is not None:
+        matrix = np.full(4, scene.matrix_sigma_px)
+    return np.concatenate([matrix, np.full(len(camera.distortion), _DISTORTION_SIGMA)])
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit begins: lens and board, (m, 4, 4) poses of the target, and both edges."""
+
+    appearance: Appearance
+    poses: FloatArray
+    edges: Edges
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The corners' word on poses and appearance, where it was linearised."""
+
+    compressed: Compressed
+    free: Free
+    sigma_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The fit at rest: the linearisation, the chain's data, and what came out."""
+
+    seen: Seen
+    data: Closure
+    fit: ClosureFit
+
+    def again(self) -> Start:
+        """The answer as the start of the next fit."""
+        after = self.seen.free.after(self.fit.edges.shared)
+        return Start(after, self.seen.compressed.cam_from_target, self.fit.edges)
+
+    @property
+    def moving(self) -> IntArray:
+        """Places of the values that the fit moves."""
+        return self.seen.free.columns[~self.seen.free.anchored]
+
+
+def settle(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+    """Linearises and fits in turn, until the values stay where they are."""
+    state = _fitted(problem, arm, moving, start)
+    for _ in range(_ROUNDS):
+        spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])
+        looks = len(state.seen.free.columns)
+        sigma = np.sqrt(np.diag(spread)[12 : 12 + looks])
+        if np.all(np.abs(state.fit.edges.shared[:looks]) <= _SETTLED * sigma):
+            break
+        state = _fitted(problem, arm, moving, state.again())
+    return state
+
+
+def _fitted(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+    seen = seen_at(problem, moving, start.appearance, start.poses)
+    data = _chain(problem, arm, seen, seen.free)
+    at_rest = Edges(start.edges.x, start.edges.z, data.unchanged)
+    return State(seen, data, fit_closure(data, at_rest))
+
+
+def seen_at(problem: Problem, moving: IntArray, appearance: Appearance, poses: FloatArray) -> Seen:
+    """Linearises the corners.
+
+    Args:
+        problem: The corners.
+        moving: Places of the values that a fit will move.
+        appearance: Lens and board to linearise at.
+        poses: (m, 4, 4) `cam_from_target` to start from.
+    """
+    compressed = compress(problem.stack, problem.basis, appearance, poses)
+    freedom = compressed.residuals.size - 6 * len(poses) - len(moving)
+    sigma_px = float(np.sqrt(np.sum(compressed.residuals**2) / max(freedom, 1)))
+    free = _known_beforehand(problem, moving, appearance, compressed, sigma_px)
+    return Seen(compressed, free, sigma_px)
+
+
+def _known_beforehand(
+    problem: Problem,
+    moving: IntArray,
+    appearance: Appearance,
+    compressed: Compressed,
+    sigma_px: float,
+) -> Free:
+    """What the corners and the priors say of the free values."""
+    columns = np.union1d(moving, problem.counted)
+    weight = 1.0 / max(sigma_px, 1e-6) ** 2
+    prior = 1.0 / problem.prior_sigma[columns] ** 2
+    away = (appearance.values - problem.stated.values)[columns]
+    information = weight * compressed.shared_information[np.ix_(columns, columns)] + np.diag(prior)
+    pull = weight * compressed.shared_pull[columns] + prior * away
+    return Free(
+        appearance,
+        problem.basis,
+        problem.positions,
+        columns,
+        ~np.isin(columns, moving),
+        information,
+        pull,
+    )
+
+
+def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
+    data = Closure(
+        problem.scene.mount,
+        arm.robot,
+        seen.compressed.cam_from_target,
+        max(seen.sigma_px, 1e-6) ** 2 * covariance(seen.compressed.information),
+        free.shared(seen.compressed.by_shared[:, :, free.columns]),
+    )
+    if arm.errors is not None:
+        data = data.with_more(arm.errors.shared())
+    return data.merged(arm.stops)
+
+
+@dataclass(frozen=True)
+class MeasuredScale:
+    """What the chain alone says of the board's scale, as if no size had been stated."""
+
+    scale: float
+    sigma: float
+
+    @property
+    def is_another(self) -> bool:
+        """Whether it differs from the stated one by more than chance."""
+        return (self.scale / self.sigma) ** 2 > chance_limit(1)
+
+
+def measured_scale(problem: Problem, arm: Arm, state: State) -> MeasuredScale:
+    """Measures the board's size by the robot's motion."""
+    data, at_change = _with_free(
+        problem, arm, state, np.union1d(state.moving, problem.scale), ignored=problem.scale
+    )
+    information, gradient = normal_equations(data, at_change, state.fit.noise)
+    spread = covariance(information)
+    at = 12 + int(np.searchsorted(state.seen.free.columns, problem.scale[0]))
+    now = state.seen.free.after(state.fit.edges.shared).board[SCALE]
+    return MeasuredScale(now - float(spread[at] @ gradient), float(np.sqrt(spread[at, at])))
+
+
+def chance_limit(freedom: int) -> float:
+    """What a squared error may fall by chance when so many more values are free (chi-square)."""
+    return float(chi2.ppf(1.0 - _FALSE_ALARM, freedom))
+
+
+def gain(problem: Problem, arm: Arm, state: State, moving: IntArray) -> float:
+    """How much the whitened squared error falls when more values are free (Rao's score test)."""
+    data, at = _with_free(problem, arm, state, moving)
+    information, gradient = normal_equations(data, at, state.fit.noise)
+    return float(gradient @ covariance(information) @ gradient)
+
+
+def _with_free(
+    problem: Problem,
+    arm: Arm,
+    state: State,
+    moving: IntArray,
+    ignored: IntArray | None = None,
+) -> tuple[Closure, Edges]:
+    """The chain at the same state with other values free, and without the prior of some."""
+    seen = state.seen
+    stated = problem if ignored is None else problem.without_prior(ignored)
+    free = _known_beforehand(stated, moving, seen.free.appearance, seen.compressed, seen.sigma_px)
+    looks, rest = np.split(state.fit.edges.shared, [len(seen.free.columns)])
+    change = np.zeros(len(free.columns))
+    change[np.searchsorted(free.columns, seen.free.columns)] = looks
+    edges = Edges(state.fit.edges.x, state.fit.edges.z, np.concatenate([change, rest]))
+    return _chain(problem, arm, seen, free), edges

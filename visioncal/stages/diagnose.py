@@ -1,0 +1,156 @@
+"""Stage 8: whether the residuals are noise, and where the uncertainty comes from."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from visioncal.estimator.appearance import Free
+from visioncal.estimator.arm import LEVER_M, ArmErrors, misfit_covariance
+from visioncal.estimator.budget import covariance_by_source, point_covariance
+from visioncal.estimator.closure import Closure
+from visioncal.estimator.intervals import noise_intervals
+from visioncal.estimator.linalg import one_blas_thread
+from visioncal.estimator.misfit import Drift, Neighbours, drift, neighbours
+from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.stages.handeye import HandEyeResult
+from visioncal.types import FloatArray, IntArray
+
+# Fewer stops than this leave no residuals to be tested.
+_FEWEST_STOPS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What the residuals show beyond noise.
+
+    Attributes:
+        point_cam: (3,) the place of work in the camera's frame: the target's middle, as the views
+            see it on average [m].
+        budget_mm: Standard deviation of such a point's place, by source and as a `total` [mm].
+        intervals: (2, 2) 95 % intervals of the noise's levels, rotation [rad] first.
+        spectrum: (12,) standard deviations along the principal directions of both edges, ascending,
+            in units of the largest that are accepted (5 mm, 0.5 deg).
+        radius95_mm: The place of work is right to within this in 95 % of cases [mm].
+        inflation: By how much the covariance was multiplied because neighbouring stops err alike.
+        arm: Errors that follow the arm's posture.
+        warnings: What is no noise, and what it probably is.
+    """
+
+    point_cam: FloatArray
+    budget_mm: Mapping[str, float]
+    radius95_mm: float
+    intervals: FloatArray
+    spectrum: FloatArray
+    inflation: float
+    arm: ArmErrors | None
+    warnings: tuple[str, ...]
+
+
+def diagnose(
+    data: Closure,
+    result: HandEyeResult,
+    free: Free | None,
+    arm: ArmErrors | None,
+    middle: FloatArray,
+) -> Diagnosis:
+    """Looks for what noise does not explain, and splits the uncertainty by its sources.
+
+    Args:
+        data: The views, one a stop, in the order of the session.
+        result: The answer.
+        free: Lens and board, where there are corners.
+        arm: Errors that follow the arm's posture, at the same views.
+        middle: (3,) of the target, in its frame [m].
+    """
+    edges, noise = result.edges, result.noise
+    with one_blas_thread():
+        enough = len(data) >= _FEWEST_STOPS
+        alike = neighbours(data, edges, noise) if enough else Neighbours(1.0, False)
+        moved = drift(data, edges, noise) if enough else None
+        parts = covariance_by_source(data, edges, noise, _owners(free, arm))
+        if arm is not None and not arm.of_links:
+            parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
+        intervals = noise_intervals(data, edges, noise)
+    inflation = alike.factor if alike.is_significant else 1.0
+    if inflation > 1.0:
+        parts["misfit"] = (inflation - 1.0) * sum(parts.values(), np.zeros((12, 12)))
+    camera = data.under(edges.shared).camera
+    point = (camera[:, :3, :3] @ middle + camera[:, :3, 3]).mean(axis=0)
+    at_work = {name: point_covariance(edges.x, it[:6, :6], point) for name, it in parts.items()}
+    at_work["total"] = sum(at_work.values(), np.zeros((3, 3)))
+    return Diagnosis(
+        point,
+        {name: 1e3 * _length(it) for name, it in at_work.items()},
+        1e3 * _radius95(at_work["total"]),
+        intervals,
+        _spectrum(inflation * result.covariance[:12, :12]),
+        inflation,
+        arm,
+        tuple(_warnings(alike, moved, arm)),
+    )
+
+
+def _owners(free: Free | None, arm: ArmErrors | None) -> dict[str, IntArray]:
+    """Which of the unknowns that all views share are whose."""
+    owners: dict[str, IntArray] = {}
+    looks = 0 if free is None else len(free.columns)
+    if free is not None:
+        is_lens = free.columns < free.lens_count
+        for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
+            if mask.any():
+                owners[name] = np.flatnonzero(mask)
+    if arm is not None and arm.of_links:
+        owners["arm"] = looks + np.arange(arm.basis.shape[2])
+    return owners
+
+
+def _length(spread: FloatArray) -> float:
+    # Lens and board share information, which may leave one of them less than nothing by itself.
+    return float(np.sqrt(max(np.trace(spread), 0.0)))
+
+
+def _radius95(spread: FloatArray) -> float:
+    """Radius of the ball that holds a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
+    values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
+    first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
+    if not third > 0.0:
+        return 0.0
+    freedom = second**3 / third**2
+    quantile = (chi2.ppf(0.95, freedom) - freedom) * np.sqrt(second / freedom) + first
+    return float(np.sqrt(max(quantile, 0.0)))
+
+
+def _spectrum(spread: FloatArray) -> FloatArray:
+    limit = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
+    values = np.linalg.eigvalsh(spread / np.outer(limit, limit))
+    return np.asarray(np.sqrt(np.maximum(values, 0.0)))
+
+
+def _warnings(alike: Neighbours, moved: Drift | None, arm: ArmErrors | None) -> Iterator[str]:
+    if arm is not None:
+        size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
+        told = (
+            "they were estimated along"
+            if arm.of_links
+            else "without joint angles and a known [robot] model they cannot be estimated along"
+        )
+        yield (
+            f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
+            f"under 15): its links are off from the model by typically {size}; {told}. What of "
+            "them looks the same in all views is in no residual, and counts in the covariance: a "
+            "kinematic calibration of the arm would take it out."
+        )
+    if moved is not None:
+        yield (
+            f"Residuals drift with time: from the first stop to the last, base or target moved by "
+            f"{1e3 * moved.moved_m:.2g} mm and {np.rad2deg(moved.moved_rad):.2g} deg. Fasten them, "
+            "let the arm warm up, and record again."
+        )
+    if alike.is_significant:
+        yield (
+            f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
+            f"{np.sqrt(alike.factor):.2g} times farther than independent noise would. The sigmas "
+            "were multiplied by as much."
+        )

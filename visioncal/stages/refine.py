@@ -1,0 +1,248 @@
+"""Stage 6: what all views share besides the edges: the lens, and the board as it really is."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.estimator.appearance import (
+    BOARD_NAMES,
+    Appearance,
+    Compressed,
+    Free,
+    board_basis,
+    compress,
+)
+from visioncal.estimator.arm import ArmErrors, find_arm_errors
+from visioncal.estimator.closure import Closure, Edges, left_out_residuals
+from visioncal.estimator.corners import CornerStack
+from visioncal.estimator.joint import (
+    Arm,
+    Problem,
+    Scene,
+    Seen,
+    Start,
+    State,
+    chance_limit,
+    gain,
+    measured_scale,
+    seen_at,
+    settle,
+)
+from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.observability import worst_directions
+from visioncal.stages.found import findings
+from visioncal.stages.pnp import ViewPoses
+from visioncal.targets import corner_positions
+from visioncal.types import Corners, IntArray
+
+# Corners must be left over to judge by: so many residuals for each unknown.
+_SPARE = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """The views under the lens and the board that fit all of them.
+
+    Attributes:
+        free: The appearance, and what is open about it.
+        views: The views with their one pose each, made anew.
+        sigma_px: Standard deviation of a corner's coordinate [px].
+        arm: Errors that follow the arm's posture, at the same views; None where there are none.
+        warnings: What was found, in sentences.
+    """
+
+    free: Free
+    views: tuple[ViewPoses, ...]
+    sigma_px: float
+    arm: ArmErrors | None
+    warnings: tuple[str, ...]
+
+
+def look(scene: Scene, views: Sequence[ViewPoses], *, closed_form: bool = False) -> Refined:
+    """Lens and board as they are given or were estimated, with what is open about them.
+
+    Args:
+        scene: What is looked at, and with what.
+        views: The views, each with its one pose and its corners.
+        closed_form: Whether nothing will move, because the edges will come from a closed form.
+
+    Returns:
+        The views with how they move when lens and board do.
+    """
+    with one_blas_thread():
+        problem = Problem.of(scene, _corners(views))
+        moving = problem.lens[:0] if closed_form else problem.first
+        poses = np.array([view.cam_from_target[0] for view in views])
+        seen = seen_at(problem, moving, problem.stated, poses)
+    return _told(seen, views, None, ())
+
+
+def refine(scene: Scene, views: Sequence[ViewPoses], arm: Arm, edges: Edges) -> Refined:
+    """Fits lens, board and edges to all corners together.
+
+    Estimated intrinsics move with the edges. The board's bend, given intrinsics together with it,
+    and the board's scale are set free where corners and chain speak for it with more than noise can
+    say, and views that are left out do not speak against it. A scale that is held still counts, by
+    its prior, in the covariance.
+
+    Args:
+        scene: What is looked at, and with what.
+        views: The views in the fit, each with its one pose and its corners.
+        arm: The robot's side.
+        edges: Where to start.
+    """
+    with one_blas_thread():
+        problem = Problem.of(scene, _corners(views))
+        poses = np.array([view.cam_from_target[0] for view in views])
+        state = settle(problem, arm, problem.first, Start(problem.stated, poses, edges))
+        errors = arm_errors(arm, state.data, state.fit.edges)
+        if errors is not None and arm.of_links:
+            arm = replace(arm, errors=errors)
+            state = settle(problem, arm, problem.first, state.again())
+        state = _chosen(problem, arm, state)
+        said = tuple(findings(problem, arm, state))
+    return _told(state.seen, views, errors, said)
+
+
+def arm_errors(arm: Arm, data: Closure, edges: Edges) -> ArmErrors | None:
+    """Finds errors that follow the arm's posture.
+
+    Args:
+        arm: The robot's side of m views.
+        data: The same views, one a stop.
+        edges: The answer under white noise.
+
+    Returns:
+        The errors at all m views; None where white noise explains the residuals as well.
+    """
+    first = np.unique(arm.stops, return_index=True)[1]
+    found = find_arm_errors(data, edges, arm.basis[first], of_links=arm.of_links)
+    return None if found is None else replace(found, basis=arm.basis)
+
+
+def _told(
+    seen: Seen,
+    views: Sequence[ViewPoses],
+    errors: ArmErrors | None,
+    said: tuple[str, ...],
+) -> Refined:
+    return Refined(
+        seen.free,
+        tuple(
+            _remade(view, seen.compressed, seen.free.columns, seen.sigma_px, at)
+            for at, view in enumerate(views)
+        ),
+        seen.sigma_px,
+        errors,
+        said,
+    )
+
+
+def _chosen(problem: Problem, arm: Arm, state: State) -> State:
+    """Sets free what the data speak for."""
+    for options in (_shapes, _scales):
+        for moving in options(problem, arm, state):
+            stated, wider = problem, settle(problem, arm, moving, state.again())
+            if _is_contradicted(problem, wider):
+                # A confident wrong prior is worse than none.
+                stated = problem.without_prior(problem.lens)
+                wider = settle(stated, arm, moving, wider.again())
+            if _is_determined(wider) and not _predicts_worse(wider, state):
+                problem, state = stated, wider
+                break
+    return state
+
+
+def _is_determined(state: State) -> bool:
+    """Whether the views still determine both edges to what is accepted."""
+    worst = worst_directions(state.data, state.fit.edges, state.fit.noise)
+    return all(it.sigma < it.limit for it in worst)
+
+
+def _is_contradicted(problem: Problem, state: State) -> bool:
+    """Whether given intrinsics are farther off than anybody's are."""
+    moved = state.again().appearance.values - problem.stated.values
+    return bool(np.any(np.abs(moved)[problem.lens] > 3.0 * problem.prior_sigma[problem.lens]))
+
+
+def held(scene: Scene) -> Free:
+    """Lens and board as they are stated, with nothing free."""
+    positions = corner_positions(scene.target)
+    nothing = np.zeros(0)
+    return Free(
+        Appearance(scene.camera, np.zeros(len(BOARD_NAMES))),
+        board_basis(positions),
+        positions,
+        nothing.astype(np.int64),
+        nothing.astype(bool),
+        np.zeros((0, 0)),
+        nothing,
+    )
+
+
+def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[ViewPoses, ...]:
+    """Makes the poses of views anew that had no part in the fit.
+
+    Args:
+        views: The views, each with its one pose and its corners.
+        free: Lens and board.
+        sigma_px: Noise of a corner's coordinate [px].
+    """
+    if not views:
+        return ()
+    stack = CornerStack.of(_corners(views), free.positions)
+    starts = np.array([view.cam_from_target[0] for view in views])
+    with one_blas_thread():
+        compressed = compress(stack, free.basis, free.appearance, starts)
+    return tuple(
+        _remade(view, compressed, free.columns, sigma_px, at) for at, view in enumerate(views)
+    )
+
+
+def _shapes(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
+    """The bend, with given intrinsics or without, where it explains significantly more."""
+    now = state.moving
+    rest = state.seen.compressed.residuals.size - 6 * len(problem.stack.views) - len(now)
+    if rest < _SPARE * len(problem.prior_sigma):
+        return
+    bent = np.union1d(now, problem.shape)
+    everything = np.union1d(bent, problem.lens)
+    gain_bent, gain_all = gain(problem, arm, state, bent), gain(problem, arm, state, everything)
+    may_refine = problem.scene.mode != "hold" and len(everything) > len(bent)
+    if may_refine and gain_all - gain_bent > chance_limit(len(everything) - len(bent)):
+        yield everything
+    if len(bent) > len(now) and gain_bent > chance_limit(len(bent) - len(now)):
+        yield bent
+
+
+def _scales(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
+    """The board's scale, where the robot measures another than is stated."""
+    if measured_scale(problem, arm, state).is_another:
+        yield np.union1d(state.moving, problem.scale)
+
+
+def _predicts_worse(wider: State, state: State) -> bool:
+    """Whether views that are left out are predicted worse, in position and in rotation."""
+    errors = [
+        left_out_residuals(it.data, it.fit.edges, it.fit.noise).reshape(-1, 2, 3)
+        for it in (wider, state)
+    ]
+    more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
+    return bool(np.all(more > less))
+
+
+def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
+    return {it.view: it.corners for it in views if it.corners is not None}
+
+
+def _remade(
+    view: ViewPoses, compressed: Compressed, columns: IntArray, sigma_px: float, at: int
+) -> ViewPoses:
+    spread = max(sigma_px, 1e-6) ** 2 * covariance(compressed.information[at])
+    return replace(
+        view,
+        cam_from_target=compressed.cam_from_target[at][None],
+        covariance=spread[None],
+        by_shared=compressed.by_shared[at][None, :, columns],
+    )
