@@ -12,6 +12,7 @@ from visioncal.estimator.corners import CornerStack
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.targets import corner_positions
 from visioncal.transforms import invert, log
+from visioncal.types import Target
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 
@@ -114,3 +115,14 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     )
     held = calibrated(told, session=session)
     assert held.free.after(held.solved.edges.shared).camera.matrix == pytest.approx(wrong.matrix)
+
+
+def test_too_few_corners_leave_the_lens_alone():
+    marker = Target("tag", "marker", 1, 1, 0.12, 1e-4, dictionary="DICT_4X4_50", marker_id=0)
+    cell = simulate(replace(FINE, seed=2, views=15, target=marker))
+    document = known_of(cell).session.document
+    camera = document["camera"] | {"intrinsics": "refine"}
+    session = replace(known_of(cell).session, document=document | {"camera": camera})
+    known = calibrated(cell, session=session)
+    assert not known.free.lens_is_free
+    assert any('"refine" was not done: 60 corners in 15 views' in it for it in known.warnings)

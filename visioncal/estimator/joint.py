@@ -29,6 +29,8 @@ from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
 _FALSE_ALARM = 1e-4
+# Corners must be left over to judge by: so many residuals for each unknown.
+_SPARE = 10
 # Values that move by less than this share of their sigma have settled.
 _SETTLED, _ROUNDS = 0.02, 8
 # Given intrinsics that are set free are known to so much without the session: the focal length and
@@ -125,11 +127,17 @@ class Problem:
         return np.arange(len(self.lens) + SCALE + 1, len(self.prior_sigma))
 
     @property
+    def has_spare_corners(self) -> bool:
+        """Whether the views show more corners than it takes to free lens and board."""
+        residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
+        return residuals >= _SPARE * len(self.prior_sigma)
+
+    @property
     def first(self) -> IntArray:
         """What is free from the start."""
         if self.scene.estimated:
             return self.lens
-        if self.scene.mode == "refine":
+        if self.scene.mode == "refine" and self.has_spare_corners:
             return np.union1d(self.lens, self.shape)
         return self.lens[:0]
 

@@ -42,6 +42,12 @@ def _bend_finding(problem: Problem, state: State) -> Iterator[str]:
 
 
 def _lens_finding(problem: Problem, state: State) -> Iterator[str]:
+    if problem.scene.mode == "refine" and not problem.has_spare_corners:
+        yield (
+            f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
+            f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
+            "more corners, or more views."
+        )
     if problem.scene.estimated or not np.isin(problem.lens, state.moving).all():
         return
     stated = problem.scene.camera

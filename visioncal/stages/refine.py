@@ -36,9 +36,6 @@ from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import corner_positions
 from visioncal.types import Corners, IntArray
 
-# Corners must be left over to judge by: so many residuals for each unknown.
-_SPARE = 10
-
 
 @dataclass(frozen=True, eq=False)
 class Refined:
@@ -203,8 +200,7 @@ def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[Vie
 def _shapes(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
     """The bend, with given intrinsics or without, where it explains significantly more."""
     now = state.moving
-    rest = state.seen.compressed.residuals.size - 6 * len(problem.stack.views) - len(now)
-    if rest < _SPARE * len(problem.prior_sigma):
+    if not problem.has_spare_corners:
         return
     bent = np.union1d(now, problem.shape)
     everything = np.union1d(bent, problem.lens)
