@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 
+import visioncal
 from visioncal.estimator.arm import LEVER_M, link_basis, pose_basis
 from visioncal.robot import load_robot
-from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.transforms import compose, exp, invert, log
 
 WRONG = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
@@ -59,6 +60,15 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
         surprises.append(error @ np.linalg.solve(spread, error) / 12)
     # Without it, this is about a hundred.
     assert np.mean(surprises) < 2.0
+
+
+@pytest.mark.parametrize("dh", [0.0, 1e-3])
+def test_measured_poses_alone_tell_a_wrong_arm_too(dh, tmp_path):
+    for seed in range(3):
+        options = replace(WRONG, seed=seed, dh_sigma_m=0.5 * dh, dh_sigma_rad=dh)
+        folder = write_session(simulate(options), tmp_path / f"{seed}", images=False)
+        result = visioncal.calibrate(folder)
+        assert ("arm_errors" in result.stages) == (dh > 0.0)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

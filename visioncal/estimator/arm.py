@@ -35,6 +35,8 @@ LEVER_M = 0.5
 _SIGNIFICANT = 15.1
 # Typical errors of links that are tried first [rad], and how finely the best is sought.
 _TRIED, _FINEST = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3), 1.05
+# Fewer stops have hardly more residuals than the edges and the noise take.
+_FEWEST_STOPS = 6
 # Positions and directions change over about so much when an arm's posture does [m].
 _REACH_M = 0.6
 
@@ -124,6 +126,8 @@ def find_arm_errors(
     Returns:
         The errors; None where white noise explains the residuals as well.
     """
+    if len(data) < _FEWEST_STOPS:
+        return None
     white = noise_likelihood(data, edges)[1]
 
     def gain(sigma: float) -> float:

@@ -25,7 +25,7 @@ from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
-from visioncal.stages.refine import held, look, refine
+from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses, usable_joints
 from visioncal.stages.validate import validate
 from visioncal.targets import corner_positions
@@ -164,10 +164,11 @@ def _agree(known: Known) -> Known:
 def _refine(known: Known) -> Known:
     """Refines with the views that agree, and looks again which do, until they stay the same."""
     scene, free, agreed = known.scene, known.free, known.agreed
-    if scene is None or free is None or not len(free.columns) or agreed is None:
+    if agreed is None or known.solver != "joint":
         return known
-    if known.solver != "joint":
-        return known
+    if scene is None or free is None or not len(free.columns):
+        data = known.closure(known.used).merged(known.stops)
+        return replace(known, arm=arm_errors(_arm(known), data, agreed.edges))
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
         result = refine(scene, views, _arm(known), agreed.edges)

@@ -14,7 +14,7 @@ from visioncal.estimator.appearance import (
     compress,
 )
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
-from visioncal.estimator.closure import Closure, Edges, left_out_residuals
+from visioncal.estimator.closure import Closure, Edges, fit_closure, left_out_residuals
 from visioncal.estimator.corners import CornerStack
 from visioncal.estimator.joint import (
     Arm,
@@ -108,11 +108,12 @@ def arm_errors(arm: Arm, data: Closure, edges: Edges) -> ArmErrors | None:
     Args:
         arm: The robot's side of m views.
         data: The same views, one a stop.
-        edges: The answer under white noise.
+        edges: The answer under white noise, or a start.
 
     Returns:
         The errors at all m views; None where white noise explains the residuals as well.
     """
+    edges = fit_closure(data, Edges(edges.x, edges.z, data.unchanged)).edges
     first = np.unique(arm.stops, return_index=True)[1]
     found = find_arm_errors(data, edges, arm.basis[first], of_links=arm.of_links)
     return None if found is None else replace(found, basis=arm.basis)
