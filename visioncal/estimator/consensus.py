@@ -18,14 +18,14 @@ from visioncal.estimator.closure import (
     ClosureFit,
     Edges,
     Noise,
+    distances,
     fit_closure,
-    knowledge_of,
+    normal_equations,
     residual_blocks,
 )
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.solvers import SOLVERS
-from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask
 
 # A sound view is lost in one session of a thousand.
@@ -108,16 +108,10 @@ def surprises(data: Closure, agrees: Mask, fit: ClosureFit) -> FloatArray:
         fit: The edges and the noise.
     """
     residuals, jacobian, spread = residual_blocks(data, fit.edges, fit.noise)
-    inside = residual_information(jacobian[agrees], spread[agrees])
-    taken = jacobian @ covariance(inside + knowledge_of(data, fit.edges).information)
-    taken = taken @ np.swapaxes(jacobian, 1, 2)
+    information, _ = normal_equations(data.subset(agrees), fit.edges, fit.noise)
+    taken = jacobian @ covariance(information) @ np.swapaxes(jacobian, 1, 2)
     left = spread + np.where(agrees, -1.0, 1.0)[:, None, None] * taken
     return _squared(residuals, left, spread)
-
-
-def residual_information(jacobian: FloatArray, spread: FloatArray) -> FloatArray:
-    """Information (p, p) that (m, d) residuals of (m, d, d) covariance have on p unknowns."""
-    return np.asarray(np.einsum("mij,mik->jk", jacobian, np.linalg.solve(spread, jacobian)))
 
 
 def _squared(residuals: FloatArray, left: FloatArray, spread: FloatArray) -> FloatArray:
@@ -190,9 +184,8 @@ def _closed_form(data: Closure, rows: IntArray) -> Edges:
 
 def _distances(data: Closure, edges: Edges) -> FloatArray:
     """Distance (m,) [m] between where each view places the target, and where the edges do."""
-    placed = data.placed(edges.x)
-    away = np.linalg.norm(placed[:, :3, 3] - edges.z[:3, 3], axis=1)
-    return np.asarray(away + _LEVER_M * rotation_angle(invert(edges.z) @ placed))
+    away_m, away_rad = distances(data.placed(edges.x), edges.z)
+    return np.asarray(away_m + _LEVER_M * away_rad)
 
 
 def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]:
