@@ -133,9 +133,11 @@ def reproject(
     )
     # A turn by w moves point p by w x p: a row b of derivatives becomes p x b.
     px, py, pz = (it[:, None] for it in (px, py, pz))
-    by_pose = np.stack(
-        [py * bz - pz * by, pz * bx - px * bz, px * by - py * bx, bx, by, bz], axis=2
-    )
+    by_pose = np.empty((*bx.shape, 6))
+    for at, column in enumerate(
+        (py * bz - pz * by, pz * bx - px * bz, px * by - py * bx, bx, by, bz)
+    ):
+        by_pose[:, :, at] = column
     residuals = projection.px - stack.px
     behind = ~np.isfinite(residuals).all(axis=1)
     if behind.any():

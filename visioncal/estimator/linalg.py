@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from visioncal.types import FloatArray
 
@@ -13,8 +14,14 @@ from visioncal.types import FloatArray
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Keeps small dense solves on one thread: on a busy machine threads make them far slower."""
-    with threadpool_limits(1):
+    with _thread_pools().limit(limits=1):
         yield
+
+
+@cache
+def _thread_pools() -> ThreadpoolController:
+    # Looking for the loaded libraries takes as long as a whole fit.
+    return ThreadpoolController()
 
 
 @dataclass(frozen=True, eq=False)

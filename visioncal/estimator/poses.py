@@ -10,8 +10,8 @@ from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray
 
 _ITERATIONS = 30
-# A step [rad or m] so small that the next, by quadratic convergence, is rounding.
-_SETTLED = 1e-7
+# A step [rad or m] so small that the next, some hundred times smaller, is nothing beside any noise.
+_SETTLED = 1e-6
 _START_DAMPING = 1e-6
 # At rest, costs differ by rounding: that is no reason to stay.
 _ROUNDING = 1e-12
@@ -47,10 +47,13 @@ def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -
     damping = np.full(len(poses), _START_DAMPING)
     now = reproject(stack, camera, poses, lens=False)
     cost = stack.sum_by_view(np.sum(now.residuals**2, axis=1))
+    information, gradient = _normal_equations(stack, now)
     for _ in range(_ITERATIONS):
-        information, gradient = _normal_equations(stack, now)
         step = damped_step(information, gradient, damping[:, None])
         candidate = poses @ exp(step)
+        if np.all(np.abs(step) < _SETTLED):
+            poses = candidate
+            break
         then = reproject(stack, camera, candidate, lens=False)
         cost_then = stack.sum_by_view(np.sum(then.residuals**2, axis=1))
         better = cost_then <= cost * (1.0 + _ROUNDING)
@@ -58,9 +61,7 @@ def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -
         cost = np.where(better, cost_then, cost)
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e6)
         now = then if better.all() else reproject(stack, camera, poses, lens=False)
-        if np.all(np.abs(step).max(axis=1) < _SETTLED):
-            break
-    information, _ = _normal_equations(stack, now)
+        information, gradient = _normal_equations(stack, now)
     return PoseFit(poses, information, now.residuals)
 
 
