@@ -35,6 +35,7 @@ LAYERS = (
     ("stages",),
     ("guess",),
     ("pipeline",),
+    ("frames",),
     ("report", "viewer"),
     ("outputs",),
     ("stored", "formats", "exports"),

@@ -1,0 +1,31 @@
+"""The result of a calibration, its frames, and how they stand on disk."""
+
+from visioncal.calibration.document import to_document
+from visioncal.calibration.edge import Edge
+from visioncal.calibration.frame import Frame, FrameFile, Observation
+from visioncal.calibration.parts import (
+    CameraResult,
+    Rms,
+    SolverResult,
+    Validation,
+    Verdict,
+    VerdictStatus,
+    ViewResult,
+)
+from visioncal.calibration.result import Calibration
+
+__all__ = [
+    "Calibration",
+    "CameraResult",
+    "Edge",
+    "Frame",
+    "FrameFile",
+    "Observation",
+    "Rms",
+    "SolverResult",
+    "Validation",
+    "Verdict",
+    "VerdictStatus",
+    "ViewResult",
+    "to_document",
+]

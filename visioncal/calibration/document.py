@@ -1,0 +1,177 @@
+"""calibration.json."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from visioncal.calibration.edge import (
+    edge_document,
+    pose_document,
+    read_array,
+    read_edge,
+    read_pose,
+)
+from visioncal.calibration.frame import frames_document, present, read_frames
+from visioncal.calibration.parts import (
+    CameraResult,
+    Rms,
+    SolverResult,
+    Validation,
+    Verdict,
+    VerdictStatus,
+    ViewResult,
+)
+from visioncal.robot import Robot
+from visioncal.types import Camera, FloatArray, Mount
+from visioncal.version import __version__
+
+if TYPE_CHECKING:
+    from visioncal.calibration.result import Calibration
+
+SCHEMA = 1
+
+
+def to_document(calibration: "Calibration") -> dict[str, Any]:
+    """Builds the content of calibration.json; what was not computed is absent."""
+    camera, robot = calibration.camera, calibration.robot
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "visioncal": __version__,
+        "created": calibration.created,
+        "session": {"name": calibration.session_name, "sha256": calibration.session_sha256},
+        "mount": calibration.mount,
+        "transforms": {name: edge_document(edge) for name, edge in calibration.edges.items()},
+        "joint_covariance": {
+            "order": list(calibration.edges),
+            "matrix": calibration.joint_covariance.tolist(),
+        },
+        "solvers": {name: _solver_document(it) for name, it in calibration.solvers.items()},
+    }
+    if camera is not None:
+        document["camera"] = _camera_document(camera)
+    if robot is not None:
+        document["robot"] = dict(robot.document)
+    document |= {
+        "noise": dict(calibration.noise),
+        "views": [present(vars(view)) for view in calibration.views],
+        "rms": present(vars(calibration.rms)),
+        "validation": _validation_document(calibration.validation),
+        "verdict": {
+            "status": calibration.verdict.status,
+            "reasons": list(calibration.verdict.reasons),
+        },
+    }
+    if calibration.frames:
+        document["frames"] = frames_document(calibration.frames)
+    return document | dict(calibration.stages)
+
+
+def _solver_document(result: SolverResult) -> dict[str, Any]:
+    poses = {name: pose_document(pose) for name, pose in result.matrices.items()}
+    return poses | {"rms_mm": result.rms_mm, "rms_deg": result.rms_deg}
+
+
+def _camera_document(result: CameraResult) -> dict[str, Any]:
+    camera = result.camera
+    return present(
+        {
+            "model": camera.model,
+            "resolution": list(camera.resolution),
+            "matrix": camera.matrix.tolist(),
+            "distortion": camera.distortion.tolist(),
+            "estimated": result.estimated,
+            "covariance": None if result.covariance is None else result.covariance.tolist(),
+            "edge_covariance": (
+                None if result.edge_covariance is None else result.edge_covariance.tolist()
+            ),
+        }
+    )
+
+
+def _validation_document(validation: Validation) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "method": validation.method,
+        "held_out": present(vars(validation.held_out)),
+    }
+    if validation.holdout is not None:
+        document["holdout"] = present(vars(validation.holdout))
+    return document
+
+
+_OWN_KEYS = frozenset(
+    {"schema", "visioncal", "created", "session", "mount", "transforms", "joint_covariance"}
+    | {"solvers", "camera", "robot", "noise", "views", "rms", "validation", "verdict", "frames"}
+)
+
+
+def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Reads the fields of a calibration from what `to_document` built.
+
+    Raises:
+        LookupError, TypeError, ValueError, AttributeError: It is no calibration of this schema.
+    """
+    if document["schema"] != SCHEMA:
+        raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
+    if document["mount"] not in get_args(Mount):
+        raise ValueError(f"mount is {document['mount']!r}")
+    if document["verdict"]["status"] not in get_args(VerdictStatus):
+        raise ValueError(f"verdict.status is {document['verdict']['status']!r}")
+    camera = document.get("camera")
+    robot = document.get("robot")
+    verdict = document["verdict"]
+    return {
+        "session_name": document["session"]["name"],
+        "session_sha256": document["session"]["sha256"],
+        "created": document["created"],
+        "mount": document["mount"],
+        "edges": {name: read_edge(edge) for name, edge in document["transforms"].items()},
+        "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
+        "solvers": {name: _solver(it) for name, it in document["solvers"].items()},
+        "noise": dict(document["noise"]),
+        "views": tuple(ViewResult(**view) for view in document["views"]),
+        "rms": Rms(**document["rms"]),
+        "validation": _validation(document["validation"]),
+        "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
+        "camera": None if camera is None else _camera(camera),
+        "robot": None if robot is None else Robot.from_document(robot),
+        "frames": read_frames(document.get("frames", {})),
+        "stages": {name: value for name, value in document.items() if name not in _OWN_KEYS},
+    }
+
+
+def _solver(document: Mapping[str, Any]) -> SolverResult:
+    poses = {name: read_pose(it) for name, it in document.items() if isinstance(it, Mapping)}
+    return SolverResult(poses, document["rms_mm"], document["rms_deg"])
+
+
+def _camera(document: Mapping[str, Any]) -> CameraResult:
+    width, height = document["resolution"]
+    return CameraResult(
+        Camera(
+            document["model"],
+            (int(width), int(height)),
+            read_array(document, "matrix", (4,)),
+            read_array(document, "distortion", (-1,)),
+        ),
+        document["estimated"],
+        read_array(document, "covariance", (-1, -1)) if "covariance" in document else None,
+        _edge_covariance(document),
+    )
+
+
+def _validation(document: Mapping[str, Any]) -> Validation:
+    holdout = document.get("holdout")
+    return Validation(
+        document["method"],
+        Rms(**document["held_out"]),
+        None if holdout is None else Rms(**holdout),
+    )
+
+
+def _edge_covariance(document: Mapping[str, Any]) -> FloatArray | None:
+    if "edge_covariance" not in document:
+        return None
+    rows = np.asarray(document["edge_covariance"], dtype=float)
+    unknowns = 4 + len(document["distortion"])
+    return read_array(document, "edge_covariance", (unknowns, rows.shape[-1]))

@@ -1,0 +1,86 @@
+"""A transform with its covariance, and how both stand on disk."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.types import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """An edge of the tree of frames that was estimated.
+
+    Attributes:
+        matrix: (4, 4) the edge, named `a_from_b` by its owner, exactly as it stands on disk.
+        covariance: (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
+    """
+
+    matrix: FloatArray
+    covariance: FloatArray
+
+    @property
+    def transform(self) -> RigidTransform:
+        """The edge as a transform; scipy makes it orthonormal anew, to the last digit."""
+        return RigidTransform.from_matrix(self.matrix)
+
+    @property
+    def sigma_mm(self) -> float:
+        """Root of the trace of the translation's covariance [mm]."""
+        return float(1e3 * np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def sigma_deg(self) -> float:
+        """Root of the trace of the rotation's covariance [deg]."""
+        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+
+def pose_document(matrix: FloatArray) -> dict[str, Any]:
+    """Writes a (4, 4) transform in the forms that readers ask for."""
+    transform = RigidTransform.from_matrix(matrix)
+    return {
+        "matrix": matrix.tolist(),
+        "quaternion_xyzw": transform.rotation.as_quat().tolist(),
+        "translation_m": matrix[:3, 3].tolist(),
+    }
+
+
+def edge_document(edge: Edge) -> dict[str, Any]:
+    """Writes a transform with its covariance."""
+    return pose_document(edge.matrix) | {
+        "covariance": edge.covariance.tolist(),
+        "sigma_mm": edge.sigma_mm,
+        "sigma_deg": edge.sigma_deg,
+    }
+
+
+def read_edge(document: Mapping[str, Any]) -> Edge:
+    """Reads what `edge_document` wrote.
+
+    Raises:
+        LookupError, TypeError, ValueError: The document is another.
+    """
+    return Edge(read_pose(document), read_array(document, "covariance", (6, 6)))
+
+
+def read_pose(document: Mapping[str, Any]) -> FloatArray:
+    """Reads the (4, 4) matrix of a pose; its errors are those of `read_edge`."""
+    matrix = read_array(document, "matrix", (4, 4))
+    rotation = matrix[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+        raise ValueError("a matrix is not a rigid transform")
+    return matrix
+
+
+def read_array(document: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray:
+    """Reads an array of finite numbers; a dimension of -1 is any, but the same throughout."""
+    array = np.asarray(document[key], dtype=float)
+    size = array.shape[0] if array.ndim else 0
+    if array.shape != tuple(size if it < 0 else it for it in shape):
+        raise ValueError(f"{key} has the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{key} has entries that are no finite numbers")
+    return array

@@ -1,0 +1,104 @@
+"""What a calibration is made of, beside its transforms."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.types import Camera, FloatArray
+
+VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
+
+
+@dataclass(frozen=True, eq=False)
+class SolverResult:
+    """What one solver made of the used views.
+
+    Attributes:
+        matrices: (4, 4) both edges by name.
+        rms_mm: Scatter of the target's position over the used views [mm].
+        rms_deg: Scatter of the target's orientation over the used views [deg].
+    """
+
+    matrices: Mapping[str, FloatArray]
+    rms_mm: float
+    rms_deg: float
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """Both edges by name."""
+        return {name: RigidTransform.from_matrix(it) for name, it in self.matrices.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class CameraResult:
+    """The camera that the result was obtained with.
+
+    Attributes:
+        camera: The intrinsics.
+        estimated: Whether they were estimated from this session's images.
+        covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
+        edge_covariance: (k, 6 e) of these with the calibration's edges in the order of its
+            `joint_covariance`, where both were estimated together.
+    """
+
+    camera: Camera
+    estimated: bool
+    covariance: FloatArray | None = None
+    edge_covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """What became of one view. A figure that could not be computed is None, and absent on disk.
+
+    Attributes:
+        view: The view's number.
+        used: Whether the fit used it.
+        reason: Why it was not used, in words; empty for a used view.
+        corners: How many corners were found.
+        rms_px: Reprojection error through the whole chain of frames [px].
+        residual_mm: Distance of the target, as this view places it, from its mean place [mm].
+        residual_deg: The same in rotation [deg].
+    """
+
+    view: int
+    used: bool
+    reason: str = ""
+    corners: int | None = None
+    rms_px: float | None = None
+    residual_mm: float | None = None
+    residual_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Rms:
+    """Root mean square residuals; `px` is None where no image was used."""
+
+    mm: float
+    deg: float
+    px: float | None = None
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Residuals of views that the fit had not seen.
+
+    Attributes:
+        method: How views were left out, in words.
+        held_out: Their residuals, over all used views in turn.
+        holdout: Residuals of the views that the session declares as `holdout`.
+    """
+
+    method: str
+    held_out: Rms
+    holdout: Rms | None = None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the result can be trusted: a status and the reasons in plain sentences."""
+
+    status: VerdictStatus
+    reasons: tuple[str, ...]

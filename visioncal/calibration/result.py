@@ -1,0 +1,151 @@
+"""The result of a calibration."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.calibration.document import fields_from_document, to_document
+from visioncal.calibration.edge import Edge
+from visioncal.calibration.frame import Frame
+from visioncal.calibration.parts import (
+    CameraResult,
+    Rms,
+    SolverResult,
+    Validation,
+    Verdict,
+    ViewResult,
+)
+from visioncal.errors import DataError
+from visioncal.files import read_bytes, write_atomically
+from visioncal.robot import Robot
+from visioncal.types import FloatArray, Mount
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The result of calibrating one session; `save` writes it as calibration.json.
+
+    Attributes:
+        session_name: The session's name.
+        session_sha256: Digest of the session's canonical content.
+        created: When, in ISO 8601.
+        mount: How the camera is mounted.
+        edges: The estimated edges by name, in the order of `joint_covariance`.
+        joint_covariance: (6 k, 6 k) covariance of all edges together, in that order.
+        solvers: What every solver made of it.
+        noise: Estimated standard deviations by name.
+        views: One entry for each view of the session.
+        rms: Residuals over the used views.
+        validation: Residuals of views that were left out.
+        verdict: Whether to trust it.
+        camera: The camera, where the session has one.
+        robot: The nominal robot model, where the session names a known one.
+        frames: Tools and fixtures by the transform that places them, as `flange_from_tool`.
+        stages: One document for each further stage that ran, by name.
+    """
+
+    session_name: str
+    session_sha256: str
+    created: str
+    mount: Mount
+    edges: Mapping[str, Edge]
+    joint_covariance: FloatArray
+    solvers: Mapping[str, SolverResult]
+    noise: Mapping[str, float]
+    views: tuple[ViewResult, ...]
+    rms: Rms
+    validation: Validation
+    verdict: Verdict
+    camera: CameraResult | None = None
+    robot: Robot | None = None
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+    stages: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """The estimated transforms by name, those of tools and fixtures among them."""
+        return {name: edge.transform for name, edge in self.placed.items()}
+
+    @property
+    def placed(self) -> dict[str, Edge]:
+        """The estimated transforms by name with their covariances, frames among them."""
+        return {**self.edges, **{name: frame.edge for name, frame in self.frames.items()}}
+
+    def covariance(self, name: str) -> FloatArray:
+        """Covariance of one transform.
+
+        Args:
+            name: Its name, such as `flange_from_cam`.
+
+        Returns:
+            (6, 6) of (rotation [rad], translation [m]), right perturbation.
+
+        Raises:
+            DataError: There is no transform of that name.
+        """
+        placed = self.placed
+        if name not in placed:
+            raise DataError(f"no transform {name!r}: this calibration has {', '.join(placed)}.")
+        return placed[name].covariance
+
+    def base_from_flange(self, q: FloatArray) -> RigidTransform:
+        """Forward kinematics of the calibrated robot.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            m transforms, as one batched RigidTransform.
+
+        Raises:
+            DataError: The session named no known robot, or q has another number of joints.
+        """
+        if self.robot is None:
+            raise DataError(
+                "this calibration holds no robot model.",
+                next_step="Name one in the session's [robot] table and calibrate again.",
+            )
+        return RigidTransform.from_matrix(self.robot.base_from_flange(np.atleast_2d(q)))
+
+    def save(self, path: Path | str) -> None:
+        """Writes calibration.json, whole or not at all."""
+        write_atomically(
+            Path(path), json.dumps(to_document(self), indent=2, allow_nan=False) + "\n"
+        )
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads a calibration.json, or the one in a folder.
+
+        Raises:
+            DataError: The file is missing or is not a calibration of a known schema.
+        """
+        file = Path(path)
+        file = file / "calibration.json" if file.is_dir() else file
+        return cls.from_json(read_bytes(file), str(file))
+
+    @classmethod
+    def from_json(cls, text: bytes | str, label: str) -> Self:
+        """Reads the content of a calibration.json.
+
+        Args:
+            text: The content.
+            label: What it came from, for messages.
+
+        Raises:
+            DataError: It is not a calibration of a known schema.
+        """
+        try:
+            return cls(**fields_from_document(json.loads(text)))
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise DataError(f"{label}: not JSON: {error}.") from error
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(
+                f"{label}: not a calibration that this version can read: {error!r}.",
+                next_step="Calibrate the session again.",
+            ) from error
