@@ -5,6 +5,7 @@ by being wrong twice. Every reader takes a document and returns a (4, 4) transfo
 """
 
 import ast
+import json
 import re
 import xml.etree.ElementTree as ET
 
@@ -172,7 +173,143 @@ def abb(text):
     return transform(of_quaternion(q2, q3, q4, q1), np.array([x, y, z]) / 1000)
 
 
-# By the format's name: every format that holds a transform.
+def urscript_pose(text):
+    """A pose of URScript, whose numbers may be without their zero, as .2 and 0. are."""
+    found = re.fullmatch(r"\s*p\[([-\d.,\s]*)\]\s*", text)
+    assert found, text
+    x, y, z, *rotation = (float(it) for it in found[1].split(","))
+    return transform(of_rotation_vector(*rotation), [x, y, z])
+
+
+def ur_tcp(text):
+    found = re.fullmatch(r"set_tcp\((.*)\)", code(text, "#").strip())
+    assert found, text
+    return urscript_pose(found[1])
+
+
+def ur_feature(text):
+    found = re.fullmatch(r"global ([A-Za-z_]\w*) = (.*)", code(text, "#").strip(), re.ASCII)
+    assert found, text
+    return urscript_pose(found[2])
+
+
+def rapid(text):
+    """The first declaration of persistent data in a module: its type, its name and its value.
+
+    RAPID's aggregates are JSON's lists but for TRUE and FALSE and a number's missing zero.
+    """
+    found = re.search(r"^\s*(?:TASK )?PERS (\w+) (\w+)\s*:=(.*?);", code(text, "!"), re.M | re.S)
+    assert found, text
+    kind, name, value = found.groups()
+    return kind, name, json.loads(value.replace("TRUE", "true").replace("FALSE", "false"))
+
+
+def rapid_pose(value):
+    position, (q1, q2, q3, q4) = value
+    return transform(of_quaternion(q2, q3, q4, q1), np.array(position) / 1000)
+
+
+def abb_tooldata(text):
+    kind, _, (held, pose, load) = rapid(text)
+    mass, centre, axes, *inertia = load
+    assert (kind, held, len(centre), axes, inertia) == ("tooldata", True, 3, [1, 0, 0, 0], [0] * 3)
+    assert mass == -1 or mass > 0
+    return rapid_pose(pose)
+
+
+def abb_wobjdata(text):
+    """Where the object's frame is in the world: both frames of a work object one after another."""
+    kind, _, (held, fixed, unit, user, object_) = rapid(text)
+    assert (kind, held, fixed, unit) == ("wobjdata", False, True, "")
+    return rapid_pose(user) @ rapid_pose(object_)
+
+
+def kuka_named(text):
+    """What is set, and the pose it is set to."""
+    name, _, value = code(text, ";").strip().partition("=")
+    x, y, z, a, b, c = (float(it[1:]) for it in value.strip().strip("{}").split(","))
+    assert re.sub(rf"{NUMBER}", "", value).replace(" ", "") == "{X,Y,Z,A,B,C}"
+    angles = np.radians([a, b, c])
+    rotation = rz(angles[0]) @ ry(angles[1]) @ rx(angles[2])
+    return name.strip(), transform(rotation, np.array([x, y, z]) / 1000)
+
+
+def kuka_tool(text):
+    name, pose = kuka_named(text)
+    assert re.fullmatch(r"\$TOOL|TOOL_DATA\[\d+\]", name)
+    return pose
+
+
+def kuka_base(text):
+    name, pose = kuka_named(text)
+    assert re.fullmatch(r"\$BASE|BASE_DATA\[\d+\]", name)
+    return pose
+
+
+def fanuc_program(text):
+    """What a program of the teach pendant leaves in the controller's frames, by their names.
+
+    Its assignments are followed from a position to a register to a frame; others are no business
+    of a program that sets frames.
+    """
+    body, _, rest = text.replace("\r\n", "\n").partition("/POS\n")
+    listing = body.partition("/MN\n")[2]
+    positions = {
+        f"P[{number}]": _fanuc_position(fields)
+        for number, fields in re.findall(r"^P\[(\d+)\]\{\n(.*?)^\};", rest, re.M | re.S)
+    }
+    lines = re.findall(r"^ *\d+:  (.*?) *;$", listing, re.M)
+    assert len(lines) == len(listing.splitlines()) == int(re.search(r"COUNT\s*= (\d+)", body)[1])
+    registers, frames = {}, {}
+    for line in (it for it in lines if not it.startswith(("!", "MESSAGE", "PAUSE"))):
+        to, _, value = line.partition("=")
+        if to.startswith("PR["):
+            registers[to] = positions[value]
+        else:
+            frames[to] = registers[value]
+    assert rest.splitlines()[-1] == "/END"
+    return frames
+
+
+def _fanuc_position(fields):
+    units = {"X": "mm", "Y": "mm", "Z": "mm", "W": "deg", "P": "deg", "R": "deg"}
+    found = re.findall(r"([XYZWPR]) = *([-.\d]+) +(mm|deg)", fields)
+    assert [it[0] for it in found] == list(units)
+    assert all(units[name] == unit for name, _, unit in found)
+    x, y, z, w, p, r = (float(it[1]) for it in found)
+    w, p, r = np.radians([w, p, r])
+    return transform(rz(r) @ ry(p) @ rx(w), np.array([x, y, z]) / 1000)
+
+
+def _only(text, kind):
+    ((name, pose),) = fanuc_program(text).items()
+    assert re.fullmatch(rf"{kind}\[\d+\]", name)
+    return pose
+
+
+def fanuc_utool(text):
+    return _only(text, "UTOOL")
+
+
+def fanuc_uframe(text):
+    return _only(text, "UFRAME")
+
+
+# By the format's name: every format that holds a tool, and every one that holds a fixture.
+TOOL_READERS = {
+    "ur-tcp": ur_tcp,
+    "abb-tooldata": abb_tooldata,
+    "kuka-tool": kuka_tool,
+    "fanuc-utool": fanuc_utool,
+}
+FIXTURE_READERS = {
+    "ur-feature": ur_feature,
+    "abb-wobjdata": abb_wobjdata,
+    "kuka-base": kuka_base,
+    "fanuc-uframe": fanuc_uframe,
+}
+
+# By the format's name: every format that holds any transform.
 READERS = {
     "ros": ros,
     "ros-launch": launch,

@@ -1,6 +1,6 @@
 """A made-up session with its calibration: small, complete, and drawn without the pipeline."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +10,8 @@ from visioncal.calibration import (
     Calibration,
     CameraResult,
     Edge,
+    Frame,
+    Observation,
     Rms,
     SolverResult,
     Validation,
@@ -41,6 +43,14 @@ REJECTED = {
     3: "no corners: the target is out of the image",
     6: "its pose is 14 mm off: <b>robot moved</b> & hit **[it](http://example.org)**",
 }
+FLANGE_FROM_TOOL = RigidTransform.from_components(
+    [0.0338, 0.001, 0.1768], Rotation.from_rotvec([0.0, 0.4, 0.1])
+)
+# A fixture of which one point alone was touched: its axes are the base's by declaration.
+BASE_FROM_FIXTURE = RigidTransform.from_translation([-0.62, -0.05, 0.02])
+# The touch of the tool that is not used, with its reason, and one that is used in doubt.
+WRONG_TOUCH, WRONG_REASON = "17", "it is 6.4 mm off: the tip slipped, or <i>another</i> point"
+DOUBTFUL_TOUCH, DOUBT = "14", "it is 0.9 mm off, three times the others"
 
 
 @dataclass(frozen=True)
@@ -212,3 +222,59 @@ def _view(seen: ViewEvidence, rng: np.random.Generator) -> ViewResult:
     if reason:
         mm, deg, rms_px = 14.2, 1.9, None if rms_px is None else 8.1
     return ViewResult(seen.view, not reason, reason, corners, rms_px, mm, deg)
+
+
+def with_frames(sample: Sample) -> Sample:
+    """The sample with a tool and a fixture in its calibration."""
+    frames = {"flange_from_tool": tool_frame(), "base_from_fixture": fixture_frame()}
+    return replace(sample, calibration=replace(sample.calibration, frames=frames))
+
+
+def tool_frame() -> Frame:
+    """A tool from ten touches of one point, of which one is wrong, and two for its axes."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(6, 6)) * np.repeat([1e-3, 3e-5], 3)[:, None]
+    touches = [
+        Observation(str(number), used=True, kind="point", residual_mm=rng.uniform(0.1, 0.4))
+        for number in range(11, 21)
+    ]
+    touches[3] = replace(touches[3], reason=DOUBT, residual_mm=0.9)
+    touches[6] = replace(touches[6], used=False, reason=WRONG_REASON, residual_mm=6.4)
+    touches += [Observation("21", used=True, kind="z"), Observation("22", used=True, kind="xz")]
+    return Frame(
+        Edge(FLANGE_FROM_TOOL.as_matrix(), root @ root.T),
+        oriented=True,
+        method="pivot about one point, axes from touches",
+        source="touches <b>1</b>.csv",
+        created="2026-11-20T12:13:14+00:00",
+        rms_mm=0.31,
+        noise_mm=0.21,
+        observations=tuple(touches),
+        verdict=Verdict("check", (f"Touch {WRONG_TOUCH} is not used: {WRONG_REASON}. Repeat it.",)),
+        details={
+            "cone_deg": 43.71,
+            "point_m": [0.61, -0.12, 0.034],
+            "refined": False,
+            "weights": [[1.0, 0.0], [0.0, 1.0]],
+            "bound": {"tip_mm": 0.052},
+        },
+    )
+
+
+def fixture_frame() -> Frame:
+    """A fixture whose orientation was not measured, from three touches of its origin."""
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = np.diag([6e-5, 6e-5, 1.2e-4]) ** 2
+    return Frame(
+        Edge(BASE_FROM_FIXTURE.as_matrix(), covariance),
+        oriented=False,
+        method="touches of its origin",
+        source="fixture.csv",
+        created="2026-11-20T12:20:00+00:00",
+        rms_mm=0.12,
+        noise_mm=0.1,
+        observations=tuple(
+            Observation(name, used=True, kind="origin", residual_mm=0.1) for name in ("1", "2", "3")
+        ),
+        verdict=Verdict("good", ("Position is determined to 0.15 mm.",)),
+    )

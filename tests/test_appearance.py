@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of, known_of
+from scipy.stats import chi2
 
 from visioncal.camera import intrinsics
 from visioncal.estimator.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
@@ -15,6 +16,7 @@ from visioncal.transforms import invert, log
 from visioncal.types import Target
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 
 def compressed(cell, change=None):
@@ -85,16 +87,92 @@ def test_a_bent_board_is_noticed_and_costs_nothing(given):
     assert lengths[3] < 1.2 * lengths[1]
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_a_board_of_another_size_is_noticed_by_the_robot(mount):
+def surprise(cell, known, size=12) -> float:
+    """Squared error of the edges in units of the stated covariance: chi-square if that is true."""
+    error = error_of(cell, known)[:size]
+    return float(error @ np.linalg.solve(known.solved.covariance[:size, :size], error))
+
+
+# A true covariance exceeds it in one run of a thousand.
+UNLIKELY = chi2.ppf(0.999, 12)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=1.002))
     known = calibrated(cell)
-    (sentence,) = [it for it in known.warnings if "robot's motion" in it]
-    assert "0.2" in sentence
-    assert "larger than stated" in sentence
-    error = error_of(cell, known)[:6]
-    # Within what a board known to 0.1 % allows, not off by 0.2 % of 0.6 m.
-    assert error @ np.linalg.solve(known.solved.covariance[:6, :6], error) < 22.5
+    (sentence,) = [it for it in known.verdict.reasons if "robot's motion" in it]
+    assert "% larger than stated" in sentence
+    assert "which what is stated allows (to within 0.1 %)" in sentence
+    assert known.verdict.status == "good"
+    assert surprise(cell, known) < UNLIKELY
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("scale", [0.97, 1.01])
+@pytest.mark.parametrize("joints", [True, False])
+def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scale, joints):
+    """As after printing with `fit to page`: the robot's measure is all that is left."""
+    cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=scale))
+    known = calibrated(cell, joints=joints)
+    assert any("which is not what is stated" in it for it in known.verdict.reasons)
+    assert known.verdict.status == "check"
+    assert known.arm is None or not known.arm.is_significant
+    assert surprise(cell, known) < UNLIKELY
+    # Left as stated, the camera would be off by 5 mm and more.
+    assert np.linalg.norm(error_of(cell, known)[3:6]) < 0.5e-3
+
+
+def test_a_size_that_is_held_counts_by_what_the_views_say_against_it():
+    """Sizes drawn as the file states them, an arm too coarse to measure them."""
+    rng = np.random.default_rng(1)
+    coarse = replace(FINE, robot_sigma_m=3e-4, robot_sigma_rad=5e-4)
+    seen = []
+    for seed in range(12):
+        scale = 1.0 + 1e-3 * rng.standard_normal()
+        cell = simulate(replace(coarse, seed=seed, board_scale=scale))
+        seen.append(surprise(cell, calibrated(cell)))
+    # Twelve chi-squares of twelve: 144 +- 17, and 199 in one of a thousand.
+    assert sum(seen) < chi2.ppf(0.999, 144)
+    assert sum(seen) > chi2.ppf(0.001, 144)
+
+
+def with_lens(cell, off, **table):
+    """What is known at the end where the session states a lens that is off by (4,) pixels."""
+    wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
+    told = replace(cell, options=replace(cell.options, camera=wrong))
+    session = known_of(told).session
+    camera = session.document["camera"] | table
+    return calibrated(
+        told, session=replace(session, document=session.document | {"camera": camera})
+    )
+
+
+def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
+    cell = simulate(replace(FINE, seed=5))
+    known = with_lens(cell, np.array([0.0, 0.0, 3.0, 0.0]), intrinsics="hold")
+    (sentence,) = [it for it in known.verdict.reasons if "do not fit these images" in it]
+    assert 'intrinsics = "hold" keeps them' in sentence
+    assert known.verdict.status != "good"
+    assert not known.free.lens_is_free
+    assert surprise(cell, known) < UNLIKELY
+
+
+@pytest.mark.parametrize("options", [FINE, replace(FINE, seed=11)])
+def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt(options):
+    cell = simulate(options)
+    known = with_lens(cell, np.zeros(4), intrinsics="refine")
+    assert known.free.lens_is_free
+    assert known.verdict.status == "good"
+    assert surprise(cell, known) < UNLIKELY
+
+
+def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
+    cell = simulate(replace(FINE, seed=2))
+    known = with_lens(cell, np.array([2.0, 2.0, -1.5, 1.0]), matrix_sigma_px=2.0)
+    assert known.verdict.status == "good"
+    assert any("refined within what is stated" in it for it in known.verdict.reasons)
+    assert surprise(cell, known) < UNLIKELY
 
 
 def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():

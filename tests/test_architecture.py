@@ -15,6 +15,7 @@ LAYERS = (
     ("version",),
     ("errors",),
     ("types",),
+    ("figures",),
     ("transforms",),
     ("files",),
     ("conventions",),
@@ -39,6 +40,7 @@ LAYERS = (
     ("report", "viewer"),
     ("outputs",),
     ("stored", "formats", "exports"),
+    ("joining",),
     ("cli",),
     ("__main__",),
 )

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 
+from visioncal.errors import DegenerateError
 from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, solve_closure
-from visioncal.estimator.consensus import surprises
+from visioncal.estimator.consensus import surprises, whole_units
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 from visioncal.stages.agree import agree
+from visioncal.transforms import exp, invert
 
 WORLDS = {
     "fine, given": CellOptions(camera=fine_camera(), pixel_sigma_px=0.1),
@@ -59,6 +61,54 @@ def test_a_stop_is_right_or_wrong_as_a_whole():
     )
     found = agree(doubled, list(range(40)), twice)
     assert [it.view for it in found.rejections] == [2 * wrong, 2 * wrong + 1]
+
+
+def looked_at_again(data, times=2, seed=5):
+    """Each stop looked at several times, with the camera's own noise each time."""
+    again = np.repeat(np.arange(len(data)), times)
+    noise = np.random.default_rng(seed).standard_normal((len(again), 6))
+    roots = np.linalg.cholesky(data.camera_covariance[again])
+    seen = data.camera[again] @ exp((roots @ noise[:, :, None])[:, :, 0])
+    return Closure(data.mount, data.robot[again], seen, data.camera_covariance[again]), again
+
+
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("measured", [True, False], ids=["covariance unknown", "covariance known"])
+def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
+    once = replace(known.closure(known.used), shared=None)
+    data, stops = looked_at_again(once, times)
+    if measured:
+        data = replace(data, camera_covariance=None)
+    assert agree(data, range(20 * times), stops).rejections == ()
+    wrong = data.camera.copy()
+    wrong[4 * times + 1] = data.camera[11 * times]
+    found = agree(replace(data, camera=wrong), range(20 * times), stops)
+    (rejected,) = found.rejections
+    assert rejected.view == 4 * times + 1
+    away = invert(once.placed(found.edges.x)[4]) @ (
+        once.robot[4] @ found.edges.x @ wrong[4 * times + 1]
+    )
+    assert f"places the target {1e3 * np.linalg.norm(away[:3, 3]):.0f} mm" in rejected.reason
+    assert f"view {4 * times} of the same stop agrees" in rejected.reason
+
+
+def test_units_are_numbered_as_stops_are():
+    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
+    data, stops = looked_at_again(replace(known.closure(known.used), shared=None))
+    np.testing.assert_array_equal(whole_units(data, stops), stops)
+    mixed = data.camera.copy()
+    mixed[9] = data.camera[30]
+    units = whole_units(replace(data, camera=mixed), stops)
+    np.testing.assert_array_equal(units, [*stops[:9], 5, *(stops[10:] + 1)])
+
+
+def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
+    cell = simulate(replace(WORLDS["fine, given"], seed=1))
+    still = np.repeat(cell.base_from_flange[:1], 20, axis=0)
+    with pytest.raises(DegenerateError, match="all 20 used views are from one pose") as caught:
+        calibrated(replace(cell, base_from_flange=still), joints=False)
+    assert caught.value.culprits == ("the camera's offset from the tool",)
 
 
 def test_a_surprise_is_the_distance_from_what_the_others_predict():

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import readers
 import yaml
-from readers import READERS
+from placed import fixture, tool
+from readers import FIXTURE_READERS, READERS, TOOL_READERS
+from rotations import CASES
 from samples import made_up
-from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import CameraResult, Edge, Verdict
 from visioncal.errors import DataError
@@ -28,39 +29,6 @@ ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
 LENSES = {"camera-info", "kalibr"}
 RNG = np.random.default_rng(3)
 SAMPLE = made_up(5).calibration
-
-
-def rotation_cases():
-    """Rotations by kind: any, and those at which some form of writing them is singular."""
-    quarter, half = np.pi / 2, np.pi
-    turns = RNG.uniform(-half, half, (40, 2))
-    axes = RNG.normal(size=(20, 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
-    r = readers
-    return {
-        "any": list(Rotation.random(60, rng=RNG).as_matrix()),
-        "identity": [np.eye(3)],
-        "pitch of 90": [r.rz(a) @ r.ry(s * quarter) @ r.rx(b) for a, b in turns for s in (-1, 1)],
-        "second x y z angle of 90": [
-            r.rx(a) @ r.ry(s * quarter) @ r.rz(b) for a, b in turns for s in (-1, 1)
-        ],
-        "second z y z angle of 0 or 180": [
-            r.rz(a) @ r.ry(m) @ r.rz(b) for a, b in turns for m in (0.0, half)
-        ],
-        "by 180": [
-            *(2 * np.outer(it, it) - np.eye(3) for it in axes),
-            *(r.rx(half), r.ry(half), r.rz(half)),
-        ],
-        "tiny": list(Rotation.from_rotvec(1e-7 * axes).as_matrix()),
-        "near 180": list(Rotation.from_rotvec((half - 1e-9) * axes).as_matrix()),
-        "near a pitch of 90": [
-            r.rz(a) @ r.ry(quarter - off) @ r.rx(b)
-            for (a, b), off in zip(turns, np.geomspace(1e-12, 1e-4, len(turns)), strict=True)
-        ],
-    }
-
-
-CASES = rotation_cases()
 
 
 def poses(kind):
@@ -117,7 +85,7 @@ def test_any_edge_and_its_inverse(name, edge):
 
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
-    assert set(NAMES) == set(READERS) | LENSES
+    assert set(NAMES) == set(READERS) | set(TOOL_READERS) | set(FIXTURE_READERS) | LENSES
     assert len(set(NAMES)) == len(NAMES)
 
 
@@ -205,9 +173,10 @@ BAD_NAMES = ['tool"0', "a b", "-x", "/world", "x\nimport os", "x'", "größe", "
 
 @pytest.mark.parametrize("bad", BAD_NAMES)
 def test_a_frame_name_that_could_end_its_quotes_is_refused(bad):
+    placed = replace(SAMPLE, frames=tool() | fixture())
     for name in NAMES:
         with pytest.raises(DataError, match="frame's name"):
-            export(SAMPLE, name, Selection(child=bad))
+            export(placed, name, Selection(child=bad))
 
 
 def test_frames_of_one_name_are_refused():

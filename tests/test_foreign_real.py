@@ -93,9 +93,10 @@ def test_industrial_calibration(real_data, calibrated):
     assert [it.view for it in result.views if not it.used] == [2]
     assert result.rms.mm <= 1.86
     assert result.rms.deg <= 0.215
-    # Within what 15 views leave open.
+    # Park's camera, within what 15 views leave open; he takes the board as stated, and the half per
+    # cent by which the robot finds it larger is 4 mm over the 0.9 m to it.
     sigma_mm = result.edges["base_from_cam"].sigma_mm
-    assert away_mm(result, "base_from_cam", [-18.4, 1263.7, 290.0]) < 3 * sigma_mm
+    assert away_mm(result, "base_from_cam", [-18.4, 1263.7, 290.0]) < 4 + 3 * sigma_mm
     # The session that was made of the same data by hand states its squares to 0.06 %, and not to
     # the 0.1 % that are taken where nothing is said, which moves the camera by less than its sigma.
     by_hand = visioncal.calibrate(real_data / "sessions/ric_charuco_eye_to_hand")

@@ -48,9 +48,10 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert result.verdict.status == "check"
     assert any("The board is not flat" in it for it in result.verdict.reasons)
     assert any("0.47 % larger than stated" in it for it in result.verdict.reasons)
-    # Park's camera, within what 15 views leave open.
+    # Park's camera, within what 15 views leave open; he takes the board as stated, and half a per
+    # cent of the 0.9 m to it is 4 mm.
     away = result.transforms["base_from_cam"].translation - [-0.0184, 1.2637, 0.2900]
-    assert 1e3 * np.linalg.norm(away) < 3 * result.edges["base_from_cam"].sigma_mm
+    assert 1e3 * np.linalg.norm(away) < 4 + 3 * result.edges["base_from_cam"].sigma_mm
 
 
 def test_eight_views_of_a_poor_set_are_not_called_good(real_data):

@@ -285,6 +285,8 @@ TOML_REFUSALS = [
     ('name = "oak"', 'model = "fisheye"', 'has 5 .* "fisheye" model needs 4'),
     ('name = "oak"', 'model = "pinhole"', 'model is \'pinhole\', .* "brown" or "fisheye"'),
     ('name = "oak"', 'intrinsics = "fix"', "camera.intrinsics is 'fix'"),
+    ('name = "oak"', "matrix_sigma_px = 1e-300", r"is 1e-300, but .* of at least 0\.001"),
+    ('name = "oak"', "matrix_sigma_px = 1e300", r"is 1e\+300, but .* of at most 10000"),
     ("resolution", "size", "camera.resolution is missing: camera.matrix holds for one"),
     ("[robot]", "[robots.a]", r"\[robots\.\*\] declares several robots; .* as \[robot\]"),
     ('target = "board.toml"\n', "", r"target is missing, but view 7 has an image\. Add target"),
@@ -354,6 +356,12 @@ def test_a_wrong_views_csv_is_refused_by_line_and_column(
     error = refusal(folder)
     assert re.search(words, str(error))
     assert "views.csv" in error.culprits[0]
+
+
+def test_an_angle_that_no_joint_turns_is_refused(folder: Path) -> None:
+    edit(folder, "views.csv", "stamp_s", "q1_rad")
+    edit(folder, "views.csv", "0.10", "1e200")
+    assert "q1_rad: 1e+200 rad is no angle of a joint" in refusal(folder).message
 
 
 def test_a_shared_column_that_names_two_cameras_is_refused(folder: Path) -> None:

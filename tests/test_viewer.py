@@ -14,14 +14,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
-from samples import Sample, made_up
+from samples import Sample, made_up, with_frames
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.calibration import Edge
 from visioncal.evidence import ViewEvidence
 from visioncal.finders import find_target
 from visioncal.recording import arm, board, coverage, paths, write_recording
-from visioncal.recording.uncertainty import Uncertainty
+from visioncal.recording.uncertainty import SIGMAS_95, Uncertainty
 from visioncal.targets import corner_positions, target_from_document
 from visioncal.transforms import exp, invert
 from visioncal.viewer import blueprint
@@ -54,6 +54,7 @@ def samples() -> dict[str, Sample]:
         "images and joints": made_up(),
         "poses alone": made_up(images=False),
         "no joints": without_joints(made_up()),
+        "tools and fixtures": with_frames(made_up()),
     }
 
 
@@ -94,7 +95,9 @@ def column(path: Path, entity: str, component: str) -> dict[int, object]:
     return found
 
 
-@pytest.mark.parametrize("name", ["images and joints", "poses alone", "no joints"])
+@pytest.mark.parametrize(
+    "name", ["images and joints", "poses alone", "no joints", "tools and fixtures"]
+)
 def test_every_panel_shows_something(name, samples, recordings):
     layout = blueprint(samples[name].session, samples[name].calibration)
     logged = {str(it.entity_path) for it in RrdReader(recordings[name]).stream()}
@@ -115,6 +118,8 @@ def test_panels_are_those_that_the_session_has_something_for(samples):
     assert "in the image" not in poses
     assert "over q1" in poses
     assert "over q1" not in str(tabs(samples["no joints"]))
+    assert "Tools and fixtures" not in str(everything)
+    assert "Tools and fixtures" in tabs(samples["tools and fixtures"])[first]
 
 
 def test_views_that_were_not_used_are_marked_in_the_plots(samples, recordings):
@@ -159,16 +164,16 @@ def test_ellipsoids_are_the_covariance_in_the_frame_of_the_edge(tmp_path):
     found = {
         str(it.entity_path)
         for it in RrdReader(file).stream()
-        if re.search(r"2_sigma_magnified_\d+x$", str(it.entity_path))
+        if re.search(r"95_percent_magnified_\d+x$", str(it.entity_path))
     }
     assert {it.split("/")[1] for it in found} == {"camera", "target"}
     for entity in found:
-        name = re.match(r"/\w+/(\w+)_2_sigma", entity)[1]
+        name = re.match(r"/\w+/(\w+)_95_percent", entity)[1]
         drawn_factor = int(re.search(r"_(\d+)x$", entity)[1])
         (half,) = column(file, entity, "Ellipsoids3D:half_sizes")[0]
         (quaternion,) = column(file, entity, "Ellipsoids3D:quaternions")[0]
         axes = Rotation.from_quat(quaternion).as_matrix()
-        drawn = axes @ np.diag(np.square(half)) @ axes.T / (2 * drawn_factor) ** 2
+        drawn = axes @ np.diag(np.square(half)) @ axes.T / (SIGMAS_95 * drawn_factor) ** 2
         expected = edges[name].covariance[3:, 3:]
         # The drawing has single precision.
         np.testing.assert_allclose(drawn, expected, atol=1e-5 * np.trace(expected))

@@ -10,7 +10,9 @@ from visioncal.session import Session
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 
 
-def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
+def write_outputs(
+    folder: Path, session: Session | None, run: Run, note: str = ""
+) -> tuple[Path, ...]:
     """Writes the three files into a folder.
 
     They are made aside first: where one of them fails, none appears, and files that an earlier
@@ -18,11 +20,12 @@ def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
 
     Args:
         folder: Where to; it is made where there is none.
-        session: What was calibrated.
+        session: What was calibrated; None where it was not kept, which leaves the recording out.
         run: The result and its evidence.
+        note: What the reader should know of the report itself.
 
     Returns:
-        The files.
+        The files that were written.
 
     Raises:
         DataError: The folder cannot be written.
@@ -32,7 +35,8 @@ def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
     from visioncal.report import write_report
     from visioncal.viewer import blueprint
 
-    files = (RECORDING, REPORT, CALIBRATION)
+    # The result last: it is what the others are beside.
+    files = (*([] if session is None else [RECORDING]), REPORT, CALIBRATION)
     taken = [folder / file for file in files if (folder / file).is_dir()]
     if taken:
         raise DataError(
@@ -43,15 +47,16 @@ def write_outputs(folder: Path, session: Session, run: Run) -> tuple[Path, ...]:
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
             aside = Path(name)
             run.calibration.save(aside / CALIBRATION)
-            write_report(aside / REPORT, run.calibration, session, run.evidence)
-            layout = blueprint(session, run.calibration)
-            write_recording(aside / RECORDING, session, run.calibration, run.evidence, layout)
+            write_report(aside / REPORT, run.calibration, session, run.evidence, note)
+            if session is not None:
+                layout = blueprint(session, run.calibration)
+                write_recording(aside / RECORDING, session, run.calibration, run.evidence, layout)
             for file in files:
                 (aside / file).replace(folder / file)
     except OSError as error:
         raise DataError(
             f"{folder}: cannot be written: {error.strerror or error}.",
             culprits=[str(folder)],
-            next_step="Choose another folder with -o.",
+            next_step="Make room in it, or choose another folder.",
         ) from error
-    return tuple(folder / file for file in (CALIBRATION, REPORT, RECORDING))
+    return tuple(folder / file for file in reversed(files))

@@ -1,16 +1,20 @@
 """Finds again what an earlier calibration has written."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.calibration import Calibration, to_document
+from visioncal.calibration import Calibration, FrameFile, to_document
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
+from visioncal.files import read_bytes
 from visioncal.outputs import CALIBRATION, RECORDING
 from visioncal.session import Session
 
 # What tells the folder of a session.
 _SESSION = "session.toml"
+# Frames of a robot without a calibration, in a folder.
+FRAMES = "frames.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,12 @@ def load_calibration(path: Path) -> Calibration:
     """
     if path.suffix.lower() != ".rrd":
         _refuse_session(path)
-        return Calibration.load(path)
+        try:
+            return Calibration.load(path)
+        except DataError as error:
+            if _holds_frames(path):
+                raise _frames_alone(path) from error
+            raise
     # The codec takes half a second to import, which a calibration.json need not wait for.
     from visioncal.recording import read_calibration
 
@@ -49,6 +58,40 @@ def load_calibration(path: Path) -> Calibration:
     if calibration is None:
         raise _uncalibrated(path, "the recording of a session")
     return calibration
+
+
+def load_placed(path: Path) -> Calibration | FrameFile:
+    """Loads a result, or frames that belong to none.
+
+    Args:
+        path: As for `load_calibration`, or a file of frames, which its content tells, or a folder
+            with one and no calibration.json.
+
+    Raises:
+        DataError: There is neither, or it cannot be read.
+    """
+    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / FRAMES).is_file()
+    file = path / FRAMES if alone else path
+    return FrameFile.load(file) if _holds_frames(file) else load_calibration(path)
+
+
+def _holds_frames(path: Path) -> bool:
+    """Tells a file of frames by its content: every calibration has transforms."""
+    if path.suffix.lower() == ".rrd" or not path.is_file():
+        return False
+    try:
+        document = json.loads(read_bytes(path))
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(document, dict) and "frames" in document and "transforms" not in document
+
+
+def _frames_alone(path: Path) -> DataError:
+    return DataError(
+        f"{path} holds frames of tools and fixtures, and no calibration.",
+        culprits=[str(path)],
+        next_step="Name the calibration's folder or its calibration.json.",
+    )
 
 
 def _refuse_session(path: Path) -> None:

@@ -21,6 +21,9 @@ from visioncal.types import FloatArray, IntArray, Target
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
 DEFAULT_RELATIVE_SIGMA = 1e-3
 
+# No square is known better, not even one etched in glass.
+LEAST_SIGMA_M = 1e-8
+
 # No printed square is larger; a larger number is in millimetres.
 LARGEST_M = 1.0
 
@@ -84,7 +87,7 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
     square_m = _size(table, "square_m")
-    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * square_m, positive=True)
+    sigma_m = _sigma(table, square_m)
     if kind == "checkerboard":
         return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
     marker_m = table.number("marker_m", positive=True)
@@ -109,9 +112,17 @@ def _size(table: Table, key: str) -> float:
     return size_m
 
 
+def _sigma(table: Table, size_m: float) -> float:
+    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
+    if not LEAST_SIGMA_M <= sigma_m <= size_m:
+        needed = f"a standard deviation from {LEAST_SIGMA_M:g} m to the square's own {size_m:g} m"
+        raise table.refuse("square_sigma_m", sigma_m, needed)
+    return sigma_m
+
+
 def _marker(table: Table, name: str) -> Target:
     size_m = _size(table, "size_m")
-    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
+    sigma_m = _sigma(table, size_m)
     dictionary = table.text("dictionary")
     marker_id = table.integer("id", 0, _dictionary_size(table, dictionary) - 1)
     return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=marker_id)

@@ -253,7 +253,7 @@ def with_a_board(task: tuple[CellOptions, int]) -> list[float] | None:
         known = calibrated(cell)
     except VisioncalError:
         return None
-    said = " ".join(known.warnings)
+    said = " ".join(known.verdict.reasons)
     return [
         *squared(error_of(cell, known)),
         float("not flat" in said),

@@ -8,9 +8,10 @@ from rich.markup import escape
 
 from visioncal.cli.console import messages
 from visioncal.cli.stdout import write_stdout
-from visioncal.exports import EXPORT_FORMATS, Selection, export
+from visioncal.errors import DataError
+from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
 from visioncal.files import check_free, write_atomically
-from visioncal.stored import load_calibration
+from visioncal.stored import load_placed
 
 
 def _show_formats(wanted: bool) -> None:
@@ -22,9 +23,11 @@ def _show_formats(wanted: bool) -> None:
 
 
 def export_command(
-    calibration: Annotated[
+    source: Annotated[
         Path,
-        typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd)."),
+        typer.Argument(
+            help="An output folder, its calibration.json, a recording (.rrd), or a file of frames."
+        ),
     ],
     to: Annotated[str, typer.Option("--to", help="The format; --list shows them all.")],
     out: Annotated[
@@ -33,7 +36,11 @@ def export_command(
     ] = None,
     edge: Annotated[
         str | None,
-        typer.Option("--edge", help="The transform; the camera's where none is named."),
+        typer.Option(
+            "--edge",
+            help="The transform; where none is named the camera's, the only tool or the only "
+            "fixture, as the format has it.",
+        ),
     ] = None,
     inverse: Annotated[bool, typer.Option("--inverse", help="Write the inverse of it.")] = False,
     parent: Annotated[
@@ -42,6 +49,17 @@ def export_command(
     ] = None,
     child: Annotated[
         str | None, typer.Option("--child", help="What to call the frame whose pose it is.")
+    ] = None,
+    number: Annotated[
+        int | None,
+        typer.Option("--number", help="Which of the controller's tools or bases it becomes."),
+    ] = None,
+    mass_kg: Annotated[
+        float | None, typer.Option("--mass-kg", help="The tool's mass, for ABB's tooldata [kg].")
+    ] = None,
+    cog_mm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--cog-mm", help="Its centre of mass in the flange's frame: X Y Z [mm]."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     _list: Annotated[
@@ -54,16 +72,25 @@ def export_command(
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
     nothing was written, for the reason given.
     """
-    result = load_calibration(calibration)
-    document = export(result, to, Selection(edge, inverse, parent, child))
-    if result.verdict.status == "bad":
-        messages().print(
-            f"[bold red]warning:[/] the verdict on this calibration is bad. "
-            f"{escape(' '.join(result.verdict.reasons))}"
-        )
+    selection = Selection(edge, inverse, parent, child, number, _load(mass_kg, cog_mm))
+    written = document(load_placed(source), to, selection)
+    for it in written.warnings:
+        messages().print(f"[bold red]warning:[/] {escape(it)}")
     if out is None or out == Path("-"):
-        write_stdout(document)
+        write_stdout(written.text)
         return
     check_free(out, force=force)
-    write_atomically(out, document)
+    write_atomically(out, written.text)
     messages().print(escape(f"wrote {out}"))
+
+
+def _load(mass_kg: float | None, cog_mm: tuple[float, float, float] | None) -> Load | None:
+    if mass_kg is None and cog_mm is None:
+        return None
+    if mass_kg is None or cog_mm is None:
+        raise DataError(
+            "A load is a mass and where its centre is.",
+            culprits=["--mass-kg", "--cog-mm"],
+            next_step="Give both --mass-kg and --cog-mm, or neither.",
+        )
+    return Load(mass_kg, cog_mm)

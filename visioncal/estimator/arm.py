@@ -30,9 +30,9 @@ from visioncal.types import FloatArray, IntArray
 
 # Arms are off by some 0.5 mm for each mrad.
 LEVER_M = 0.5
-# Twice the gain in log-likelihood that noise gives in one session of ten thousand: chi-square of
-# one degree of freedom.
-_SIGNIFICANT = 15.1
+# Twice the gain in log-likelihood that noise gives in one session of ten thousand, and in one of
+# twenty: chi-square of one degree of freedom.
+SIGNIFICANT, _LIKELY = 15.1, 3.84
 # Typical errors of links that are tried first [rad], and how finely the best is sought.
 _TRIED, _FINEST = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3), 1.05
 # Fewer stops have hardly more residuals than the edges and the noise take.
@@ -57,6 +57,16 @@ class ArmErrors:
     sigma: float
     gain: float
     of_links: bool
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether they are beyond chance; others are likely enough to be counted with."""
+        return self.gain > SIGNIFICANT
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether they are unknowns of the fit; others only count in the covariance."""
+        return self.of_links and self.is_significant
 
     def of(self, rows: IntArray) -> "ArmErrors":
         """Returns the errors of some views."""
@@ -124,7 +134,7 @@ def find_arm_errors(
         of_links: Whether it is of this arm's links.
 
     Returns:
-        The errors; None where white noise explains the residuals as well.
+        The errors; None where white noise explains the residuals about as well.
     """
     if len(data) < _FEWEST_STOPS:
         return None
@@ -140,7 +150,7 @@ def find_arm_errors(
 
     found = {sigma: gain(sigma) for sigma in _TRIED}
     best = max(found, key=lambda it: found[it])
-    if found[best] < _SIGNIFICANT:
+    if found[best] < _LIKELY:
         return None
     best, highest = _climb(gain, best, found[best])
     return ArmErrors(basis, best, highest, of_links)

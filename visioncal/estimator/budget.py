@@ -15,8 +15,10 @@ def covariance_by_source(
 ) -> dict[str, FloatArray]:
     """Splits the covariance of the joint fit into the parts that its sources contribute.
 
-    The estimate is linear in the errors of corners, arm, lens and board, which are independent:
-    each contributes its own covariance through the same gain, and the parts add up to the whole.
+    The estimate is linear in the errors of corners, arm, lens and board: each contributes its own
+    covariance through the same gain, and the parts add up to the whole. Lens and board are known
+    from the same corners, so their errors hang together: each takes half of what is common, which
+    may leave one of them less than nothing where they make up for each other.
 
     Args:
         data: The views, one a stop.
@@ -37,9 +39,12 @@ def covariance_by_source(
         parts["pixels"] = np.einsum("mij,mik,mkl->jl", slopes, camera, slopes)
         parts["robot"] = np.einsum("mij,mik,mkl->jl", slopes, robot, slopes)
     if data.shared is not None:
+        owned = np.concatenate([*shared.values(), np.zeros(0, np.int64)])
+        information = data.shared.information[np.ix_(owned, owned)]
         for name, rows in shared.items():
+            share = np.where(np.isin(owned, rows), 0.5, 0.0)
             known = np.zeros_like(fitted)
-            known[np.ix_(12 + rows, 12 + rows)] = data.shared.information[np.ix_(rows, rows)]
+            known[np.ix_(12 + owned, 12 + owned)] = (share[:, None] + share) * information
             parts[name] = known
     return {name: (fitted @ part @ fitted)[:12, :12] for name, part in parts.items()}
 

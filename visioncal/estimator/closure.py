@@ -71,6 +71,16 @@ class Shared:
         """Returns the views of an (m,) mask."""
         return replace(self, by_camera=self.by_camera[chosen], by_flange=self.by_flange[chosen])
 
+    def first(self, count: int) -> "Shared":
+        """Returns the first of these unknowns alone, as if nothing were open about the others."""
+        return Shared(
+            self.information[:count, :count],
+            self.pull[:count],
+            self.anchor[:count],
+            self.by_camera[:, :, :count],
+            self.by_flange[:, :, :count],
+        )
+
     def joined(self, other: "Shared") -> "Shared":
         """Returns these unknowns and others behind them, of which nothing is known in common."""
         return Shared(
@@ -122,6 +132,10 @@ class Closure:
     def with_more(self, more: Shared) -> "Closure":
         """Returns the views with more unknowns that they share, behind those that are there."""
         return replace(self, shared=more if self.shared is None else self.shared.joined(more))
+
+    def with_first(self, count: int) -> "Closure":
+        """Returns the views with the first of the unknowns that they share, and no others."""
+        return replace(self, shared=None if self.shared is None else self.shared.first(count))
 
     def merged(self, stops: IntArray) -> "Closure":
         """Makes one view of all that were taken at one stop of the robot.
@@ -312,6 +326,22 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     if data.shared is not None:
         information[12:, 12:] += data.shared.information
     return np.asarray(information)
+
+
+def held_shift(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """How far the answer (12 + k,) would move if what is anchored moved as well, to first order.
+
+    What is held is wrong by what is open about it, and by how far the data pull at it: beside the
+    covariance, which counts the former, the square of this shift is the error of holding.
+    """
+    shift = np.zeros(12 + len(edges.shared))
+    if data.shared is None or not data.shared.anchor.any():
+        return shift
+    held = data.shared.anchor > 0.0
+    still = replace(edges, shared=np.where(held, 0.0, edges.shared))
+    pull = normal_equations(data, still, noise)[1]
+    shift[12:][held] = pull[12:][held]
+    return np.asarray(-covariance(closure_information(data, edges, noise)) @ shift)
 
 
 def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatArray, FloatArray]:

@@ -2,17 +2,20 @@
 
 A wrong view is wrong as a whole: the unit of rejection is the 6-vector by which a view places the
 target away from where the others place it. The start is a consensus of small sets of views
-(Fischler and Bolles 1981) under the least median (Rousseeuw 1984); what follows works on squared
-Mahalanobis distances with the noise estimated from the views that agree.
+(Fischler and Bolles 1981) under the least trimmed sum of distances (Rousseeuw 1984); what follows
+works on squared Mahalanobis distances with the noise estimated from the views that agree.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
+from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.closure import (
     Closure,
     ClosureFit,
@@ -23,20 +26,20 @@ from visioncal.estimator.closure import (
     normal_equations,
     residual_blocks,
 )
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.linalg import covariance, squared_lengths
 from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.estimator.variance import LEAST_SIGMA
 from visioncal.solvers import SOLVERS
+from visioncal.transforms import invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 
 # A sound view is lost in one session of a thousand.
 _FALSE_ALARM = 1e-3
-# With 40 % of the views wrong, all 60 sets of three contain a wrong one with probability 3e-7.
+# With 40 % of 20 views wrong, all 60 sets of three contain a wrong one with probability 3e-6.
 _SETS, _SET_SIZE = 60, 3
 _REFINED, _ROUNDS = 5, 10
 # The noise of measured poses differs by so much from view to view: with tilt and distance.
 _UNEVEN = 3.0
-# Lever by which an angle counts as a distance when sets are compared [m].
-_LEVER_M = 0.5
 # Where fewer than this share of the views agree, nothing tells which of them are right.
 _LEAST_SHARE = 0.5
 # Views that agree, at the least: with fewer, wrong ones cannot be told from noise.
@@ -84,6 +87,37 @@ def agreeing_views(data: Closure, start: Mask | None = None) -> Agreement:
     return _kept(data, *_fitted(data, everything))
 
 
+def whole_units(data: Closure, stops: IntArray) -> IntArray:
+    """Which views are right or wrong together: those of one stop, as far as their images agree.
+
+    Views of one stop share the robot's pose, and must see the target at one place up to the
+    camera's noise alone. Those that do not are units by themselves, so that a wrong image does not
+    take a sound one with it. Where the camera's noise is unknown, it is what pairs of views of one
+    stop show in the median.
+
+    Args:
+        data: The views.
+        stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
+
+    Returns:
+        (m,) the unit of each view, numbered likewise.
+    """
+    first, second = np.nonzero(np.triu(stops[:, None] == stops, 1))
+    if not len(first):
+        return stops
+    away = log(invert(data.camera[first]) @ data.camera[second])
+    if data.camera_covariance is None:
+        typical = np.median(np.sum(away.reshape(-1, 2, 3) ** 2, axis=2), axis=0) / chi2.median(3)
+        spread = _UNEVEN**2 * np.diag(np.repeat(np.maximum(typical, LEAST_SIGMA**2), 3))[None]
+    else:
+        spread = data.camera_covariance[first] + data.camera_covariance[second]
+    squared = np.einsum("pi,pi->p", away, np.linalg.solve(spread, away[:, :, None])[:, :, 0])
+    alike = squared < chi2.ppf(1.0 - _FALSE_ALARM / len(first), 6)
+    pairs = (np.ones(alike.sum()), (first[alike], second[alike]))
+    links = coo_array(pairs, shape=(len(data), len(data)))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
 def _is_noise(noise: Noise) -> bool:
     return noise.sigma_m < SIGMA_LIMIT_M and noise.sigma_rad < SIGMA_LIMIT_RAD
 
@@ -111,22 +145,7 @@ def surprises(data: Closure, agrees: Mask, fit: ClosureFit) -> FloatArray:
     information, _ = normal_equations(data.subset(agrees), fit.edges, fit.noise)
     taken = jacobian @ covariance(information) @ np.swapaxes(jacobian, 1, 2)
     left = spread + np.where(agrees, -1.0, 1.0)[:, None, None] * taken
-    return _squared(residuals, left, spread)
-
-
-def _squared(residuals: FloatArray, left: FloatArray, spread: FloatArray) -> FloatArray:
-    """Squared lengths of residuals in units of a covariance, where that has not vanished.
-
-    A view that alone determines a direction has no residual there, and no variance either.
-    """
-    root = np.linalg.cholesky(spread)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ left @ np.swapaxes(inverse, 1, 2))
-    white = (np.swapaxes(vectors, 1, 2) @ inverse @ residuals[:, :, None])[:, :, 0]
-    counts = values > 1e-6
-    return np.asarray(
-        np.sum(np.where(counts, white**2 / np.where(counts, values, 1.0), 0.0), axis=1)
-    )
+    return squared_lengths(residuals, left, spread)[0]
 
 
 def _limit(data: Closure, agrees: Mask) -> float:
@@ -185,7 +204,7 @@ def _closed_form(data: Closure, rows: IntArray) -> Edges:
 def _distances(data: Closure, edges: Edges) -> FloatArray:
     """Distance (m,) [m] between where each view places the target, and where the edges do."""
     away_m, away_rad = distances(data.placed(edges.x), edges.z)
-    return np.asarray(away_m + _LEVER_M * away_rad)
+    return np.asarray(away_m + LEVER_M * away_rad)
 
 
 def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]:

@@ -13,6 +13,14 @@ import numpy as np
 from visioncal.camera import project_with_jacobian
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
+# Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
+_LEAST_SIGMA_PX = 1e-6
+
+
+def floored_sigma_px(sigma_px: float) -> float:
+    """Noise of a corner's coordinate as covariances can bear it: never none at all [px]."""
+    return max(sigma_px, _LEAST_SIGMA_PX)
+
 
 @dataclass(frozen=True, eq=False)
 class CornerStack:

@@ -1,7 +1,8 @@
 """How well the noise's levels are known."""
 
+from functools import partial
+
 import numpy as np
-from scipy.optimize import brentq
 
 from visioncal.estimator.closure import (
     RATIO_PRIOR,
@@ -13,12 +14,8 @@ from visioncal.estimator.closure import (
     noise_likelihood,
     residual_blocks,
 )
-from visioncal.estimator.variance import LEAST_SIGMA, estimate_sigmas
+from visioncal.estimator.variance import estimate_sigmas, profile_interval
 from visioncal.types import FloatArray
-
-# Twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square), and how far
-# it is followed, in logarithms.
-_SURPRISE_95, _WIDEST = 3.84, 4.0
 
 
 def noise_intervals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
@@ -37,23 +34,16 @@ def noise_intervals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
     residuals, jacobian, _ = residual_blocks(data, edges, noise)
     components, known = components_of(data, edges.z), knowledge_of(data, edges)
     lowest = noise_likelihood(data, edges)[1]
-    intervals = np.empty((2, 2))
 
-    def surprise(level: int, logarithm: float) -> float:
+    def profile(level: int, logarithm: float) -> float:
         start, others = noise.sigmas.copy(), np.arange(2) != level
         start[level] = np.exp(logarithm)
-        value = estimate_sigmas(residuals, jacobian, components, known, start, RATIO_PRIOR, others)[
-            1
-        ]
-        return 2.0 * (value - lowest) - _SURPRISE_95
+        fitted = estimate_sigmas(residuals, jacobian, components, known, start, RATIO_PRIOR, others)
+        return fitted[1]
 
-    for level, sigma in enumerate(np.log(np.maximum(noise.sigmas, LEAST_SIGMA))):
-        for side, end in enumerate((sigma - _WIDEST, sigma + _WIDEST)):
-            if surprise(level, end) > 0.0:
-                crossing = brentq(
-                    lambda at, level=level: surprise(level, at), sigma, end, xtol=0.02
-                )
-                intervals[level, side] = np.exp(crossing)
-            else:
-                intervals[level, side] = np.exp(end) if side else 0.0
-    return intervals
+    return np.array(
+        [
+            profile_interval(partial(profile, level), sigma, lowest)
+            for level, sigma in enumerate(noise.sigmas)
+        ]
+    )

@@ -22,7 +22,7 @@ from visioncal.estimator.appearance import (
 )
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
-from visioncal.estimator.corners import CornerStack
+from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance
 from visioncal.targets import corner_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
@@ -33,6 +33,8 @@ _FALSE_ALARM = 1e-4
 _SPARE = 10
 # Values that move by less than this share of their sigma have settled.
 _SETTLED, _ROUNDS = 0.02, 8
+# What is stated is contradicted by so many standard deviations.
+_CONTRADICTION = 3.0
 # Given intrinsics that are set free are known to so much without the session: the focal length and
 # the centre as shares of the focal length, and the distortion's coefficients.
 _FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
@@ -80,13 +82,23 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The corners of m views with what is known of the scene beforehand."""
+    """The corners of m views with what is known of the scene beforehand.
+
+    Attributes:
+        scene: The scene.
+        stack: The corners.
+        positions: (c, 3) corners of the flat board [m].
+        basis: (c, 3, 9) of `board_basis`.
+        prior_sigma: (k + 9,) what lens and board are known to; inf where nothing is known.
+        contested: Whether given intrinsics are held although the corners speak against them.
+    """
 
     scene: Scene
     stack: CornerStack
     positions: FloatArray
     basis: FloatArray
     prior_sigma: FloatArray
+    contested: bool = False
 
     @classmethod
     def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "Problem":
@@ -144,7 +156,7 @@ class Problem:
     @property
     def counted(self) -> IntArray:
         """What is open and counts in the covariance, whether it is free or not."""
-        if self.scene.estimated:
+        if self.scene.estimated or self.contested:
             return np.union1d(self.lens, self.scale)
         stated = self.scene.matrix_sigma_px is not None
         return np.union1d(self.lens[:4] if stated else self.lens[:0], self.scale)
@@ -242,7 +254,7 @@ def _known_beforehand(
 ) -> Free:
     """What the corners and the priors say of the free values."""
     columns = np.union1d(moving, problem.counted)
-    weight = 1.0 / max(sigma_px, 1e-6) ** 2
+    weight = 1.0 / floored_sigma_px(sigma_px) ** 2
     prior = 1.0 / problem.prior_sigma[columns] ** 2
     away = (appearance.values - problem.stated.values)[columns]
     information = weight * compressed.shared_information[np.ix_(columns, columns)] + np.diag(prior)
@@ -263,7 +275,7 @@ def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
         problem.scene.mount,
         arm.robot,
         seen.compressed.cam_from_target,
-        max(seen.sigma_px, 1e-6) ** 2 * covariance(seen.compressed.information),
+        floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
         free.shared(seen.compressed.by_shared[:, :, free.columns]),
     )
     if arm.errors is not None:
@@ -273,15 +285,27 @@ def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
 
 @dataclass(frozen=True)
 class MeasuredScale:
-    """What the chain alone says of the board's scale, as if no size had been stated."""
+    """What the chain alone says of the board's scale, as if no size had been stated.
+
+    Attributes:
+        scale: By which share the board is larger than stated.
+        sigma: Its standard deviation.
+        stated_sigma: What the stated size is known to.
+    """
 
     scale: float
     sigma: float
+    stated_sigma: float
 
     @property
     def is_another(self) -> bool:
-        """Whether it differs from the stated one by more than chance."""
-        return (self.scale / self.sigma) ** 2 > chance_limit(1)
+        """Whether it differs from the stated one by more than its own uncertainty explains."""
+        return abs(self.scale) > _CONTRADICTION * self.sigma
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it differs by more than both uncertainties explain."""
+        return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
 def measured_scale(problem: Problem, arm: Arm, state: State) -> MeasuredScale:
@@ -293,7 +317,31 @@ def measured_scale(problem: Problem, arm: Arm, state: State) -> MeasuredScale:
     spread = covariance(information)
     at = 12 + int(np.searchsorted(state.seen.free.columns, problem.scale[0]))
     now = state.seen.free.after(state.fit.edges.shared).board[SCALE]
-    return MeasuredScale(now - float(spread[at] @ gradient), float(np.sqrt(spread[at, at])))
+    return MeasuredScale(
+        now - float(spread[at] @ gradient),
+        float(np.sqrt(spread[at, at])),
+        float(board_prior(problem.scene.target, problem.positions)[SCALE]),
+    )
+
+
+def moved_surprise(problem: Problem, state: State, places: IntArray) -> float:
+    """Squared distance of some values from the stated ones, in units of their covariance.
+
+    Args:
+        problem: The corners.
+        state: A fit that moves these values among others.
+        places: (k,) where they stand among the values.
+    """
+    spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])
+    at = 12 + np.searchsorted(state.seen.free.columns, places)
+    away = (state.again().appearance.values - problem.stated.values)[places]
+    return float(away @ np.linalg.solve(spread[np.ix_(at, at)], away))
+
+
+def contradicted_lens(problem: Problem, state: State) -> bool:
+    """Whether given intrinsics are farther off than what they are known to explains."""
+    away = state.again().appearance.values - problem.stated.values
+    return bool(np.any(np.abs(away)[problem.lens] > _CONTRADICTION * _lens_prior(problem.scene)))
 
 
 def chance_limit(freedom: int) -> float:

@@ -8,7 +8,10 @@ from functools import cache
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
+
+# Share of the noise's variance under which a fit has taken all of it.
+_VANISHED = 1e-6
 
 
 @contextmanager
@@ -83,6 +86,30 @@ def damped_step(
     added = damping * np.maximum(diagonal, np.finfo(float).tiny) + np.finfo(float).tiny
     matrix = information + added[..., :, None] * np.eye(information.shape[-1])
     return np.asarray(-np.linalg.solve(matrix, gradient[..., None])[..., 0])
+
+
+def squared_lengths(
+    residuals: FloatArray, left: FloatArray, spread: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Squared lengths of residuals in units of a covariance, where that has not vanished.
+
+    A residual that alone determines a direction is zero there, and has no variance either.
+
+    Args:
+        residuals: (m, d) residuals.
+        left: (m, d, d) their covariances: those of the noise, less what a fit has taken.
+        spread: (m, d, d) covariances of the noise.
+
+    Returns:
+        (m,) squared lengths, and (m,) in how many directions they were measured.
+    """
+    root = np.linalg.cholesky(spread)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ left @ np.swapaxes(inverse, 1, 2))
+    white = (np.swapaxes(vectors, 1, 2) @ inverse @ residuals[:, :, None])[:, :, 0]
+    counts = values > _VANISHED
+    squares = np.where(counts, white**2 / np.where(counts, values, 1.0), 0.0)
+    return np.asarray(squares.sum(axis=1)), np.asarray(counts.sum(axis=1))
 
 
 def _scale(information: FloatArray) -> FloatArray:

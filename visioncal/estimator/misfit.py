@@ -41,7 +41,8 @@ class Drift:
     """A steady motion of base or target over the session.
 
     Attributes:
-        moved_m: How far the target moved from the first stop to the last, where it is [m].
+        moved_m: How far a target at rest moved from the first stop to the last, where it is on
+            average [m].
         moved_rad: How far it turned [rad].
     """
 
@@ -58,7 +59,7 @@ def neighbours(data: Closure, edges: Edges, noise: Noise) -> Neighbours:
 
     Args:
         data: The views, one a stop, in the order of the session.
-        edges: The answer.
+        edges: Where the whitened residuals are least: elsewhere their slope passes for a misfit.
         noise: Of the flange.
     """
     residuals, jacobian, spread = residual_blocks(data, edges, noise)
@@ -86,7 +87,7 @@ def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
 
     Args:
         data: The views, one a stop, in the order of the session.
-        edges: The answer.
+        edges: Where the whitened residuals are least.
         noise: Of the flange.
 
     Returns:
@@ -109,8 +110,8 @@ def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
     if -gradient @ step < chi2.ppf(1.0 - _FALSE_ALARM, 6):
         return None
     base = step[size:]
-    place = flange[:, :3, 3].mean(axis=0)
-    moved = base[3:] + np.cross(base[:3], place)
+    target = edges.z if data.mount == "eye-in-hand" else (flange @ edges.z).mean(axis=0)
+    moved = base[3:] + np.cross(base[:3], target[:3, 3])
     return Drift(float(np.linalg.norm(moved)), float(np.linalg.norm(base[:3])))
 
 

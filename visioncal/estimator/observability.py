@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DegenerateError
 from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimator.linalg import Spectrum, covariance, spectrum
+from visioncal.figures import figure
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, Mount
 
@@ -43,7 +44,7 @@ class Direction:
     def figure(self) -> str:
         """The sigma and its limit with their unit."""
         unit, scale = ("deg", np.rad2deg(1.0)) if self.is_rotation else ("mm", 1e3)
-        return f"{self.sigma * scale:.2g} {unit} (limit {self.limit * scale:.2g})"
+        return f"{figure(self.sigma * scale)} {unit} (limit {figure(self.limit * scale)})"
 
 
 def edge_names(mount: Mount) -> tuple[str, str]:
@@ -53,8 +54,8 @@ def edge_names(mount: Mount) -> tuple[str, str]:
     return "base_from_cam", "flange_from_target"
 
 
-def check_observability(data: Closure, edges: Edges, noise: Noise) -> tuple[Direction, ...]:
-    """Refuses motion that leaves a direction open; otherwise tells the worst ones.
+def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 0) -> None:
+    """Refuses motion that leaves a direction open.
 
     Views that disagree wildly are no fault of the motion: poses in other units, of other images or
     through a wrong lens leave residuals that no motion could average out. The motion is judged by a
@@ -64,15 +65,12 @@ def check_observability(data: Closure, edges: Edges, noise: Noise) -> tuple[Dire
         data: The used views.
         edges: The answer.
         noise: Of the residuals.
-
-    Returns:
-        The worst direction of each edge: x's offset and rotation, then z's.
+        looks: How many of the unknowns that the views share are of lens and board; they come first.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    if len(data) < FEWEST_VIEWS:
-        raise _too_few(data)
+    refuse_too_few(data)
     held, still = replace(data, shared=None), replace(edges, shared=np.zeros(0))
     spread = spectrum(closure_information(held, still, noise))
     if spread.ratio < _NULL_RATIO:
@@ -86,12 +84,15 @@ def check_observability(data: Closure, edges: Edges, noise: Noise) -> tuple[Dire
         )
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
     _refuse(worst_directions(held, still, plausible), _motion(data), _advice(data.mount))
-    _refuse(
-        worst_directions(data, edges, plausible),
-        "the views do not determine the lens well enough",
-        "Give matrix and distortion in [camera], or add views tilted by 30 to 45 degrees.",
-    )
-    return worst_directions(data, edges, noise)
+    if looks:
+        _refuse(
+            worst_directions(
+                data.with_first(looks), replace(edges, shared=edges.shared[:looks]), plausible
+            ),
+            "the views do not determine lens and board well enough",
+            "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
+            "views tilted by 30 to 45 degrees.",
+        )
 
 
 def _refuse(worst: Sequence[Direction], cause: str, next_step: str) -> None:
@@ -105,8 +106,18 @@ def _refuse(worst: Sequence[Direction], cause: str, next_step: str) -> None:
 
 
 def worst_directions(data: Closure, edges: Edges, noise: Noise) -> tuple[Direction, ...]:
-    """The worst direction of each edge, first x's and then z's, offset before rotation."""
-    spread = covariance(closure_information(data, edges, noise))
+    """The worst directions of a fit; see `directions`."""
+    return directions(covariance(closure_information(data, edges, noise)), edges, data.mount)
+
+
+def directions(spread: FloatArray, edges: Edges, mount: Mount) -> tuple[Direction, ...]:
+    """The worst direction of each edge, first x's and then z's, offset before rotation.
+
+    Args:
+        spread: (12 + k, 12 + k) covariance of x, z and others.
+        edges: The answer.
+        mount: Where the camera is.
+    """
     found = []
     for edge, transform in enumerate((edges.x, edges.z)):
         for is_rotation in (False, True):
@@ -114,20 +125,34 @@ def worst_directions(data: Closure, edges: Edges, noise: Noise) -> tuple[Directi
             block = spread[start : start + 3, start : start + 3]
             values, vectors = np.linalg.eigh(block)
             limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
-            words = _words(edge, transform[:3, :3] @ vectors[:, -1], data.mount, is_rotation)
+            words = _words(edge, transform[:3, :3] @ vectors[:, -1], mount, is_rotation)
             found.append(Direction(words, float(np.sqrt(values[-1])), float(limit), is_rotation))
     return tuple(found)
 
 
-def _too_few(data: Closure) -> DegenerateError:
+def refuse_too_few(data: Closure, views: int = 1) -> None:
+    """Refuses stops that cannot tell anything, however they lie.
+
+    Args:
+        data: The used views, one a stop.
+        views: How many they were before those of one stop became one.
+
+    Raises:
+        DegenerateError: There are fewer than three.
+    """
+    if len(data) >= FEWEST_VIEWS:
+        return
     culprit = f"the camera's offset from the {_frame(data.mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
     if len(data) == 2:
-        culprit += f" along the {_frame(data.mount)}'s {_axis(_main_axis(_turns(data)))}"
+        culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data)))}"
         cause = f"two views share that axis of rotation, and {cause}"
-    return DegenerateError(
-        f"hand-eye: {len(data)} usable stops of the robot, at least {FEWEST_VIEWS} are needed; "
-        f"{culprit} is not determined: {cause}.",
+    stops = f"{len(data)} usable stops of the robot"
+    if len(data) == 1 < views:
+        stops = f"all {views} used views are from one pose of the robot"
+    raise DegenerateError(
+        f"hand-eye: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not determined: "
+        f"{cause}.",
         culprits=[culprit],
         next_step=_advice(data.mount),
     )
@@ -167,7 +192,7 @@ def _words(edge: int, direction: FloatArray, mount: Mount, is_rotation: bool) ->
     """Says which component of which edge a direction in the edge's parent frame is."""
     thing, frame = _names(edge, mount)
     quantity = "rotation about" if is_rotation else "offset along"
-    return f"the {thing}'s {quantity} the {frame}'s {_axis(direction)}"
+    return f"the {thing}'s {quantity} the {frame}'s {axis_words(direction)}"
 
 
 def _names(edge: int, mount: Mount) -> tuple[str, str]:
@@ -177,7 +202,8 @@ def _names(edge: int, mount: Mount) -> tuple[str, str]:
     return "target", "base" if mount == "eye-in-hand" else "tool"
 
 
-def _axis(direction: FloatArray) -> str:
+def axis_words(direction: FloatArray) -> str:
+    """Names a direction (3,): `x`, or `direction (0.71, 0.71, 0.00)`."""
     at = int(np.argmax(np.abs(direction)))
     if abs(direction[at]) > _NEARLY_AXIS:
         return "xyz"[at]
@@ -219,8 +245,8 @@ def _motion(data: Closure) -> str:
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
     if aside < 0.1 * largest:
         return (
-            f"all {count} used views turn about the {_frame(data.mount)}'s {_axis(main)} to within "
-            f"{max(aside, 0.01):.2g} deg"
+            f"all {count} used views turn about the {_frame(data.mount)}'s {axis_words(main)} to "
+            f"within {max(aside, 0.01):.2g} deg"
         )
     return (
         f"the {count} used views turn by at most {largest:.2g} deg, and by {aside:.2g} deg "

@@ -1,8 +1,10 @@
 """Noise levels from residuals: restricted maximum likelihood of variance components."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from visioncal.estimator.linalg import covariance
 from visioncal.types import FloatArray, Mask
@@ -13,6 +15,9 @@ _ITERATIONS = 60
 # A step changes a sigma by a factor of e at most; 1e-4 of it is far below its own uncertainty.
 _LONGEST_STEP, _SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
+# Twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square), and how far
+# it is followed, in logarithms.
+_SURPRISE_95, _WIDEST = 3.84, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +69,7 @@ def estimate_sigmas(
     components: Components,
     known: Knowledge,
     start: FloatArray,
-    prior: RatioPrior,
+    prior: RatioPrior | None = None,
     free: Mask | None = None,
 ) -> tuple[FloatArray, float]:
     """Estimates the standard deviations of variance components.
@@ -81,7 +86,7 @@ def estimate_sigmas(
         known: What is known of the parameters from elsewhere.
         start: (k,) sigmas to start from.
         prior: Of the first two sigmas' ratio: it decides where the residuals cannot, because one
-            kind of them can be fitted away altogether.
+            kind of them can be fitted away altogether. None where nothing is known of it.
         free: (k,) which sigmas to estimate; the others stay at their start. All where None.
 
     Returns:
@@ -111,6 +116,34 @@ def estimate_sigmas(
     return np.asarray(np.exp(logs), dtype=float), now.value
 
 
+def profile_interval(
+    profile: Callable[[float], float], sigma: float, lowest: float
+) -> tuple[float, float]:
+    """95 % interval of a standard deviation by its profile likelihood.
+
+    Args:
+        profile: The negative log-likelihood at a logarithm of the sigma.
+        sigma: The most likely one.
+        lowest: The negative log-likelihood there.
+
+    Returns:
+        Low and high: a low of zero where the residuals do not speak against no noise at all, and a
+        high of fifty times the sigma where they do not speak against that.
+    """
+    middle = float(np.log(max(sigma, LEAST_SIGMA)))
+
+    def surprise(logarithm: float) -> float:
+        return 2.0 * (profile(logarithm) - lowest) - _SURPRISE_95
+
+    def crossing(end: float, beyond: float) -> float:
+        if surprise(end) <= 0.0:
+            return beyond
+        return float(np.exp(brentq(surprise, middle, end, xtol=0.02)))
+
+    low, high = middle - _WIDEST, middle + _WIDEST
+    return crossing(low, 0.0), crossing(high, float(np.exp(high)))
+
+
 @dataclass(frozen=True, eq=False)
 class _Likelihood:
     """Negative log-likelihood at some logarithms of the sigmas, its slope and its curvature."""
@@ -126,7 +159,7 @@ def _likelihood(
     components: Components,
     known: Knowledge,
     logs: FloatArray,
-    prior: RatioPrior,
+    prior: RatioPrior | None,
 ) -> _Likelihood:
     sigmas = np.exp(logs)
     total = components.total(sigmas)
@@ -158,7 +191,8 @@ def _likelihood(
         - 2 * np.einsum("rj,kljr->kl", spread, both)
         + np.einsum("kij,lji->kl", shrunk, shrunk)
     )
-
+    if prior is None:
+        return _Likelihood(value, slope, curvature)
     offset = (logs[1] - logs[0] - np.log(prior.ratio)) / prior.spread
     lean = np.zeros(len(logs))
     lean[:2] = np.array([-1.0, 1.0]) / prior.spread

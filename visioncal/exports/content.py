@@ -1,22 +1,22 @@
-"""What is exported of a calibration: one transform with its frames, the lens, and their worth."""
+"""What is asked for of a result, and what a format then writes."""
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
-from visioncal.calibration import Calibration, CameraResult, Edge, VerdictStatus
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean
-from visioncal.transforms import adjoint, invert
+from visioncal.calibration import CameraResult, Edge, Verdict
 from visioncal.types import FloatArray, Mount
 
-# Such a name needs no quotes in YAML, XML, Python or a shell, and is no option of a command.
-_FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
 
-# The camera's transform.
-HAND_EYE: Mapping[Mount, str] = {"eye-in-hand": "flange_from_cam", "eye-to-hand": "base_from_cam"}
+@dataclass(frozen=True)
+class Load:
+    """What a tool weighs, which no calibration tells.
+
+    Attributes:
+        mass_kg: Its mass.
+        centre_mm: Where its centre of mass is in the flange's frame.
+    """
+
+    mass_kg: float
+    centre_mm: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,21 @@ class Selection:
     """What to export; what is None is left to the format.
 
     Attributes:
-        edge: A transform of the calibration by name; None for the camera's.
+        edge: A transform by name; None for the camera's, or in a format of tools or fixtures for
+            the only one of its kind.
         inverse: Whether its inverse is wanted.
         parent: What to call the frame in which the pose is given.
         child: What to call the frame whose pose it is; the camera, in a format of lenses.
+        number: Which of the controller's tools or bases it becomes.
+        load: What the tool weighs.
     """
 
     edge: str | None = None
     inverse: bool = False
     parent: str | None = None
     child: str | None = None
+    number: int | None = None
+    load: Load | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +46,19 @@ class Content:
     """What a format writes.
 
     Attributes:
-        name: Which transform of the calibration it is.
+        name: Which transform of the result it is.
         edge: `parent_from_child`: its translation and rotation are the child's pose in the parent.
         parent: Name of the parent's frame, as its readers know it.
         child: Name of the child's frame likewise.
         frames: Our own names of parent and child.
-        mount: How the camera is mounted.
-        lens: The camera, where the calibration has one.
+        mount: How the camera is mounted; None for a frame that belongs to no calibration.
+        lens: The camera, where there is one.
         origin: Where the result comes from, in one line.
-        verdict: Whether the calibration can be trusted.
+        verdict: Whether it can be trusted.
+        rotation_of: Our name of the frame whose rotation was taken over unmeasured; None where
+            the rotation was measured.
+        number: Which of the controller's tools or bases it becomes, where that was said.
+        load: What the tool weighs, where that was said.
     """
 
     name: str
@@ -57,10 +66,13 @@ class Content:
     parent: str
     child: str
     frames: tuple[str, str]
-    mount: Mount
+    mount: Mount | None
     lens: CameraResult | None
     origin: str
-    verdict: VerdictStatus
+    verdict: Verdict
+    rotation_of: str | None = None
+    number: int | None = None
+    load: Load | None = None
 
     @property
     def matrix(self) -> FloatArray:
@@ -70,81 +82,17 @@ class Content:
     @property
     def worth(self) -> str:
         """The verdict and the sigma of the transform, in one line."""
-        edge = self.edge
-        return f"verdict {self.verdict}; sigma {edge.sigma_mm:.2g} mm and {edge.sigma_deg:.2g} deg"
+        position = f"verdict {self.verdict.status}; sigma {self.edge.sigma_mm:.2g} mm"
+        if self.rotation_of is None:
+            return f"{position} and {self.edge.sigma_deg:.2g} deg"
+        return f"{position}; rotation taken from the {self.rotation_of}, not measured"
 
     @property
     def direction(self) -> str:
         """What the transform does, in one line."""
         return f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t"
 
-
-def select(calibration: Calibration, selection: Selection, names: Mapping[str, str]) -> Content:
-    """Picks what is to be exported.
-
-    Args:
-        calibration: The result.
-        selection: What is asked for.
-        names: What the format calls our frames, by our names.
-
-    Raises:
-        DataError: There is no such transform, or a frame's name cannot be written safely.
-    """
-    name = HAND_EYE[calibration.mount] if selection.edge is None else selection.edge
-    edge, frames = _edge(calibration, name)
-    if selection.inverse:
-        edge, frames = _inverted(edge), (frames[1], frames[0])
-        name = f"inverse of {name}"
-    parent, child = (
-        _frame(names.get(frame, frame) if chosen is None else chosen)
-        for frame, chosen in zip(frames, (selection.parent, selection.child), strict=True)
-    )
-    if parent == child:
-        raise DataError(
-            f"parent and child are both named {parent!r}, but a transform joins two frames.",
-            culprits=[parent],
-            next_step="Give them different names with --parent and --child.",
-        )
-    return Content(
-        name,
-        edge,
-        parent,
-        child,
-        frames,
-        calibration.mount,
-        calibration.camera,
-        f"calibrated by visioncal from {calibration.session_name!r}, {calibration.created}",
-        calibration.verdict.status,
-    )
-
-
-def _edge(calibration: Calibration, name: str) -> tuple[Edge, tuple[str, str]]:
-    parent, _, child = name.partition("_from_")
-    if name in calibration.edges and parent and child:
-        return calibration.edges[name], (parent, child)
-    turned = f"{child}_from_{parent}"
-    hint = did_you_mean(name, calibration.edges)
-    if turned in calibration.edges:
-        hint = f"Ask for --edge {turned} --inverse."
-    raise DataError(
-        f"There is no transform {name!r}; this calibration has {', '.join(calibration.edges)}.",
-        culprits=[name],
-        next_step=hint,
-    )
-
-
-def _inverted(edge: Edge) -> Edge:
-    # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
-    carried = adjoint(edge.matrix)
-    return Edge(invert(edge.matrix), np.asarray(carried @ edge.covariance @ carried.T))
-
-
-def _frame(name: str) -> str:
-    if _FRAME.fullmatch(name):
-        return name
-    raise DataError(
-        f"{name!r} cannot be a frame's name: letters, digits and _ / - . are needed, the first a "
-        "letter, a digit or _.",
-        culprits=[name],
-        next_step="Choose other names with --parent and --child.",
-    )
+    @property
+    def notes(self) -> list[str]:
+        """Lines for a comment: where it comes from, its worth, and what it does."""
+        return [self.origin, self.worth, self.direction]

@@ -6,8 +6,15 @@ from typing import Literal, TypeAlias
 
 from visioncal.exports.content import Content
 
-# Any transform of the calibration; the camera's alone, in its own direction; or the lens alone.
-Holds: TypeAlias = Literal["any edge", "hand-eye", "lens"]
+# Any transform; the camera's alone, in its own direction; the lens alone; where something sits on
+# the flange; or where something stands in the base.
+Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
+# What of a selection a format has a use for, beside the transform and its frames' names.
+Takes: TypeAlias = Literal["number", "load"]
+
+
+def _nothing_amiss(_: Content) -> str:
+    return ""
 
 
 @dataclass(frozen=True)
@@ -18,8 +25,11 @@ class ExportFormat:
         name: As the command line has it.
         words: What it is and who reads it, with its units, in one line.
         write: Builds the document.
-        holds: What of a calibration it can hold.
+        holds: What of a result it can hold.
         frames: What its readers call our frames; ours keep their names where it says nothing.
+        takes: What it can be told beside.
+        counterpart: The maker's format of fixtures, for one of tools; and the other way round.
+        warn: Words what the user must still do before the document serves; empty for nothing.
     """
 
     name: str
@@ -27,3 +37,6 @@ class ExportFormat:
     write: Callable[[Content], str]
     holds: Holds = "any edge"
     frames: Mapping[str, str] = field(default_factory=dict)
+    takes: frozenset[Takes] = frozenset()
+    counterpart: str = ""
+    warn: Callable[[Content], str] = _nothing_amiss

@@ -24,6 +24,8 @@ _MEANINGS: Mapping[str, str] = {
     "reported without a tool",
     "cam": "the camera's optical frame: z forward, x right, y down",
     "target": "the frame of the printed target",
+    "tool": "the tool's frame: its origin is the tool's centre point",
+    "fixture": "the fixture's own frame",
 }
 
 
@@ -31,4 +33,4 @@ def ros_notes(content: Content) -> list[str]:
     """Says in lines for a comment what the transform is, its worth, and what its frames are."""
     names = zip((content.parent, content.child), content.frames, strict=True)
     meanings = [f"{name}: {_MEANINGS[own]}" for name, own in names if own in _MEANINGS]
-    return [content.origin, content.worth, content.direction, *meanings]
+    return [*content.notes, *meanings]

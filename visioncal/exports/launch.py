@@ -53,8 +53,9 @@ def _write_moveit(content: Content) -> str:
     The Euler angles that it adds in a comment are left out: its order is not the one that the
     publisher's --roll, --pitch and --yaw have.
     """
-    mount = f'""" {content.mount.upper()}: {content.parent} -> {content.child} """\n'
-    return mount + comments("#", ros_notes(content)) + _program(content)
+    mount = "" if content.mount is None else f"{content.mount.upper()}: "
+    first = f'""" {mount}{content.parent} -> {content.child} """\n'
+    return first + comments("#", ros_notes(content)) + _program(content)
 
 
 ROS_LAUNCH = ExportFormat(

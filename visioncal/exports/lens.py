@@ -35,7 +35,7 @@ def _camera_of(content: Content) -> Camera:
 def _notes(content: Content) -> list[str]:
     estimated = content.lens is not None and content.lens.estimated
     how = "estimated from the session's images" if estimated else "as the session gave it"
-    return [content.origin, f"verdict {content.verdict}; the lens is {how}"]
+    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}"]
 
 
 def _array(matrix: FloatArray) -> dict[str, int | list[float]]:

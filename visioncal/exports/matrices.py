@@ -12,7 +12,7 @@ from visioncal.types import FloatArray
 
 def _write_text(content: Content) -> str:
     lines = [" ".join(map(repr, row)) for row in rows(content.matrix)]
-    notes = comments("#", [content.origin, content.worth, content.direction])
+    notes = comments("#", content.notes)
     return notes + "\n".join(lines) + "\n"
 
 
@@ -22,7 +22,7 @@ def _write_opencv(content: Content) -> str:
     The lens goes under the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
     """
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    for line in (content.origin, content.worth, content.direction):
+    for line in content.notes:
         storage.writeComment(one_line(line), append=False)
     storage.write("parent", content.parent)
     storage.write("child", content.child)

@@ -1,14 +1,19 @@
-"""The formats that are known, and the way from a calibration to a document."""
+"""The formats that are known, and the way from a result to a document."""
 
-from visioncal.calibration import Calibration
+from dataclasses import dataclass
+
 from visioncal.errors import DataError
-from visioncal.exports.content import HAND_EYE, Selection, select
+from visioncal.exports.choosing import select
+from visioncal.exports.content import Content, Selection
+from visioncal.exports.controllers import CONTROLLERS
 from visioncal.exports.format import ExportFormat
 from visioncal.exports.launch import MOVEIT, ROS_LAUNCH
 from visioncal.exports.lens import CAMERA_INFO, KALIBR
 from visioncal.exports.matrices import OPENCV, TEXT, ZIVID
+from visioncal.exports.programs import PROGRAMS
 from visioncal.exports.robots import ROBOTS
 from visioncal.exports.ros import EASY_HANDEYE2, ROS
+from visioncal.exports.sources import Source
 from visioncal.exports.urdf import URDF
 from visioncal.files import did_you_mean
 
@@ -24,15 +29,30 @@ EXPORT_FORMATS: tuple[ExportFormat, ...] = (
     ZIVID,
     TEXT,
     *ROBOTS,
+    *CONTROLLERS,
+    *PROGRAMS,
 )
 _EVERYTHING = Selection()
 
 
-def export(calibration: Calibration, to: str, selection: Selection = _EVERYTHING) -> str:
+@dataclass(frozen=True)
+class Document:
+    """A result in somebody else's format.
+
+    Attributes:
+        text: The document.
+        warnings: What its user should know before it is used, each in plain words.
+    """
+
+    text: str
+    warnings: tuple[str, ...]
+
+
+def export(source: Source, to: str, selection: Selection = _EVERYTHING) -> str:
     """Writes a result in somebody else's format.
 
     Args:
-        calibration: The result.
+        source: A calibration, or frames alone.
         to: The name of a format among `EXPORT_FORMATS`.
         selection: Which transform, in which direction, and what its frames are to be called.
 
@@ -41,11 +61,27 @@ def export(calibration: Calibration, to: str, selection: Selection = _EVERYTHING
 
     Raises:
         DataError: There is no such format or transform, the format cannot hold what is asked for,
-            or a frame's name cannot be written safely.
+            or a name cannot be written safely.
+    """
+    return document(source, to, selection).text
+
+
+def document(source: Source, to: str, selection: Selection = _EVERYTHING) -> Document:
+    """Writes a result as `export` does, with what is to be warned of.
+
+    Raises:
+        DataError: As `export` has it.
     """
     form = _find(to)
-    _check_holds(form, selection)
-    return form.write(select(calibration, selection, form.frames))
+    content = select(source, selection, form)
+    warnings = (_of_verdict(content), form.warn(content))
+    return Document(form.write(content), tuple(it for it in warnings if it))
+
+
+def _of_verdict(content: Content) -> str:
+    if content.verdict.status != "bad":
+        return ""
+    return f"the verdict on this result is bad. {' '.join(content.verdict.reasons)}"
 
 
 def _find(name: str) -> ExportFormat:
@@ -58,22 +94,3 @@ def _find(name: str) -> ExportFormat:
         culprits=[name],
         next_step=f"{hint} visioncal export --list says what each is.".strip(),
     )
-
-
-def _check_holds(form: ExportFormat, selection: Selection) -> None:
-    if form.holds == "lens" and (
-        selection.inverse or selection.edge is not None or selection.parent is not None
-    ):
-        raise DataError(
-            f"{form.name} holds the lens and no transform: --edge, --inverse and --parent do not "
-            "go with it.",
-            culprits=[form.name],
-            next_step="Leave them out; --child names the camera.",
-        )
-    hand_eye = selection.edge in (None, *HAND_EYE.values())
-    if form.holds == "hand-eye" and (selection.inverse or not hand_eye):
-        raise DataError(
-            f"{form.name} holds the camera's pose on the flange or in the base, and nothing else.",
-            culprits=[form.name],
-            next_step="Leave --edge and --inverse out, or choose --to ros.",
-        )

@@ -10,6 +10,7 @@ from visioncal.conventions import POSE_FORMS, PoseForm, write_pose
 from visioncal.exports.content import Content
 from visioncal.exports.format import ExportFormat
 from visioncal.exports.writing import comments, fixed
+from visioncal.types import FloatArray
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}
@@ -17,12 +18,17 @@ _ROTATION_DECIMALS = {"rotation-vector": 10, "quaternion-wxyz": 10}
 _DEGREE_DECIMALS = 8
 
 
-def _labelled(labels: str) -> Callable[[list[str]], str]:
-    names = labels.split()
-    return lambda it: ",".join(f"{a} {b}" for a, b in zip(names, it, strict=True))
+def ur_pose(it: list[str]) -> str:
+    """Writes URScript's pose (Universal Robots, script manual)."""
+    return f"p[{', '.join(it)}]"
 
 
-def _abb(it: list[str]) -> str:
+def kuka_frame(it: list[str]) -> str:
+    """Writes KRL's FRAME (KUKA, system variables)."""
+    return "{" + ",".join(f"{a} {b}" for a, b in zip("XYZABC", it, strict=True)) + "}"
+
+
+def abb_pose(it: list[str]) -> str:
     """Writes RAPID's `pose`: trans of type pos, rot of type orient (RAPID reference manual)."""
     return f"[[{','.join(it[:3])}],[{','.join(it[3:])}]]"
 
@@ -33,13 +39,17 @@ def _fanuc(it: list[str]) -> str:
     return f"X = {x} mm, Y = {y} mm, Z = {z} mm,\nW = {w} deg, P = {p} deg, R = {r} deg"
 
 
-def _write(form: PoseForm, mark: str, shape: Callable[[list[str]], str], content: Content) -> str:
+def pose_texts(matrix: FloatArray, form: PoseForm) -> list[str]:
+    """Writes the numbers of a (4, 4) pose [m] as a controller reads them."""
     decimals = _ROTATION_DECIMALS.get(form.rotation, _DEGREE_DECIMALS)
-    pose = write_pose(content.matrix, form)
+    pose = write_pose(matrix, form)
     texts = [fixed(it, _DECIMALS[form.unit]) for it in pose[:3]]
-    texts += [fixed(it, decimals) for it in pose[3:]]
-    notes = [content.origin, content.worth, content.direction]
-    return (comments(mark, notes) if mark else "") + shape(texts) + "\n"
+    return texts + [fixed(it, decimals) for it in pose[3:]]
+
+
+def _write(form: PoseForm, mark: str, shape: Callable[[list[str]], str], content: Content) -> str:
+    notes = comments(mark, content.notes) if mark else ""
+    return notes + shape(pose_texts(content.matrix, form)) + "\n"
 
 
 def _robot(name: str, words: str, mark: str, shape: Callable[[list[str]], str]) -> ExportFormat:
@@ -51,16 +61,18 @@ UR = _robot(
     "ur",
     "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]",
     "#",
-    lambda it: f"p[{', '.join(it)}]",
+    ur_pose,
 )
 KUKA = _robot(
     "kuka",
     "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]",
     ";",
-    lambda it: f"{{{_labelled('X Y Z A B C')(it)}}}",
+    kuka_frame,
 )
 FANUC = _robot("fanuc", "FANUC: X, Y, Z, W, P, R as in an .LS program [mm, deg]", "", _fanuc)
-ABB = _robot("abb", "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]", "!", _abb)
+ABB = _robot(
+    "abb", "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]", "!", abb_pose
+)
 STAUBLI = _robot(
     "staubli",
     "Staubli VAL 3 trsf: {x, y, z, rx, ry, rz} [mm, deg]",

@@ -55,6 +55,7 @@ class Known:
         verdict: Whether to trust it all.
         reasons: Why a view cannot be used, by view.
         warnings: What the user should know, in sentences.
+        notes: What is good to know and no reason for doubt.
     """
 
     session: Session
@@ -80,6 +81,7 @@ class Known:
     verdict: Verdict | None = None
     reasons: Mapping[int, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[str] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
@@ -95,20 +97,24 @@ class Known:
 
     def seeing(self, refined: Refined) -> Self:
         """Takes over lens, board and poses, and makes the poses of all other views anew."""
-        made = {it.view: it for it in refined.views}
-        rest = [
-            pose
-            for view, pose in self.poses.items()
-            if view not in made and pose.corners is not None and len(pose.cam_from_target) == 1
-        ]
-        made |= {it.view: it for it in remade(rest, refined.free, refined.sigma_px)}
-        return replace(
-            self,
-            free=refined.free,
-            poses={**self.poses, **made},
-            pixel_px=refined.sigma_px,
-            arm=refined.arm,
+        seen = {it.view: it for it in refined.views}
+        known = replace(
+            self, free=refined.free, pixel_px=refined.sigma_px, arm=refined.arm, notes=refined.notes
         )
+        known = known.posed([it for view, it in self.poses.items() if view not in seen])
+        return replace(known, poses={**known.poses, **seen})
+
+    def posed(self, poses: Iterable[ViewPoses]) -> Self:
+        """Takes over poses, made anew by lens and board where their view has just one."""
+        given = {it.view: it for it in poses}
+        if self.free is not None and self.pixel_px is not None:
+            single = [
+                it
+                for it in given.values()
+                if it.corners is not None and len(it.cam_from_target) == 1
+            ]
+            given |= {it.view: it for it in remade(single, self.free, self.pixel_px)}
+        return replace(self, poses={**self.poses, **given})
 
     @property
     def scene(self) -> Scene | None:
@@ -162,9 +168,18 @@ class Known:
                 camera_covariance=np.array([pose.covariance[0] for pose in poses]),
                 shared=None if self.free is None else self.free.shared(np.array(shift)),
             )
-        if self.arm is not None and self.arm.of_links and poses:
+        if self.arm is not None and self.arm.is_estimated and poses:
             data = data.with_more(replace(self.arm, basis=self.arm_basis(views)).shared())
         return data
+
+    @property
+    def estimated_looks(self) -> int:
+        """How many unknowns of lens and board the views share, where they have to tell the lens.
+
+        They come before the arm's.
+        """
+        told = self.camera is not None and self.camera.estimated
+        return 0 if self.free is None or not told else len(self.free.columns)
 
     def arm_basis(self, views: Sequence[int]) -> FloatArray:
         """How errors of the arm move each view's flange: of its links where these are known."""

@@ -159,7 +159,7 @@ def _further(known: Known) -> dict[str, dict[str, Any]]:
             "sigma_mm": 1e3 * LEVER_M * known.arm.sigma,
             "sigma_deg": float(np.rad2deg(known.arm.sigma)),
             "likelihood_ratio": known.arm.gain,
-            "estimated": known.arm.of_links,
+            "estimated": known.arm.is_estimated,
         }
     if known.diagnosis is not None:
         documents["uncertainty"] = _uncertainty(known, known.diagnosis)
@@ -198,15 +198,27 @@ def _uncertainty(known: Known, diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _camera(known: Known) -> CameraResult | None:
-    """The camera as the whole chain left it."""
+    """The camera as the whole chain left it, with what is open about it.
+
+    Its covariance, the edges', and that of both together are blocks of one matrix: the joint fit's
+    with all that was added to it since, errors of the arm and inflation. Given intrinsics of which
+    only a part is open, the matrix and not the distortion, have zeros for the rest.
+    """
     result, free = known.solved, known.free
-    if known.camera is None or free is None or not free.lens_is_free:
+    if known.camera is None or free is None:
         return known.camera
-    lens = 12 + np.flatnonzero(free.columns < free.lens_count)
+    columns = free.columns[free.columns < free.lens_count]
+    if not len(columns):
+        return known.camera
+    rows = 12 + np.searchsorted(free.columns, columns)
+    spread, shared = np.zeros((free.lens_count,) * 2), np.zeros((free.lens_count, 12))
+    spread[np.ix_(columns, columns)] = result.covariance[np.ix_(rows, rows)]
+    shared[columns] = result.covariance[rows, :12]
     return CameraResult(
         free.after(result.edges.shared).camera,
-        estimated=True,
-        covariance=result.covariance[np.ix_(lens, lens)],
+        estimated=known.camera.estimated or free.lens_is_free,
+        covariance=spread,
+        edge_covariance=shared,
     )
 
 

@@ -13,6 +13,7 @@ from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.joint import Arm
+from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
@@ -55,6 +56,8 @@ def _read_robot(known: Known) -> Known:
     )
     warnings = (*known.session.warnings, *reported.warnings, *_not_used(known.session))
     known = known.noting(reported.rejections, warnings)
+    if len(known.held_back) == len(known.session.views):
+        raise _all_held_back(known)
     if not reported.base_from_flange:
         raise DataError(
             f"session {known.session.name!r}: no view has a pose of the robot.",
@@ -84,11 +87,11 @@ def _detect(known: Known) -> Known:
 
 def _intrinsics(known: Known) -> Known:
     session, target = known.session, known.session.target
-    if not known.corners or target is None or known.resolution is None:
+    fitted = {view: it for view, it in known.corners.items() if view not in known.held_back}
+    if not fitted or target is None or known.resolution is None:
         return known
     if session.camera is not None:
         return replace(known, camera=CameraResult(session.camera, estimated=False))
-    fitted = {view: it for view, it in known.corners.items() if view not in known.held_back}
     result = estimate_intrinsics(fitted, target, known.resolution, session.camera_model)
     camera = CameraResult(result.camera, estimated=True, covariance=result.covariance)
     return replace(known, camera=camera).noting(result.rejections, result.warnings)
@@ -112,7 +115,17 @@ def _pnp(known: Known) -> Known:
     return replace(known, poses=poses)
 
 
+def _all_held_back(known: Known) -> DataError:
+    return DataError(
+        f"session {known.session.name!r}: all views that could be used are held back (role = "
+        "holdout), and none is left to fit.",
+        next_step="Clear role in the rows that the fit may use.",
+    )
+
+
 def _nothing_seen(known: Known) -> DataError:
+    if known.corners and known.corners.keys() <= known.held_back:
+        return _all_held_back(known)
     if not any(view.image for view in known.session.views):
         return DataError(
             f"session {known.session.name!r}: there are neither images nor measured poses.",
@@ -153,12 +166,15 @@ def _look(known: Known) -> Known:
 
 
 def _agree(known: Known) -> Known:
-    agreed = agree(known.closure(known.used), known.used, known.stops)
-    poses = dict(known.poses)
-    for view in known.held_back & poses.keys() & known.base_from_flange.keys():
-        robot = known.closure([view]).robot[0]
-        poses[view] = choose_by(poses[view], robot, agreed.edges, known.session.target)
-    return replace(known, poses=poses, candidates=known.used).agreeing(agreed)
+    target = known.session.target
+    data = known.closure(known.used)
+    refuse_too_few(data.merged(known.stops), len(data))
+    agreed = agree(data, known.used, known.stops)
+    poses = [
+        choose_by(known.poses[view], known.closure([view]).robot[0], agreed.edges, target)
+        for view in known.held_back & known.poses.keys() & known.base_from_flange.keys()
+    ]
+    return replace(known.posed(poses), candidates=known.used).agreeing(agreed)
 
 
 def _refine(known: Known) -> Known:
@@ -192,7 +208,8 @@ def _arm(known: Known) -> Arm:
 
 def _hand_eye(known: Known) -> Known:
     data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
-    return replace(known, hand_eye=solve_hand_eye(data, known.solver, arm))
+    result = solve_hand_eye(data, known.solver, arm, known.estimated_looks)
+    return replace(known, hand_eye=result)
 
 
 def _arm_by_stop(known: Known) -> ArmErrors | None:
@@ -207,7 +224,9 @@ def _diagnose(known: Known) -> Known:
     target = known.session.target
     middle = np.zeros(3) if target is None else corner_positions(target).mean(axis=0)
     diagnosis = diagnose(data, result, known.free, _arm_by_stop(known), middle)
-    wider = replace(result, covariance=diagnosis.inflation * result.covariance)
+    spread = diagnosis.inflation * result.covariance
+    worst = directions(spread, result.edges, data.mount)
+    wider = replace(result, covariance=spread, worst=worst)
     known = replace(known, hand_eye=wider, diagnosis=diagnosis)
     return known.noting((), diagnosis.warnings)
 
@@ -240,6 +259,7 @@ def _judge(known: Known) -> Known:
         robot=known.robot_noise,
         diagnosis=diagnosis,
         warnings=known.warnings,
+        notes=known.notes,
     )
     return replace(known, findings=findings, verdict=judge(findings))
 

@@ -22,6 +22,7 @@ SOURCES = {
     "intrinsics": "what is open about the lens",
     "board": "what is open about the board",
     "arm": "errors of the arm's links",
+    "held_values": "values that are held and that the views would move",
     "misfit": "neighbouring stops that err alike",
 }
 

@@ -11,7 +11,7 @@ from visioncal.recording import colours, paths
 from visioncal.recording.findings import SOURCES, Arm, Board, Findings, Uncertainty
 from visioncal.transforms import pose_difference
 
-_HEADLINES = {"good": "Good", "check": "Check before use", "bad": "Bad: do not use"}
+HEADLINES = {"good": "Good", "check": "Check before use", "bad": "Bad: do not use"}
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
     paths.ORIENTATION_DEG: "residual_deg",
@@ -78,14 +78,23 @@ def log_view(stream: rr.RecordingStream, view: ViewResult, ends: Mapping[str, fl
 def verdict_markdown(calibration: Calibration) -> str:
     """The verdict with its reasons, the transforms, and the views that were left out."""
     verdict = calibration.verdict
-    lines = [f"# {_HEADLINES[verdict.status]}", ""]
+    lines = [f"# {HEADLINES[verdict.status]}", ""]
     lines += [f"- {plain(reason)}" for reason in verdict.reasons]
+    lines += [
+        f"- {plain(name)}: {HEADLINES[it.verdict.status]}, see Tools and fixtures."
+        for name, it in calibration.frames.items()
+        if it.verdict.status != "good"
+    ]
     lines += [
         "",
         "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
         "|---|---|---|---|",
     ]
-    lines += [_edge_line(name, edge) for name, edge in calibration.edges.items()]
+    lines += [f"| {plain(name)} {edge_line(it)}" for name, it in calibration.edges.items()]
+    lines += [
+        f"| {plain(name)} {edge_line(it.edge, oriented=it.oriented)}"
+        for name, it in calibration.frames.items()
+    ]
     known = Findings.of(calibration).uncertainty
     if known is not None:
         lines += ["", _work_line(known)]
@@ -96,18 +105,26 @@ def verdict_markdown(calibration: Calibration) -> str:
     return "\n".join(lines)
 
 
-def _edge_line(name: str, edge: Edge) -> str:
+def edge_line(edge: Edge, *, oriented: bool = True) -> str:
+    """A row of a table: position, rotation and sigma of a transform.
+
+    Args:
+        edge: The transform.
+        oriented: Whether its rotation was measured.
+    """
     position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
+    if not oriented:
+        return f"| {position} | not measured | {edge.sigma_mm:.2g} mm |"
     turn = ", ".join(f"{value:.3f}" for value in edge.transform.rotation.as_rotvec(degrees=True))
-    sigma = f"{edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg"
-    return f"| {plain(name)} | {position} | {turn} | {sigma} |"
+    return f"| {position} | {turn} | {edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg |"
 
 
 def _work_line(known: Uncertainty) -> str:
     largest = plain(next(iter(known.parts_mm)))
     return (
         f"Where the views look, a point is placed to {known.total_mm:.2g} mm (sigma; 95 % within "
-        f"{known.radius95_mm:.2g} mm); the largest part comes from the {largest}."
+        f"{known.radius95_mm:.2g} mm); the largest part comes from the "
+        f"{largest.replace('_', ' ')}."
     )
 
 

@@ -1,6 +1,7 @@
 """Where things are in a recording: the names of its entities, its frames and its timeline.
 
-The frames of the cell are rerun's named frames, all placed in the base frame.
+The frames of the cell are rerun's named frames, all placed in the base frame; tools alone are
+placed in the flange's, which takes them along.
 """
 
 TIMELINE = "view"
@@ -27,6 +28,7 @@ FLANGE = "/flange"
 STOPS = "/stops"
 CAMERA = "/camera"
 TARGET = "/target"
+FRAMES = "/frames"
 SEEN_TARGET = "/target_as_this_view_sees_it"
 
 # Charts over all views.
@@ -47,10 +49,16 @@ REPROJECTION_PX = f"{RESIDUALS}/reprojection_px"
 VERDICT = "/notes/verdict"
 FIGURES = "/notes/figures"
 SOLVERS = "/notes/solvers"
+TOOLS = "/notes/tools_and_fixtures"
 VIEW_NOTE = "/notes/view"
 USED, REJECTED, THIS_VIEW = "used", "rejected", "this_view"
 # Drawn where the scale ends, because it lies farther out.
 BEYOND = "rejected_beyond_the_scale"
+
+
+def entity_of(frame: str) -> str:
+    """The entity of a frame of the calibration: the camera's, the target's, a tool's."""
+    return {CAM_FRAME: CAMERA, TARGET_FRAME: TARGET}.get(frame, f"{FRAMES}/{frame}")
 
 
 def magnified_residuals(factor: int) -> str:

@@ -97,6 +97,7 @@ class Scene:
                 f"{paths.TARGET}/sheet", frame, board.sheet(self.session.target), static=True
             )
         self._log_mount(stream)
+        self._log_frames(stream, self.calibration)
         self._log_stops(stream)
         if self.uncertainty is not None:
             self.uncertainty.log_static(stream)
@@ -137,8 +138,21 @@ class Scene:
         axes = rr.TransformAxes3D(times * _AXIS * self.size_m, show_frame=True)
         stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
 
+    def _log_frames(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
+        """Draws tools, which the flange takes along, and fixtures, which stand in the base."""
+        for name, frame in calibration.frames.items():
+            parent, _, child = name.partition("_from_")
+            pose = rr.Transform3D(
+                translation=frame.edge.matrix[:3, 3],
+                mat3x3=frame.edge.matrix[:3, :3],
+                parent_frame=parent,
+                child_frame=child,
+            )
+            stream.log(paths.entity_of(child), pose, static=True)
+            self._log_axes(stream, paths.entity_of(child), child, 0.5)
+
     def _log_mount(self, stream: rr.RecordingStream) -> None:
-        """Draws the edge that hangs on the flange, as a line."""
+        """Draws the edges that hang on the flange, as lines."""
         edges = {} if self.calibration is None else self.calibration.transforms
         for name, edge in edges.items():
             if name.startswith("flange_from_"):

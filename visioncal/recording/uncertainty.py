@@ -17,15 +17,14 @@ from visioncal.recording import colours, paths
 from visioncal.transforms import invert, mean_transform
 from visioncal.types import FloatArray
 
-_SIGMAS = 2.0
+# Half axes of the ellipsoid that holds a point in 95 % of cases, in standard deviations: the root
+# of the chi-square distribution's quantile for three degrees of freedom.
+SIGMAS_95 = 2.795
 # How large the largest of them is drawn, as a share of the cell's size.
 _SHARE = 0.07
 # Placements beyond this are drawn here, as shares of the same: wrong views lie anywhere.
 _REACH = 0.2
 _POINT, _LINE = 0.005, 0.0015
-# What lies at the child's end of each edge, whose frame its covariance is given in.
-_ENTITIES = {"cam": paths.CAMERA, "target": paths.TARGET}
-_FRAMES = {"cam": paths.CAM_FRAME, "target": paths.TARGET_FRAME}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +32,7 @@ class Uncertainty:
     """What is drawn of the uncertainty.
 
     Attributes:
-        edges: The estimated edges by name.
+        edges: The edges that have a covariance, by name; tools and fixtures among them.
         scatter_m: By view, how far from the mean it puts the target: (3,) in the target's frame.
         used: The views that the fit used.
         factor: How many times larger than it is everything is drawn.
@@ -53,34 +52,16 @@ class Uncertainty:
         """Collects the placements and chooses the factor by the used views."""
         used = frozenset(view.view for view in calibration.views if view.used)
         scatter_m = _scatter_m(calibration, evidence, used)
-        sizes_m = [_SIGMAS * _axes(edge)[0].max() for edge in calibration.edges.values()]
+        edges = {name: it for name, it in calibration.placed.items() if it.covariance.any()}
+        sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
         factor = _round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
-        return cls(calibration.edges, scatter_m, used, factor, size_m)
+        return cls(edges, scatter_m, used, factor, size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Draws the ellipsoids, and all views' placements of the target."""
         for name, edge in self.edges.items():
-            child = name.rpartition("_from_")[2]
-            sigmas_m, axes = _axes(edge)
-            ellipsoid = rr.Ellipsoids3D(
-                half_sizes=[_SIGMAS * self.factor * sigmas_m],
-                quaternions=[Rotation.from_matrix(axes).as_quat()],
-                colors=colours.UNCERTAINTY,
-                line_radii=_LINE * self.size_m,
-            )
-            # Above the camera and beside the board, clear of the name of the frame.
-            label = rr.Points3D(
-                [[0.0, -1.2 * _SHARE * self.size_m, 0.0]],
-                radii=0.0,
-                colors=colours.UNCERTAINTY,
-                labels=f"{_SIGMAS:g} sigma, {self.factor} x",
-                show_labels=True,
-            )
-            frame = rr.CoordinateFrame(_FRAMES[child])
-            entity = f"{_ENTITIES[child]}/{name}_{_SIGMAS:g}_sigma_magnified_{self.factor}x"
-            stream.log(entity, frame, ellipsoid, static=True)
-            stream.log(f"{entity}/label", frame, label, static=True)
+            self._log_ellipsoid(stream, name, edge)
         for name, colour, wanted in (
             (paths.USED, colours.USED, True),
             (paths.REJECTED, colours.REJECTED, False),
@@ -89,6 +70,31 @@ class Uncertainty:
             if some:
                 self._log_scatter(stream, name, some, colour, static=True)
         self._log_beyond(stream)
+
+    def _log_ellipsoid(self, stream: rr.RecordingStream, name: str, edge: Edge) -> None:
+        child = name.rpartition("_from_")[2]
+        entity = f"{paths.entity_of(child)}/{name}_95_percent_magnified_{self.factor}x"
+        frame = rr.CoordinateFrame(child)
+        sigmas_m, axes = _axes(edge)
+        ellipsoid = rr.Ellipsoids3D(
+            half_sizes=[SIGMAS_95 * self.factor * sigmas_m],
+            quaternions=[Rotation.from_matrix(axes).as_quat()],
+            colors=colours.UNCERTAINTY,
+            line_radii=_LINE * self.size_m,
+        )
+        stream.log(entity, frame, ellipsoid, static=True)
+        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME):
+            # All are drawn alike, and tools are close to the camera: more labels would hide them.
+            return
+        # Above the camera and beside the board, clear of the name of the frame.
+        label = rr.Points3D(
+            [[0.0, -1.2 * _SHARE * self.size_m, 0.0]],
+            radii=0.0,
+            colors=colours.UNCERTAINTY,
+            labels=f"95 %, {self.factor} x",
+            show_labels=True,
+        )
+        stream.log(f"{entity}/label", frame, label, static=True)
 
     def log_view(self, stream: rr.RecordingStream, view: int) -> None:
         """Marks one view's placement of the target, at the stream's current time."""

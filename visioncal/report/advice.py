@@ -8,10 +8,10 @@ import numpy as np
 
 from visioncal.calibration import Calibration, ViewResult
 from visioncal.report.numbers import significant
+from visioncal.stages.judge import JudgeOptions
 
-# Views whose residual is this many times the median are named in a doubtful result. The verdict
-# itself takes more for a doubt; but wrong views that pull at a fit stand out less than one alone.
-_STANDS_OUT = 4.0
+# Views whose residual is this many times the median are named, as by the verdict.
+_STANDS_OUT = JudgeOptions.outlier
 # Sentences of a verdict that start so say what to do.
 _IMPERATIVE = re.compile("(Add|Check|Compare|Look|Measure|Move|Print|Record|Take|Use) ")
 # And one that starts so is about views that disagree.
@@ -99,8 +99,13 @@ def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str
     Returns:
         Sentences, the most pressing first.
     """
+    of_frames = [
+        f"Settle what is said of {name} under Tools and fixtures before it is used."
+        for name, frame in calibration.frames.items()
+        if frame.verdict.status != "good"
+    ]
     if calibration.verdict.status == "good":
-        return tuple(_when_good(calibration))
+        return (*_when_good(calibration), *of_frames)
     outlying = outlying_views(found)
     advice = list(
         dict.fromkeys(
@@ -130,7 +135,7 @@ def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str
             "use: does the pose belong to the image, and did anything move? Repeat them where the "
             "others leave gaps.",
         )
-    return tuple(advice) or ("Settle the points above, and calibrate again.",)
+    return (*(advice or ["Settle the points above, and calibrate again."]), *of_frames)
 
 
 def _when_good(calibration: Calibration) -> Iterator[str]:

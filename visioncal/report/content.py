@@ -7,7 +7,7 @@ from importlib import metadata
 
 import numpy as np
 
-from visioncal.calibration import Calibration, Edge, Rms, SolverResult, ViewResult
+from visioncal.calibration import Calibration, Edge, Rms, SolverResult, Verdict, ViewResult
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
 from visioncal.report.advice import Suspects, contradicts, outlying_views
@@ -44,7 +44,7 @@ class EdgeCard:
         name: Its name, such as `flange_from_cam`.
         meaning: What it is, in words.
         sigma_mm: Standard deviation of its translation [mm].
-        sigma_deg: Standard deviation of its rotation [deg].
+        sigma_deg: Standard deviation of its rotation [deg]; empty where that was not measured.
         rows: The components with their deviations and units.
         matrix: The 4x4 matrix, to be copied.
     """
@@ -96,62 +96,69 @@ class ResidualRow:
     px: str
 
 
-def headline(calibration: Calibration) -> str:
+def headline(verdict: Verdict) -> str:
     """The verdict in a few words."""
-    return _HEADLINES[calibration.verdict.status]
+    return _HEADLINES[verdict.status]
 
 
-def created(calibration: Calibration) -> str:
-    """When the result was computed, for people."""
+def readable_time(created: str) -> str:
+    """When something was computed, for people; it stands in ISO 8601."""
     try:
-        time = datetime.fromisoformat(calibration.created)
+        time = datetime.fromisoformat(created)
     except ValueError:
-        return calibration.created
+        return created
     return f"{time:%Y-%m-%d %H:%M %Z}".strip()
 
 
 def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
     """The estimated transforms, the wanted one first."""
-    return tuple(_edge_card(name, edge) for name, edge in calibration.edges.items())
+    return tuple(edge_card(name, edge) for name, edge in calibration.edges.items())
 
 
-def _edge_card(name: str, edge: Edge) -> EdgeCard:
+def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:
+    """Writes a transform as text.
+
+    Args:
+        name: Its name, such as `flange_from_cam`.
+        edge: The transform.
+        oriented: Whether its rotation was measured; else it is the parent's own.
+    """
     parent, _, child = name.partition("_from_")
     rotation = edge.matrix[:3, :3]
     # The perturbation is in the child's frame; the components are along the parent's axes.
     covariance_m2 = rotation @ edge.covariance[3:, 3:] @ rotation.T
     sigmas_mm = 1e3 * np.sqrt(np.clip(np.diag(covariance_m2), 0.0, None))
     translation_mm = 1e3 * edge.transform.translation
-    sigma_axis_deg = edge.sigma_deg / np.sqrt(3.0)
-    quaternion_decimals = decimals_for(0.5 * np.deg2rad(sigma_axis_deg))
     rows = [
         Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {_rounded(sigma)} mm")
         for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
     ]
-    rotvec_deg = edge.transform.rotation.as_rotvec(degrees=True)
-    rows += [
-        Fact(
-            "rotation vector",
-            "[" + ", ".join(matched(value, sigma_axis_deg) for value in rotvec_deg) + "]",
-            "deg",
-        ),
-        Fact(
-            "quaternion x, y, z, w",
-            "["
-            + ", ".join(
-                f"{value:.{quaternion_decimals}f}" for value in edge.transform.rotation.as_quat()
-            )
-            + "]",
-        ),
-    ]
+    if oriented:
+        rows += _rotation_facts(edge)
+    else:
+        rows.append(Fact("rotation", "not measured", f"taken as that of {frame_words(parent)}"))
     return EdgeCard(
         name,
         f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}.",
         _rounded(edge.sigma_mm),
-        _rounded(edge.sigma_deg),
+        _rounded(edge.sigma_deg) if oriented else "",
         tuple(rows),
         _matrix_text(edge.matrix),
     )
+
+
+def _rotation_facts(edge: Edge) -> list[Fact]:
+    sigma_axis_deg = edge.sigma_deg / np.sqrt(3.0)
+    decimals = decimals_for(0.5 * np.deg2rad(sigma_axis_deg))
+    rotation = edge.transform.rotation
+    rotvec_deg = ", ".join(
+        matched(value, sigma_axis_deg) for value in rotation.as_rotvec(degrees=True)
+    )
+    quaternion = ", ".join(f"{value:.{decimals}f}" for value in rotation.as_quat())
+    return [
+        Fact("rotation vector", f"[{rotvec_deg}]", "deg"),
+        Fact("quaternion x, y, z, w", f"[{quaternion}]"),
+    ]
 
 
 def frame_words(frame: str) -> str:

@@ -13,7 +13,7 @@ from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence, magnification
 from visioncal.files import write_atomically
 from visioncal.recording.findings import Findings
-from visioncal.report import advice, content, plots, sources, uncertainty
+from visioncal.report import advice, content, plots, sources, tools, uncertainty
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
@@ -74,14 +74,15 @@ def render(
 def _words(calibration: Calibration) -> dict[str, object]:
     found = advice.suspects(calibration)
     return {
-        "headline": content.headline(calibration),
-        "created": content.created(calibration),
+        "headline": content.headline(calibration.verdict),
+        "created": content.readable_time(calibration.created),
         "next_steps": advice.next_steps(calibration, found),
         "suspects": [(advice.listed(it.views), it) for it in found],
         "has_outliers": any(it.used for it in found),
         "has_contradicting": any(it.contradict for it in found),
         "key_figures": content.key_figures(calibration),
         "edges": content.edge_cards(calibration),
+        "frames": tools.frame_cards(calibration),
         "method": content.method_facts(calibration),
         "lens": content.lens_facts(calibration),
         "lens_origin": content.lens_origin(calibration),

@@ -11,15 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import Calibration, ViewResult
 from visioncal.evidence import ViewEvidence
-from visioncal.report import svg
+from visioncal.report import bars, svg
 from visioncal.report.advice import contradicts
-from visioncal.report.numbers import significant
+from visioncal.report.bars import Bar
 from visioncal.transforms import nearest_rotation
 from visioncal.types import FloatArray
 
 # Beyond this many marks a bitmap is smaller than the vectors.
 _MANY_MARKS = 2500
-_ROOM = 1.25
 # Widths of figures, such that their text is as large as the page's.
 _WIDE_IN, _SMALL_IN = 9.2, 3.7
 
@@ -59,48 +58,18 @@ def _residual_panel(
     rms: float | None,
     outlying: Collection[int],
 ) -> None:
-    """Bars by the view's place in the session; what exceeds the used views' scale is clipped."""
-    known = [(place, view, value_of(view)) for place, view in enumerate(views)]
-    values = [(place, view.used, value) for place, view, value in known if value is not None]
-    unknown = [place for place, view, value in known if value is None and not view.used]
-    of_unused = {it.view: svg.BAD if contradicts(it) else svg.MUTED for it in views if not it.used}
-    used = [value for _, is_used, value in values if is_used]
-    top = _ROOM * max(used or [value for _, _, value in values], default=1.0) or 1.0
-    if values:
-        places, _, heights = zip(*values, strict=True)
-        colours = [
-            of_unused.get(view, svg.CHECK if view in outlying else svg.ACCENT)
-            for view in (views[place].view for place in places)
-        ]
-        axes.bar(places, np.minimum(heights, top), width=0.7, color=colours, alpha=0.9)
-    for place, is_used, value in values:
-        if not is_used:
-            clipped = value > top
-            colour = of_unused[views[place].view]
-            axes.plot(place, min(value, top), "^" if clipped else "x", color=colour, markersize=5)
-            if clipped:
-                axes.annotate(
-                    significant(value), (place, top), (0, 5), textcoords="offset points",
-                    fontsize=8, color=colour, ha="center",
-                )  # fmt: skip
-    axes.plot(unknown, [0.05 * top] * len(unknown), "x", color=svg.MUTED, markersize=5)
-    if rms is not None:
-        axes.axhline(rms, color=svg.INK, linewidth=0.9, linestyle=(0, (4, 3)))
-        axes.annotate(
-            f"rms {significant(rms)}", (1.0, rms), (4, 0), xycoords=("axes fraction", "data"),
-            textcoords="offset points", fontsize=8, va="center",
-        )  # fmt: skip
-    axes.set_ylim(0.0, top * 1.2)
-    axes.set_xlim(-0.7, len(views) - 0.3)
-    axes.grid(visible=False, axis="x")
-    axes.yaxis.set_major_locator(MaxNLocator(4))
-    _label_views(axes, [view.view for view in views])
+    """Bars by the view's place in the session."""
+    bars.draw(
+        axes,
+        [Bar(str(it.view), value_of(it), it.used, _colour(it, outlying)) for it in views],
+        rms,
+    )
 
 
-def _label_views(axes: Axes, numbers: Sequence[int]) -> None:
-    step = max(1, -(-len(numbers) // 25))
-    places = range(0, len(numbers), step)
-    axes.set_xticks(list(places), [str(numbers[place]) for place in places])
+def _colour(view: ViewResult, outlying: Collection[int]) -> str:
+    if view.used:
+        return svg.CHECK if view.view in outlying else svg.ACCENT
+    return svg.BAD if contradicts(view) else svg.MUTED
 
 
 def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:

@@ -15,6 +15,7 @@ _REMEDIES = {
     "intrinsics": "views with the board near the image's edges would lower it",
     "board": "squares measured over the whole board would lower it",
     "arm": "more views would hardly lower it, a kinematic calibration of the arm would",
+    "held_values": "stating lens and board better, or letting them move, would lower it",
     "misfit": "a cell that has warmed up and settled would lower it",
 }
 
@@ -33,7 +34,7 @@ def summary(calibration: Calibration, found: Uncertainty) -> tuple[str, ...]:
         remedy = f"; {_REMEDIES[largest]}" if largest in _REMEDIES else ""
         sentences.append(
             f"The largest part, {found.percent(largest)} of the variance, comes from the "
-            f"{largest}{remedy}."
+            f"{largest.replace('_', ' ')}{remedy}."
         )
     return tuple(sentences)
 

@@ -10,6 +10,8 @@ from visioncal.files import did_you_mean
 from visioncal.types import CameraKind, Mount
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+# Nobody knows a focal length better than the least of these, or worse than the largest [px].
+PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 PositiveInt = Annotated[int, Field(gt=0)]
 
@@ -32,7 +34,7 @@ class CameraTable(_TableModel):
     matrix: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
     distortion: list[FiniteFloat] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
-    matrix_sigma_px: Positive | None = None
+    matrix_sigma_px: PixelSigma | None = None
 
 
 class RobotTable(_TableModel):
@@ -141,6 +143,7 @@ def _in_words(entry: Mapping[str, Any]) -> str:
         "literal_error": str(context.get("expected")).replace("'", '"'),
         "greater_than": f"a number above {context.get('gt', 0):g}",
         "greater_than_equal": f"a number of at least {context.get('ge', 0):g}",
+        "less_than_equal": f"a number of at most {context.get('le', 0):g}",
         "too_short": f"a list of {context.get('min_length')}",
         "too_long": f"a list of {context.get('max_length')}",
     }

@@ -16,9 +16,10 @@ from visioncal.session import columns as known
 from visioncal.session.images import image_path
 from visioncal.types import FloatArray
 
+# Poses in micrometres stay under this many metres, and turns in degrees under this many radians; a
+# number beyond is a slip.
+_FARTHEST_M, _WIDEST_RAD = 1e7, 1e4
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
-# Poses in micrometres stay under this many metres; a number beyond is a slip.
-_FARTHEST_M = 1e7
 _NORM_TOLERANCE = 1e-3
 _SHOWN_PROBLEMS = 10
 # Stricter than float(), which also takes 1_000, nan, and the digits of other scripts.
@@ -230,7 +231,7 @@ class _RowReader:
         role = self._take(cells, "role", _role, keep=True)
         numbers = self._numbers(cells)
         text = {name: cell for name, cell in cells.items() if cell}
-        self._check_lengths(numbers)
+        self._check_sizes(numbers)
         self._check_groups(numbers)
         observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text
         if not image and not observed and not self.problems:
@@ -261,12 +262,14 @@ class _RowReader:
                     numbers[column] = value
         return numbers
 
-    def _check_lengths(self, numbers: Mapping[str, float]) -> None:
+    def _check_sizes(self, numbers: Mapping[str, float]) -> None:
         for column, value in numbers.items():
             if column.endswith("_m") and abs(value) > _FARTHEST_M:
                 self.report(
                     column, f"{value:g} m is no place in a robot cell; write metres ({value:g} mm?)"
                 )
+            if column.endswith("_rad") and abs(value) > _WIDEST_RAD:
+                self.report(column, f"{value:g} rad is no angle of a joint; write radians")
 
     def _check_groups(self, numbers: Mapping[str, float]) -> None:
         # A cell that was refused would be reported again as missing from its group.

@@ -1,4 +1,4 @@
-"""Stage 5: takes out the views that are wrong as a whole."""
+"""Takes out the views that are wrong as a whole."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.closure import Closure, Edges, distances
-from visioncal.estimator.consensus import Agreement, agreeing_views
+from visioncal.estimator.consensus import agreeing_views, whole_units
 from visioncal.estimator.linalg import one_blas_thread
+from visioncal.figures import figure
 from visioncal.types import IntArray, Mask, Rejection
 
 
@@ -34,32 +35,42 @@ def agree(
     Args:
         data: The chain's known parts, one entry a view.
         views: The views' numbers.
-        stops: (m,) which stop of the robot each was taken at: a stop is right or wrong as a whole.
+        stops: (m,) which stop of the robot each was taken at. A stop is right or wrong as a whole,
+            unless its own images contradict each other: then each is compared with the other stops.
         start: What was found of the same views before; None for a search without any idea.
 
     Returns:
         The views that agree with each other, and why the others do not.
     """
-    thought = None if start is None else np.bincount(stops, start.mask) > 0
     with one_blas_thread():
-        found = agreeing_views(data.merged(stops), thought)
-    mask = found.agrees[stops]
-    seen = data.under(found.fit.edges.shared)
-    away_m, away_rad = distances(seen.placed(found.fit.edges.x), found.fit.edges.z)
+        units = whole_units(data, stops)
+        thought = None if start is None else np.bincount(units, start.mask) > 0
+        found = agreeing_views(data.merged(units), thought)
+    mask, edges = found.agrees[units], found.fit.edges
+    away_m, away_rad = distances(data.under(edges.shared).placed(edges.x), edges.z)
+    surprise = np.sqrt(found.surprise[units] / 6.0)
+    limit = float(np.sqrt(found.limit / 6.0))
     return Agreed(
         mask,
-        found.fit.edges,
+        edges,
         tuple(
-            Rejection(views[at], _reason(found, stops[at], float(away_m[at]), float(away_rad[at])))
+            Rejection(
+                views[at],
+                f"disagrees with the other views: it places the target {figure(1e3 * away_m[at])} "
+                f"mm and {figure(np.rad2deg(away_rad[at]))} deg away, {figure(surprise[at])} times "
+                f"the noise (limit {figure(limit)}); {_cause(views, (stops == stops[at]) & mask)}",
+            )
             for at in np.flatnonzero(~mask).tolist()
         ),
     )
 
 
-def _reason(found: Agreement, stop: int, away_m: float, away_rad: float) -> str:
-    sigmas, limit = (float(np.sqrt(it / 6.0)) for it in (found.surprise[stop], found.limit))
-    return (
-        f"disagrees with the other views: it places the target {1e3 * away_m:.2g} mm and "
-        f"{np.rad2deg(away_rad):.2g} deg away, {sigmas:.1f} times the noise (limit {limit:.1f}); "
-        "its pose or its image is wrong, or something had moved"
-    )
+def _cause(views: Sequence[int], agreeing_mates: Mask) -> str:
+    """What is wrong with a view, by the views of its stop that agree with all others."""
+    mates = np.flatnonzero(agreeing_mates)
+    if len(mates):
+        return (
+            f"view {views[mates[0]]} of the same stop agrees: the image is wrong, or something "
+            "moved in between"
+        )
+    return "its pose or its image is wrong, or something had moved"

@@ -1,4 +1,4 @@
-"""Stage 4: chooses among the poses that each view allows, by the robot's motion."""
+"""Chooses among the poses that each view allows, by the robot's motion."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from visioncal.errors import DegenerateError
+from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.closure import Edges
 from visioncal.solvers import SOLVERS
 from visioncal.stages.pnp import ViewPoses
@@ -14,8 +15,6 @@ from visioncal.targets import rotations
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import Corners, FloatArray, IntArray, Mask, Rejection, Target
 
-# Lever by which an angle counts as a distance when views are compared [m].
-_LEVER_M = 0.5
 # A rival that closes the chain within this many times the chosen one's distance is as likely.
 _CLEAR_RATIO = 3.0
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
@@ -187,7 +186,7 @@ def _nearest(
     """Distance (m, k) [m] between where each candidate places the target, and z."""
     placed = robot[:, None] @ x @ candidates.poses
     away = np.linalg.norm(placed[..., :3, 3] - z[:3, 3], axis=-1)
-    away = away + _LEVER_M * rotation_angle(invert(z) @ placed)
+    away = away + LEVER_M * rotation_angle(invert(z) @ placed)
     return np.asarray(np.where(candidates.valid, away, np.inf))
 
 

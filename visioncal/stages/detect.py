@@ -1,4 +1,4 @@
-"""Stage 1: finds the target in every image, on threads, with a reason where it cannot be used."""
+"""Finds the target in every image, on threads, with a reason where it cannot be used."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from visioncal.estimator.appearance import Free
-from visioncal.estimator.arm import LEVER_M, ArmErrors, misfit_covariance
+from visioncal.estimator.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
 from visioncal.estimator.budget import covariance_by_source, point_covariance
-from visioncal.estimator.closure import Closure
+from visioncal.estimator.closure import Closure, fit_closure
 from visioncal.estimator.intervals import noise_intervals
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.misfit import Drift, Neighbours, drift, neighbours
@@ -66,12 +66,17 @@ def diagnose(
     """
     edges, noise = result.edges, result.noise
     with one_blas_thread():
-        enough = len(data) >= _FEWEST_STOPS
-        alike = neighbours(data, edges, noise) if enough else Neighbours(1.0, False)
-        moved = drift(data, edges, noise) if enough else None
+        alike, moved = Neighbours(1.0, False), None
+        if len(data) >= _FEWEST_STOPS:
+            # A closed form is not at rest, and that would pass for a misfit.
+            rest = fit_closure(data, edges)
+            alike = neighbours(data, rest.edges, rest.noise)
+            moved = drift(data, rest.edges, rest.noise)
         parts = covariance_by_source(data, edges, noise, _owners(free, arm))
-        if arm is not None and not arm.of_links:
+        if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
+        if result.held.any():
+            parts["held_values"] = np.outer(result.held[:12], result.held[:12])
         intervals = noise_intervals(data, edges, noise)
     inflation = alike.factor if alike.is_significant else 1.0
     if inflation > 1.0:
@@ -101,13 +106,14 @@ def _owners(free: Free | None, arm: ArmErrors | None) -> dict[str, IntArray]:
         for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
             if mask.any():
                 owners[name] = np.flatnonzero(mask)
-    if arm is not None and arm.of_links:
+    if arm is not None and arm.is_estimated:
         owners["arm"] = looks + np.arange(arm.basis.shape[2])
     return owners
 
 
 def _length(spread: FloatArray) -> float:
-    # Lens and board share information, which may leave one of them less than nothing by itself.
+    # Errors of lens and board hang together; each takes half of what is common, which may leave one
+    # of them less than nothing.
     return float(np.sqrt(max(np.trace(spread), 0.0)))
 
 
@@ -129,7 +135,7 @@ def _spectrum(spread: FloatArray) -> FloatArray:
 
 
 def _warnings(alike: Neighbours, moved: Drift | None, arm: ArmErrors | None) -> Iterator[str]:
-    if arm is not None:
+    if arm is not None and arm.is_significant:
         size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
         told = (
             "they were estimated along"
@@ -138,9 +144,9 @@ def _warnings(alike: Neighbours, moved: Drift | None, arm: ArmErrors | None) -> 
         )
         yield (
             f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
-            f"under 15): its links are off from the model by typically {size}; {told}. What of "
-            "them looks the same in all views is in no residual, and counts in the covariance: a "
-            "kinematic calibration of the arm would take it out."
+            f"under {SIGNIFICANT:.0f}): its links are off from the model by typically {size}; "
+            f"{told}. What of them looks the same in all views is in no residual, and counts in "
+            "the covariance: a kinematic calibration of the arm would take it out."
         )
     if moved is not None:
         yield (

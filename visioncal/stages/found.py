@@ -4,34 +4,78 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.estimator.joint import Arm, Problem, State, measured_scale
+from visioncal.estimator.closure import held_shift
+from visioncal.estimator.joint import (
+    Arm,
+    MeasuredScale,
+    Problem,
+    State,
+    chance_limit,
+    contradicted_lens,
+    measured_scale,
+    moved_surprise,
+)
+from visioncal.figures import figure
+from visioncal.types import FloatArray, IntArray
 
 
 def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
-    """Says what was found, and what the user can do about it."""
+    """Says what was found that is a reason for doubt, and what the user can do about it.
+
+    Args:
+        problem: The corners, and what is known of the scene.
+        arm: The robot's side.
+        state: The answer.
+    """
     yield from _scale_finding(problem, arm, state)
     yield from _bend_finding(problem, state)
     yield from _lens_finding(problem, state)
 
 
+def remarks(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
+    """Says what was found that is no reason for doubt; as `findings`."""
+    measured = _measured(problem, arm, state)
+    if measured is not None and not measured.contradicts:
+        yield (
+            f"{_sized(problem, measured)}, which what is stated allows (to within "
+            f"{100 * measured.stated_sigma:.1g} %). The result goes by both."
+        )
+    if _lens_moved(problem, state) and not _is_doubtful(problem, state):
+        yield (
+            "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
+            f"{_lens_steps(problem, state)} px."
+        )
+
+
 def _scale_finding(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
     """Whether the robot measures another size of the squares than the file states."""
-    measured = measured_scale(problem, arm, state)
-    if not measured.is_another:
-        return
+    measured = _measured(problem, arm, state)
+    if measured is not None and measured.contradicts:
+        yield (
+            f"{_sized(problem, measured)}, which is not what is stated (to within "
+            f"{100 * measured.stated_sigma:.1g} %). The result goes by the robot. Measure over "
+            "many squares and mend square_m and square_sigma_m; if the board is right, the arm's "
+            "model is off by as much."
+        )
+
+
+def _measured(problem: Problem, arm: Arm, state: State) -> MeasuredScale | None:
+    """What the robot measures, where the fit has taken it up."""
+    return measured_scale(problem, arm, state) if _moves(state, problem.scale) else None
+
+
+def _sized(problem: Problem, measured: MeasuredScale) -> str:
     side = 1e3 * problem.scene.target.square_m
-    prior = problem.prior_sigma[problem.scale[0]]
-    yield (
+    return (
         f"By the robot's motion the board is {100 * abs(measured.scale):.2g} % "
         f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
         f"{100 * measured.sigma:.1g} %): squares of {side * (1 + measured.scale):.4g} mm, not of "
-        f"{side:.4g} mm to within {100 * prior:.1g} %. Measure over many squares and mend square_m "
-        "and square_sigma_m; if the board is right, the arm's model is off by as much."
+        f"{side:.4g} mm"
     )
 
 
 def _bend_finding(problem: Problem, state: State) -> Iterator[str]:
-    if not np.isin(problem.shape, state.moving).all():
+    if not _moved(problem, state, problem.shape):
         return
     shift = state.seen.free.corners_after(state.fit.edges.shared) - problem.positions
     bend_mm = 1e3 * float(np.ptp(shift[:, 2]))
@@ -48,13 +92,55 @@ def _lens_finding(problem: Problem, state: State) -> Iterator[str]:
             f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
             "more corners, or more views."
         )
-    if problem.scene.estimated or not np.isin(problem.lens, state.moving).all():
-        return
-    stated = problem.scene.camera
-    refined = state.seen.free.after(state.fit.edges.shared).camera
-    moved = refined.matrix - stated.matrix
-    yield (
-        "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved by "
-        + ", ".join(f"{it:+.2g}" for it in moved)
-        + ' px. Calibrate the camera anew, or hold them with intrinsics = "hold".'
+    if _lens_moved(problem, state) and _is_doubtful(problem, state):
+        yield (
+            "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved "
+            f"by {_lens_steps(problem, state)} px. Calibrate the camera anew, or hold them with "
+            'intrinsics = "hold".'
+        )
+    if problem.contested:
+        yield _contest(problem, state)
+
+
+def _lens_moved(problem: Problem, state: State) -> bool:
+    return not problem.scene.estimated and _moved(problem, state, problem.lens)
+
+
+def _is_doubtful(problem: Problem, state: State) -> bool:
+    """Whether moved intrinsics were taken for exact, or for better than they are."""
+    return problem.scene.matrix_sigma_px is None or contradicted_lens(problem, state)
+
+
+def _lens_steps(problem: Problem, state: State) -> str:
+    return _px((state.again().appearance.values - problem.stated.values)[:4])
+
+
+def _contest(problem: Problem, state: State) -> str:
+    """Words intrinsics that stay although the corners speak against them."""
+    shift = held_shift(state.data, state.fit.edges, state.fit.noise)[12:]
+    moves = shift[np.searchsorted(state.seen.free.columns, problem.lens[:4])]
+    why = (
+        'intrinsics = "hold" keeps them'
+        if problem.scene.mode == "hold"
+        else "they were kept, because views left out are predicted no better with others"
     )
+    return (
+        "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
+        f"{_px(moves)} px. But {why}; what this does to the result counts in its sigmas. "
+        "Calibrate the camera anew."
+    )
+
+
+def _moves(state: State, places: IntArray) -> bool:
+    return bool(np.isin(places, state.moving).all())
+
+
+def _moved(problem: Problem, state: State, places: IntArray) -> bool:
+    """Whether values were moved from what is stated by more than chance."""
+    return _moves(state, places) and moved_surprise(problem, state, places) > chance_limit(
+        len(places)
+    )
+
+
+def _px(values: FloatArray) -> str:
+    return ", ".join(f"{'-' if it < 0 else '+'}{figure(abs(it))}" for it in values)

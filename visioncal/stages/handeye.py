@@ -17,10 +17,16 @@ from visioncal.estimator.closure import (
     deviations,
     estimate_noise,
     fit_closure,
+    held_shift,
     solve_closure,
 )
 from visioncal.estimator.linalg import covariance, one_blas_thread
-from visioncal.estimator.observability import FEWEST_VIEWS, Direction, check_observability
+from visioncal.estimator.observability import (
+    Direction,
+    check_observability,
+    directions,
+    refuse_too_few,
+)
 from visioncal.solvers import SOLVERS
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, Mount, SolverName
@@ -47,11 +53,13 @@ class HandEyeResult:
 
     Attributes:
         edges: x is `flange_from_cam` or `base_from_cam`; z is `base_from_target` or
-            `flange_from_target`; with them the change of an estimated lens.
-        covariance: (12 + k, 12 + k) of x, z (right perturbations) and the intrinsics.
+            `flange_from_target`; with them the change of lens, board and links.
+        covariance: (12 + k, 12 + k) of x, z (right perturbations) and of what the views share.
         noise: Of the flange, or of both together.
         solutions: Every solver's edges by name, the answer's own among them.
         worst: The worst directions of each edge.
+        held: (12 + k,) how far the answer would move if what is held moved as well; its square is
+            in the covariance.
     """
 
     edges: Edges
@@ -59,6 +67,7 @@ class HandEyeResult:
     noise: Noise
     solutions: Mapping[str, Solution]
     worst: tuple[Direction, ...]
+    held: FloatArray
 
 
 def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
@@ -67,7 +76,10 @@ def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
 
 
 def solve_hand_eye(
-    data: Closure, solver: SolverName = "joint", arm: ArmErrors | None = None
+    data: Closure,
+    solver: SolverName = "joint",
+    arm: ArmErrors | None = None,
+    looks: int = 0,
 ) -> HandEyeResult:
     """Solves for both unknown edges.
 
@@ -79,6 +91,7 @@ def solve_hand_eye(
         solver: `joint` for the whitened fit of both edges, or a closed form's name.
         arm: Errors that follow the arm's posture, at the same views. Those of its links are among
             what the views share; others are noise to the fit and count in the covariance.
+        looks: How many of the unknowns that the views share are of lens and board; they come first.
 
     Returns:
         The answer with its covariance.
@@ -88,10 +101,7 @@ def solve_hand_eye(
         ConvergenceError: The joint fit does not come to rest on motion that should allow it.
     """
     with one_blas_thread():
-        if len(data) < FEWEST_VIEWS:
-            # Raises, and says what is missing: no solver can answer.
-            nowhere = Edges(np.eye(4), np.eye(4), data.unchanged)
-            check_observability(data, nowhere, Noise(1.0, 1.0))
+        refuse_too_few(data)
         closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
         start = closed[_START if solver == "joint" else solver]
         edges = Edges(start.x, start.z, data.unchanged)
@@ -99,9 +109,12 @@ def solve_hand_eye(
             fit = fit_closure(data, edges)
         else:
             fit = ClosureFit(edges, estimate_noise(data, edges))
-        worst = check_observability(data, fit.edges, fit.noise)
+        check_observability(data, fit.edges, fit.noise, looks)
+        # Away from its rest a closed form is pulled by more than what is held.
+        shift = held_shift(data, fit.edges, fit.noise) * float(solver == "joint")
         spread = covariance(closure_information(data, fit.edges, fit.noise))
-        if arm is not None and not arm.of_links:
+        spread = spread + np.outer(shift, shift)
+        if arm is not None and not arm.is_estimated:
             spread = spread + misfit_covariance(data, fit.edges, fit.noise, arm)
     if not fit.settled:
         raise ConvergenceError(
@@ -112,7 +125,8 @@ def solve_hand_eye(
     solutions |= {
         name: _solution(data, Edges(it.x, it.z, data.unchanged)) for name, it in closed.items()
     }
-    return HandEyeResult(fit.edges, spread, fit.noise, solutions, worst)
+    worst = directions(spread, fit.edges, data.mount)
+    return HandEyeResult(fit.edges, spread, fit.noise, solutions, worst, shift)
 
 
 def refit(data: Closure, result: HandEyeResult, solver: SolverName) -> Edges:

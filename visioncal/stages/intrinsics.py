@@ -1,4 +1,4 @@
-"""Stage 2: the camera's intrinsics, where the session gives none."""
+"""The camera's intrinsics, where the session gives none."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

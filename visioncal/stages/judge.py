@@ -1,4 +1,4 @@
-"""Stage 7: whether the result can be trusted, in plain sentences."""
+"""Whether the result can be trusted, in plain sentences."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,14 +7,16 @@ import numpy as np
 
 from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
 from visioncal.estimator.closure import Noise
+from visioncal.figures import figure
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult
-from visioncal.transforms import pose_difference
 from visioncal.types import Rejection
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
 _ROUNDING = 1e-6
 _LISTED_VIEWS, _LISTED_PARTS = 3, 3
+# So many views in a row are not left out by chance.
+_LEAST_RUN = 3
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,6 @@ class JudgeOptions:
         optimism: Held-out over in-sample scatter; large where each view carries the fit.
         outlier: Residual of a view over the median of all.
         holdout: Residuals of views held back over those of views left out in turn.
-        disagreement: Distance of half of the closed forms from the answer, over its sigma.
     """
 
     scatter_mm: tuple[float, float] = (2.0, 10.0)
@@ -50,7 +51,6 @@ class JudgeOptions:
     optimism: tuple[float, float] = (1.6, 4.0)
     outlier: float = 6.0
     holdout: float = 4.0
-    disagreement: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ class Findings:
         robot: Noise of the flange; None where it cannot be told from the camera's.
         diagnosis: What the residuals show beyond noise, and where the uncertainty comes from.
         warnings: What earlier stages had to say.
+        notes: What of it is no reason for doubt.
     """
 
     views: Sequence[ViewResult]
@@ -84,6 +85,7 @@ class Findings:
     robot: Noise | None
     diagnosis: Diagnosis
     warnings: Sequence[str]
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -117,14 +119,13 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
         *_view_doubts(findings, options),
         *_pixel_doubts(findings, options),
         *([] if scatter else _robot_doubts(findings, options)),
-        *_solver_doubts(findings, options),
         *(_Doubt(sentence) for sentence in findings.warnings),
     ]
     if not doubts:
-        return Verdict("good", (_praise(findings),))
+        return Verdict("good", (_praise(findings), *findings.notes))
     status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
     ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
-    return Verdict(status, tuple(doubt.sentence for doubt in ordered))
+    return Verdict(status, (*(doubt.sentence for doubt in ordered), *findings.notes))
 
 
 def is_scattered(findings: Findings, options: JudgeOptions | None = None) -> bool:
@@ -136,8 +137,8 @@ def _praise(findings: Findings) -> str:
     used, worst = sum(view.used for view in findings.views), findings.hand_eye.worst[0]
     return (
         f"All {used} used views agree: left out of the fit, they are predicted to "
-        f"{findings.held_out.mm:.2g} mm and {findings.held_out.deg:.2g} deg (rms), and "
-        f"{worst.words}, its worst direction, is known to {1e3 * worst.sigma:.2g} mm."
+        f"{figure(findings.held_out.mm)} mm and {figure(findings.held_out.deg)} deg (rms), and "
+        f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm."
     )
 
 
@@ -145,7 +146,7 @@ def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
     held, inside = findings.held_out, findings.rms
     limits = (options.scatter_mm, options.scatter_deg)
     beyond = [
-        (f"{value:.2g} {unit} (doubt begins at {check:g})", value > bad)
+        (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
         for value, unit, (check, bad) in zip(
             (held.mm, held.deg), ("mm", "deg"), limits, strict=True
         )
@@ -177,10 +178,7 @@ def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
 def _worst_views(views: Sequence[ViewResult]) -> str:
     measured = [view for view in views if view.used and view.residual_mm is not None]
     measured.sort(key=lambda view: -(view.residual_mm or 0.0))
-    return ", ".join(
-        f"view {view.view} ({view.residual_mm:.2g} mm, {view.residual_deg:.2g} deg)"
-        for view in measured[:_LISTED_VIEWS]
-    )
+    return ", ".join(f"view {view.view} ({_residual(view)})" for view in measured[:_LISTED_VIEWS])
 
 
 def _disagreement_doubts(findings: Findings) -> Iterator[_Doubt]:
@@ -191,23 +189,52 @@ def _disagreement_doubts(findings: Findings) -> Iterator[_Doubt]:
     if len(out) == 1:
         yield _Doubt(f"View {out[0].view} was left out: it {out[0].reason}.")
         return
-    named = ", ".join(str(it.view) for it in out)
-    yield _Doubt(f"Views {named} were left out; view {out[0].view} {out[0].reason}.")
+    named, first = ", ".join(str(it.view) for it in out), out[0].view
+    yield _Doubt(f"Views {named} were left out; view {first} {out[0].reason}.{_run(findings)}")
+
+
+def _run(findings: Findings) -> str:
+    """Says so where the views that were left out follow each other, with no other between them."""
+    out = [it.view for it in findings.disagreeing]
+    compared = [it.view for it in findings.views if it.used or it.view in out]
+    first = compared.index(out[0])
+    end = first + len(out)
+    if len(out) < _LEAST_RUN or compared[first:end] != out:
+        return ""
+    when = f"from view {out[0]} on" if first else f"before view {compared[end]}"
+    if first and end < len(compared):
+        when = f"from view {out[0]} to view {out[-1]}"
+    return f" They follow each other: {when}, something had moved."
 
 
 def _outlier_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    """Names single views whose residual stands out from the others'."""
-    used = [view for view in findings.views if view.used]
+    """Names single views whose residual stands out from the others'.
+
+    Where the corners tell how well each view sees the board, the consensus has judged them better.
+    """
+    if findings.robot is not None:
+        return
+    for view, ratio in outlying_views(findings.views, options.outlier):
+        yield _Doubt(
+            f"View {view.view} stands out: it places the target {_residual(view, ' and ')} from "
+            f"the others, {ratio:.0f} times what is typical. It is in the fit and pulls at it: "
+            "look at its image and its pose, and take it out of views.csv if one of them is wrong."
+        )
+
+
+def outlying_views(
+    views: Sequence[ViewResult], limit: float = JudgeOptions.outlier
+) -> tuple[tuple[ViewResult, float], ...]:
+    """The used views whose residual is over so many times the median, with their ratios."""
+    used = [view for view in views if view.used]
     away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
-    typical = np.maximum(np.median(away, axis=0), _ROUNDING)
-    for view, ratio in zip(used, (away / typical).max(axis=1), strict=True):
-        if ratio > options.outlier:
-            yield _Doubt(
-                f"View {view.view} stands out: it places the target {view.residual_mm:.2g} mm and "
-                f"{view.residual_deg:.2g} deg from the others, {ratio:.0f} times what is typical. "
-                "It is in the fit and pulls at it: look at its image and its pose, and take it out "
-                "of views.csv if one of them is wrong."
-            )
+    ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
+    return tuple((view, float(it)) for view, it in zip(used, ratios, strict=True) if it > limit)
+
+
+def _residual(view: ViewResult, between: str = ", ") -> str:
+    mm, deg = view.residual_mm or 0.0, view.residual_deg or 0.0
+    return f"{figure(mm)} mm{between}{figure(deg)} deg"
 
 
 def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
@@ -217,9 +244,9 @@ def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
     ratio = max(holdout.mm / max(held.mm, _ROUNDING), holdout.deg / max(held.deg, _ROUNDING))
     if ratio > options.holdout and max(holdout.mm, holdout.deg) > _ROUNDING:
         yield _Doubt(
-            f"The views that the session holds back are missed by {holdout.mm:.2g} mm and "
-            f"{holdout.deg:.2g} deg, {ratio:.0f} times worse than views left out in turn. They lie "
-            "where the result does not hold, or their poses or images are wrong."
+            f"The views that the session holds back are missed by {figure(holdout.mm)} mm and "
+            f"{figure(holdout.deg)} deg, {ratio:.0f} times worse than views left out in turn. They "
+            "lie where the result does not hold, or their poses or images are wrong."
         )
 
 
@@ -233,7 +260,7 @@ def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
         )
         sigma = direction.sigma * scale
         if sigma > check:
-            weak.append(f"{direction.words} ({sigma:.2g} {unit})")
+            weak.append(f"{direction.words} ({figure(sigma)} {unit})")
             is_fatal |= bool(sigma > bad)
     if weak:
         yield _Doubt(
@@ -251,10 +278,14 @@ def _budget_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt
         return
     parts = sorted((it for it in budget.items() if it[0] != "total"), key=lambda it: -it[1])
     yield _Doubt(
-        f"Where the views look, a point is placed to {budget['total']:.2g} mm (sigma; 95 % within "
-        f"{findings.diagnosis.radius95_mm:.2g} mm): "
-        + ", ".join(f"{mm:.2g} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
-        + "."
+        f"Where the views look, a point is placed to {figure(budget['total'])} mm (sigma; 95 % "
+        f"within {figure(findings.diagnosis.radius95_mm)} mm): "
+        + ", ".join(
+            f"{figure(mm)} mm from the {name.replace('_', ' ')}"
+            for name, mm in parts[:_LISTED_PARTS]
+        )
+        + ".",
+        budget["total"] > options.sigma_mm[1],
     )
 
 
@@ -270,9 +301,16 @@ def _view_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
         )
     share = len(lost) / max(used + len(lost), 1)
     if share > options.lost_share[0]:
+        told, disagree = "", {it.view for it in findings.disagreeing}
+        others = [it for it in lost if it.view not in disagree]
+        if disagree:
+            count = len(disagree) if others else "all"
+            told = f"; {count} of them disagree with the others"
+        if others:
+            told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
+            told += others[0].reason
         yield _Doubt(
-            f"{len(lost)} of {used + len(lost)} views could not be used; the first: view "
-            f"{lost[0].view}, {lost[0].reason}.",
+            f"{len(lost)} of {used + len(lost)} views are not used{told}.",
             share > options.lost_share[1],
         )
 
@@ -282,7 +320,7 @@ def _pixel_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
     noise = findings.pixel_px
     if noise is not None and noise > check:
         yield _Doubt(
-            f"Corners deviate by {noise:.2g} px from any pose of a flat board (doubt begins at "
+            f"Corners deviate by {figure(noise)} px from any pose of a flat board (doubt begins at "
             f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
             "are blurred.",
             noise > bad,
@@ -296,30 +334,8 @@ def _robot_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
     away_mm, away_deg = 1e3 * findings.robot.sigma_m, np.rad2deg(findings.robot.sigma_rad)
     if away_mm > options.robot_mm or away_deg > options.robot_deg:
         yield _Doubt(
-            f"To explain what is seen, the flange would have to be off by {away_mm:.2g} mm and "
-            f"{away_deg:.2g} deg from stop to stop; arms repeat to 0.1 mm. More likely the board "
-            "is of another size than stated, or warped, the intrinsics are not this camera's, or "
-            "the arm's model is off by as much. Measure the board's squares first."
-        )
-
-
-def _solver_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    """Compares the closed forms with the answer, in units of what the views leave open.
-
-    Single ones have weaknesses of their own, and an answer that changed the lens is another
-    question: what half of them agree on is meant.
-    """
-    result = findings.hand_eye
-    if findings.diagnosis.arm is not None or len(result.edges.shared) > 1:
-        return
-    sigma_mm = 1e3 * float(np.sqrt(np.trace(result.covariance[3:6, 3:6])))
-    sigma_deg = float(np.rad2deg(np.sqrt(np.trace(result.covariance[:3, :3]))))
-    steps = [pose_difference(result.edges.x, it.x) for it in result.solutions.values()]
-    away_mm, away_deg = np.median(steps, axis=0)
-    ratio = max(away_mm / max(sigma_mm, _ROUNDING), away_deg / max(sigma_deg, _ROUNDING))
-    if ratio > options.disagreement:
-        yield _Doubt(
-            f"Half of the solvers disagree with the answer by {away_mm:.2g} mm and "
-            f"{away_deg:.2g} deg or more, {ratio:.0f} times its sigma. Wrong views pull solvers "
-            "apart: look at the largest residuals."
+            f"To explain what is seen, the flange would have to be off by {figure(away_mm)} mm "
+            f"and {figure(away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely the "
+            "board is of another size than stated, or warped, the intrinsics are not this "
+            "camera's, or the arm's model is off by as much. Measure the board's squares first."
         )

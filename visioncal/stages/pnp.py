@@ -1,4 +1,4 @@
-"""Stage 3: the pose of the target in each view, with covariance and with its rivals."""
+"""The pose of the target in each view, with covariance and with its rivals."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.corners import CornerStack, mean_square_by_view, reproject
+from visioncal.estimator.corners import (
+    CornerStack,
+    floored_sigma_px,
+    mean_square_by_view,
+    reproject,
+)
 from visioncal.estimator.gating import gate
 from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.planar import planar_poses
@@ -143,8 +148,7 @@ def _with_rivals(
     mean_squares = [mean_square_by_view(stack, it.residuals) for it in (best, other)]
     turns = rotation_transforms(target)
     turned = adjoint(invert(turns))
-    # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
-    spreads = [max(sigma_px, 1e-6) ** 2 * covariance(it.information) for it in (best, other)]
+    spreads = [floored_sigma_px(sigma_px) ** 2 * covariance(it.information) for it in (best, other)]
     views = []
     for at, view in enumerate(stack.views):
         rival = _is_rival(mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px)
@@ -225,7 +229,7 @@ def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
     """Whether the mirrored pose explains a view's corners about as well as the better one."""
     if np.isclose(best, other, rtol=1e-6, atol=0.0):
         return False  # both starts ran into the same pose
-    surprise = corners * (other - best) / max(sigma_px, 1e-6) ** 2
+    surprise = corners * (other - best) / floored_sigma_px(sigma_px) ** 2
     return bool(other < _RIVAL_RATIO**2 * best or surprise < _RIVAL_CHI2)
 
 

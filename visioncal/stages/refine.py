@@ -15,7 +15,7 @@ from visioncal.estimator.appearance import (
 )
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
 from visioncal.estimator.closure import Closure, Edges, fit_closure, left_out_residuals
-from visioncal.estimator.corners import CornerStack
+from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.joint import (
     Arm,
     Problem,
@@ -24,6 +24,7 @@ from visioncal.estimator.joint import (
     Start,
     State,
     chance_limit,
+    contradicted_lens,
     gain,
     measured_scale,
     seen_at,
@@ -31,7 +32,7 @@ from visioncal.estimator.joint import (
 )
 from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.observability import worst_directions
-from visioncal.stages.found import findings
+from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import corner_positions
 from visioncal.types import Corners, IntArray
@@ -46,14 +47,16 @@ class Refined:
         views: The views with their one pose each, made anew.
         sigma_px: Standard deviation of a corner's coordinate [px].
         arm: Errors that follow the arm's posture, at the same views; None where there are none.
-        warnings: What was found, in sentences.
+        warnings: What was found and is a reason for doubt, in sentences.
+        notes: What was found and is none.
     """
 
     free: Free
     views: tuple[ViewPoses, ...]
     sigma_px: float
     arm: ArmErrors | None
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def look(scene: Scene, views: Sequence[ViewPoses], *, closed_form: bool = False) -> Refined:
@@ -72,7 +75,7 @@ def look(scene: Scene, views: Sequence[ViewPoses], *, closed_form: bool = False)
         moving = problem.lens[:0] if closed_form else problem.first
         poses = np.array([view.cam_from_target[0] for view in views])
         seen = seen_at(problem, moving, problem.stated, poses)
-    return _told(seen, views, None, ())
+    return _told(seen, views, None)
 
 
 def refine(scene: Scene, views: Sequence[ViewPoses], arm: Arm, edges: Edges) -> Refined:
@@ -92,14 +95,38 @@ def refine(scene: Scene, views: Sequence[ViewPoses], arm: Arm, edges: Edges) -> 
     with one_blas_thread():
         problem = Problem.of(scene, _corners(views))
         poses = np.array([view.cam_from_target[0] for view in views])
-        state = settle(problem, arm, problem.first, Start(problem.stated, poses, edges))
-        errors = arm_errors(arm, state.data, state.fit.edges)
-        if errors is not None and arm.of_links:
-            arm = replace(arm, errors=errors)
-            state = settle(problem, arm, problem.first, state.again())
-        state = _chosen(problem, arm, state)
-        said = tuple(findings(problem, arm, state))
-    return _told(state.seen, views, errors, said)
+        start = Start(problem.stated, poses, edges)
+        answer = _chosen(problem, arm, settle(problem, arm, problem.first, start))
+        errors = arm_errors(arm, answer.state.data, answer.state.fit.edges)
+        if errors is not None and errors.is_significant:
+            answer, arm, errors = _with_arm(problem, arm, start, errors)
+        doubts = tuple(findings(answer.problem, arm, answer.state))
+        notes = tuple(remarks(answer.problem, arm, answer.state))
+    return replace(_told(answer.state.seen, views, errors), warnings=doubts, notes=notes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """A fit, and the problem that it answers: priors that are contradicted have been dropped."""
+
+    problem: Problem
+    state: State
+
+
+def _with_arm(
+    problem: Problem, arm: Arm, start: Start, errors: ArmErrors
+) -> tuple[_Answer, Arm, ArmErrors | None]:
+    """Fits again with errors of the arm, which may have passed for another lens or board.
+
+    Errors of any arm's shape tell which values are free, but are not estimated.
+    """
+    erring = replace(arm, errors=errors)
+    answer = _chosen(problem, erring, settle(problem, erring, problem.first, start))
+    if arm.of_links:
+        return answer, erring, errors
+    state = settle(answer.problem, arm, answer.state.moving, answer.state.again())
+    left = arm_errors(arm, state.data, state.fit.edges)
+    return replace(answer, state=state), arm, left
 
 
 def arm_errors(arm: Arm, data: Closure, edges: Edges) -> ArmErrors | None:
@@ -119,12 +146,7 @@ def arm_errors(arm: Arm, data: Closure, edges: Edges) -> ArmErrors | None:
     return None if found is None else replace(found, basis=arm.basis)
 
 
-def _told(
-    seen: Seen,
-    views: Sequence[ViewPoses],
-    errors: ArmErrors | None,
-    said: tuple[str, ...],
-) -> Refined:
+def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
     return Refined(
         seen.free,
         tuple(
@@ -133,35 +155,63 @@ def _told(
         ),
         seen.sigma_px,
         errors,
-        said,
     )
 
 
-def _chosen(problem: Problem, arm: Arm, state: State) -> State:
+def _chosen(problem: Problem, arm: Arm, state: State) -> _Answer:
     """Sets free what the data speak for."""
-    for options in (_shapes, _scales):
-        for moving in options(problem, arm, state):
-            stated, wider = problem, settle(problem, arm, moving, state.again())
-            if _is_contradicted(problem, wider):
-                # A confident wrong prior is worse than none.
-                stated = problem.without_prior(problem.lens)
-                wider = settle(stated, arm, moving, wider.again())
-            if _is_determined(wider) and not _predicts_worse(wider, state):
-                problem, state = stated, wider
-                break
-    return state
+    answer = _Answer(problem, state)
+    for moving in _shapes(problem, arm, state):
+        wider = _freed(problem, arm, moving, state)
+        if _is_determined(wider.state) and not _predicts_worse(wider.state, state):
+            answer = wider
+            break
+    if not np.isin(problem.lens, answer.state.moving).all() and _speaks_against_lens(answer, arm):
+        contested = replace(answer.problem, contested=True)
+        again = settle(contested, arm, answer.state.moving, answer.state.again())
+        answer = _Answer(contested, again)
+    return _resized(answer, arm)
+
+
+def _freed(problem: Problem, arm: Arm, moving: IntArray, state: State) -> _Answer:
+    """Fits with more values free; a confident wrong prior is worse than none."""
+    wider = settle(problem, arm, moving, state.again())
+    if not np.isin(problem.lens, moving).all() or not contradicted_lens(problem, wider):
+        return _Answer(problem, wider)
+    unknown = problem.without_prior(problem.lens)
+    return _Answer(unknown, settle(unknown, arm, moving, wider.again()))
+
+
+def _resized(answer: _Answer, arm: Arm) -> _Answer:
+    """Sets the board's scale free where the robot measures another than is stated."""
+    problem, state = answer.problem, answer.state
+    measured = measured_scale(problem, arm, state)
+    if not measured.is_another:
+        return answer
+    if measured.contradicts:
+        problem = problem.without_prior(problem.scale)
+    moving = np.union1d(state.moving, problem.scale)
+    resized = _Answer(problem, settle(problem, arm, moving, state.again()))
+    return resized if _is_determined(resized.state) else answer
 
 
 def _is_determined(state: State) -> bool:
-    """Whether the views still determine both edges to what is accepted."""
-    worst = worst_directions(state.data, state.fit.edges, state.fit.noise)
+    """Whether the views still determine both edges to what is accepted, errors of the arm aside."""
+    looks = len(state.seen.free.columns)
+    edges = replace(state.fit.edges, shared=state.fit.edges.shared[:looks])
+    worst = worst_directions(state.data.with_first(looks), edges, state.fit.noise)
     return all(it.sigma < it.limit for it in worst)
 
 
-def _is_contradicted(problem: Problem, state: State) -> bool:
-    """Whether given intrinsics are farther off than anybody's are."""
-    moved = state.again().appearance.values - problem.stated.values
-    return bool(np.any(np.abs(moved)[problem.lens] > 3.0 * problem.prior_sigma[problem.lens]))
+def _speaks_against_lens(answer: _Answer, arm: Arm) -> bool:
+    """Whether given intrinsics that are held explain the corners worse than chance does."""
+    problem, state = answer.problem, answer.state
+    if not problem.has_spare_corners:
+        return False
+    bent = np.union1d(state.moving, problem.shape)
+    everything = np.union1d(bent, problem.lens)
+    more = gain(problem, arm, state, everything) - gain(problem, arm, state, bent)
+    return more > chance_limit(len(problem.lens))
 
 
 def held(scene: Scene) -> Free:
@@ -213,12 +263,6 @@ def _shapes(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
         yield bent
 
 
-def _scales(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
-    """The board's scale, where the robot measures another than is stated."""
-    if measured_scale(problem, arm, state).is_another:
-        yield np.union1d(state.moving, problem.scale)
-
-
 def _predicts_worse(wider: State, state: State) -> bool:
     """Whether views that are left out are predicted worse, in position and in rotation."""
     errors = [
@@ -236,7 +280,7 @@ def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
 def _remade(
     view: ViewPoses, compressed: Compressed, columns: IntArray, sigma_px: float, at: int
 ) -> ViewPoses:
-    spread = max(sigma_px, 1e-6) ** 2 * covariance(compressed.information[at])
+    spread = floored_sigma_px(sigma_px) ** 2 * covariance(compressed.information[at])
     return replace(
         view,
         cam_from_target=compressed.cam_from_target[at][None],

@@ -1,12 +1,14 @@
 """Where the robot says that its flange was: poses as reported, or joints through the model."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.closure import deviations
+from visioncal.estimator.closure import distances
+from visioncal.figures import figure
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.transforms import invert, mean_transform, pose_difference, rotation_angle
@@ -15,10 +17,14 @@ from visioncal.types import FloatArray, Rejection
 # Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
 # another convention is off by far more.
 _AGREE_M, _AGREE_RAD = 1e-3, 2e-3
+# The robot stands still while a stop's images are taken; controllers report it with some noise.
+_ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
 # Beyond, the model is of another arm, or its base or its tip is another frame.
 _SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
 # Arms have at most seven joints in the models that ship; messages list no more columns than that.
 _LISTED_COLUMNS = 7
+# Where at least this share of the rows disagrees, it is not the rows that are wrong.
+_MOST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +55,8 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         The poses, and whether joints and poses disagree.
 
     Raises:
-        DataError: Joints are all there is, and they are not as many as the robot's.
+        DataError: Joints are all there is, and they are not as many as the robot's; or rows that
+            are said to be of one stop lie apart.
     """
     poses: dict[int, FloatArray] = {}
     rejections = []
@@ -66,7 +73,28 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
             rejections.append(Rejection(view.number, reason))
         else:
             rejections.append(Rejection(view.number, "no pose of the robot: x_m to qw are empty"))
+    _check_stops(session, poses)
     return Reported(poses, tuple(rejections), tuple(_disagreement(session, robot)))
+
+
+def _check_stops(session: Session, poses: Mapping[int, FloatArray]) -> None:
+    """Refuses declared stops whose rows lie apart: one pose of the robot would stand for all."""
+    rows = defaultdict(list)
+    for view in session.views:
+        if view.stop is not None and view.number in poses:
+            rows[view.stop].append(view.number)
+    for stop, views in rows.items():
+        away = [pose_difference(poses[views[0]], poses[view]) for view in views]
+        mm, deg = np.max(away, axis=0)
+        if mm > _ONE_STOP_MM or deg > _ONE_STOP_DEG:
+            named = ", ".join(map(str, views))
+            raise DataError(
+                f"views.csv: the rows of stop {stop} (views {named}) have poses of the robot up to "
+                f"{mm:.4g} mm and {deg:.3g} deg apart; those of one stop lie within "
+                f"{_ONE_STOP_MM:g} mm and {_ONE_STOP_DEG:g} deg.",
+                culprits=[f"views.csv: view {view}" for view in views],
+                next_step="Remove the stop numbers, or correct the poses.",
+            )
 
 
 def usable_joints(
@@ -112,30 +140,41 @@ def _disagreement(session: Session, robot: Robot | None) -> Iterator[str]:
     if robot is None:
         return
     both = [
-        (np.asarray(pose.as_matrix()), joints)
+        (view.number, np.asarray(pose.as_matrix()), joints)
         for view in session.views
         if (pose := view.base_from_flange()) is not None and (joints := view.joints_rad) is not None
     ]
     if not both:
         return
-    if any(len(joints) != robot.joint_count for _, joints in both):
+    views, poses, angles = zip(*both, strict=True)
+    if any(len(joints) != robot.joint_count for joints in angles):
         yield (
-            f"Joint angles were not used: there are {len(both[0][1])} a row, and {robot.name} has "
+            f"Joint angles were not used: there are {len(angles[0])} a row, and {robot.name} has "
             f"{robot.joint_count} joints."
         )
         return
-    reported = np.array([pose for pose, _ in both])
-    flange_from_reported = invert(robot.base_from_flange(np.array([q for _, q in both]))) @ reported
-    away_m, away_rad = deviations(flange_from_reported)
-    if away_m.max() > _AGREE_M or away_rad.max() > _AGREE_RAD:
+    flange_from_reported = invert(robot.base_from_flange(np.array(angles))) @ np.array(poses)
+    # The most central one, which wrong rows do not move as they would move the mean.
+    away_m, away_rad = min(
+        (distances(flange_from_reported, it) for it in flange_from_reported),
+        key=lambda away: float(np.median(away[0]) + np.median(away[1])),
+    )
+    apart = (away_m > _AGREE_M) | (away_rad > _AGREE_RAD)
+    figures = f"{figure(1e3 * away_m.max())} mm and {figure(np.rad2deg(away_rad.max()))} deg"
+    if apart.mean() >= _MOST:
         yield (
             f"Poses and joint angles disagree: through the model of {robot.name} the joints give "
-            f"poses that differ by up to {1e3 * away_m.max():.2g} mm and "
-            f"{np.rad2deg(away_rad.max()):.2g} deg. The hand-eye result uses the poses. Check "
+            f"poses that differ by up to {figures}. The hand-eye result uses the poses. Check "
             "[robot] model and tip, and whether the base frame is the controller's."
         )
         return
-    offset_mm, turn_deg = pose_difference(np.eye(4), mean_transform(flange_from_reported))
+    if apart.any():
+        wrong = ", ".join(f"view {view}" for view, it in zip(views, apart, strict=True) if it)
+        yield (
+            f"Pose and joint angles disagree in {wrong}, by up to {figures}; in the other "
+            "views they agree. The hand-eye result uses the poses. Correct what is wrong there."
+        )
+    offset_mm, turn_deg = pose_difference(np.eye(4), mean_transform(flange_from_reported[~apart]))
     if offset_mm > 1e3 * _AGREE_M or turn_deg > np.rad2deg(_AGREE_RAD):
         yield (
             f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "

@@ -1,4 +1,4 @@
-"""Stage 6: predicts each view from a fit that has not seen it."""
+"""Predicts each view from a fit that has not seen it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -22,6 +22,7 @@ class _Contents:
     images: bool
     joints: int
     unused: bool
+    frames: bool
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
@@ -43,6 +44,7 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         any(view.image for view in session.views),
         min(joints, default=0),
         not all(view.used for view in results),
+        calibration is not None and bool(calibration.frames),
     )
     tabs = rrb.Tabs(
         _overview(contents, _eye(session, calibration)),
@@ -76,7 +78,7 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
     )
     plots = _plots(contents)
     left = rrb.Vertical(cell, rrb.Horizontal(plots[0], plots[-1]), row_shares=[3, 1])
-    verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    verdict = _verdict(contents)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
     if not contents.images:
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
@@ -88,6 +90,15 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
     )
     right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _verdict(contents: _Contents) -> rrb.Container | rrb.View:
+    """The verdict, and what is said of tools and fixtures behind it."""
+    verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    if not contents.frames:
+        return verdict
+    tools = rrb.TextDocumentView(name="Tools and fixtures", origin=paths.TOOLS)
+    return rrb.Tabs(verdict, tools, active_tab=0)
 
 
 def _residuals(contents: _Contents) -> rrb.Container:
@@ -169,6 +180,7 @@ def _cell_contents(contents: _Contents) -> list[str]:
         paths.STOPS,
         paths.CAMERA,
         paths.TARGET,
+        paths.FRAMES,
         paths.SEEN_TARGET,
     ]
     # The image's overlays would float as a crowd of points in the frustum.

@@ -1,0 +1,44 @@
+"""Made-up frames of a tool and a fixture, as `visioncal tcp` and `visioncal fixture` leave them."""
+
+import numpy as np
+
+from visioncal.calibration import Edge, Frame, FrameFile, Observation, Verdict
+from visioncal.transforms import exp
+
+TOOL, FIXTURE = "flange_from_tool", "base_from_fixture"
+CREATED = "2026-11-20T12:13:14+00:00"
+GOOD = Verdict("good", ("The tip is determined to 0.22 mm.",))
+FLANGE_FROM_TOOL = exp(np.array([0.1, -0.4, 2.0, 0.0338, 0.001, 0.0768]))
+BASE_FROM_FIXTURE = exp(np.array([0.01, 0.02, -1.1, 0.71, -0.33, 0.12]))
+# [rad], [m]
+COVARIANCE = np.diag([1e-4, 2e-4, 2e-4, 1e-4, 1e-4, 1.5e-4]) ** 2
+
+
+def frame(matrix, *, oriented=True, verdict=GOOD, source="touches.csv"):
+    covariance = COVARIANCE.copy()
+    if not oriented:
+        covariance[:3], covariance[:, :3] = 0.0, 0.0
+    return Frame(
+        Edge(matrix, covariance),
+        oriented,
+        "pivot over 10 touches",
+        source,
+        CREATED,
+        0.21,
+        0.1,
+        (Observation("1", used=True, kind="point", residual_mm=0.1),),
+        verdict,
+    )
+
+
+def tool(matrix=FLANGE_FROM_TOOL, **changes):
+    return {TOOL: frame(matrix, **changes)}
+
+
+def fixture(matrix=BASE_FROM_FIXTURE, **changes):
+    return {FIXTURE: frame(matrix, **changes)}
+
+
+def alone(*frames):
+    """A file of frames without a calibration."""
+    return FrameFile({name: it for some in frames for name, it in some.items()})

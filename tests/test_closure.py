@@ -1,0 +1,110 @@
+"""Identities of the joint fit: views left out, stops merged, and the likelihood's slope."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cells import calibrated
+
+from visioncal.estimator.closure import (
+    RATIO_PRIOR,
+    Closure,
+    Shared,
+    closure_jacobian,
+    components_of,
+    fit_closure,
+    knowledge_of,
+    left_out_residuals,
+    normal_equations,
+    residual_blocks,
+    solve_closure,
+)
+from visioncal.estimator.variance import _likelihood
+from visioncal.simulation import CellOptions, fine_camera, simulate
+
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+LENS = pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+
+
+def answered(given, **changes):
+    known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
+    data = known.closure(known.used)
+    return data, fit_closure(data, known.solved.edges)
+
+
+@LENS
+def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
+    data, fit = answered(given, views=12, seed=3)
+    predicted = left_out_residuals(data, fit.edges, fit.noise)
+    spread = residual_blocks(data, fit.edges, fit.noise)[2]
+    for view in range(12):
+        others = np.arange(12) != view
+        without, _ = solve_closure(data.subset(others), fit.edges, fit.noise)
+        refitted = residual_blocks(data, without, fit.noise)[0][view]
+        sigma = np.sqrt(np.diagonal(spread[view]))
+        # To first order: what is left is the curvature over a step of the size of the noise.
+        np.testing.assert_allclose(predicted[view], refitted, atol=0.01 * sigma.max())
+
+
+def doubled(data):
+    """Every view twice, as two that know half as much each."""
+    again = np.repeat(np.arange(len(data)), 2)
+    shared = data.shared
+    return Closure(
+        data.mount,
+        data.robot[again],
+        data.camera[again],
+        2.0 * data.camera_covariance[again],
+        replace(shared, by_camera=shared.by_camera[again], by_flange=shared.by_flange[again]),
+    ), again
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
+    data, fit = answered(False, views=8, seed=2, mount=mount)
+    arm = 1e-3 * np.random.default_rng(0).standard_normal((8, 6, 2))
+    nothing = np.zeros((8, 6, 2))
+    data = data.with_more(Shared(np.eye(2), np.zeros(2), np.zeros(2), nothing, arm))
+    once = replace(fit.edges, shared=data.unchanged)
+    twice, stops = doubled(data)
+    merged = twice.merged(stops)
+    for expected, seen in zip(
+        normal_equations(data, once, fit.noise),
+        normal_equations(merged, once, fit.noise),
+        strict=True,
+    ):
+        # The same sums in another order.
+        np.testing.assert_allclose(seen, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+def test_views_of_a_stop_move_with_the_lens_by_their_information():
+    data, _ = answered(False, views=8, seed=2)
+    twice, stops = doubled(data)
+    # The second view of each stop knows nothing to speak of, and says nonsense.
+    known, lens = twice.camera_covariance.copy(), twice.shared.by_camera.copy()
+    known[1::2] *= 1e12
+    lens[1::2] *= -5.0
+    lopsided = replace(
+        twice, camera_covariance=known, shared=replace(twice.shared, by_camera=lens)
+    ).merged(stops)
+    np.testing.assert_allclose(lopsided.shared.by_camera, data.shared.by_camera, rtol=1e-6)
+    np.testing.assert_allclose(lopsided.camera_covariance, 2 * data.camera_covariance, rtol=1e-6)
+
+
+@LENS
+def test_the_likelihood_slopes_as_its_differences_say(given):
+    data, fit = answered(given, views=10, seed=4)
+    edges = fit.edges.moved(np.full(12 + len(fit.edges.shared), 1e-5))
+    residuals = residual_blocks(data, edges, fit.noise)[0]
+    known = knowledge_of(data, edges)
+
+    def at(logs):
+        jacobian, parts = closure_jacobian(data, edges), components_of(data, edges.z)
+        return _likelihood(residuals, jacobian, parts, known, logs, RATIO_PRIOR)
+
+    logs, step = np.log(2.0 * fit.noise.sigmas), 1e-4
+    for level in range(2):
+        shift = step * np.eye(2)[level]
+        slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
+        # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
+        assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)

@@ -1,0 +1,246 @@
+"""The pick: where a feature that an image shows lies in the base, and how well that is known."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from visioncal.calibration import Calibration
+from visioncal.camera import normalise, project_with_jacobian
+from visioncal.errors import DataError
+from visioncal.estimator.observability import SIGMA_LIMIT_M
+from visioncal.frames.chain import Eye, Stop, point_slope
+from visioncal.frames.located import Located
+from visioncal.frames.look import SeenTarget, see
+from visioncal.frames.plane import Plane
+from visioncal.types import Corners, FloatArray, Image, Target
+
+# A ray within this angle of a plane [rad] does not meet it at any place that could be told.
+_PARALLEL = 1e-6
+
+
+def locate(
+    calibration: Calibration,
+    px: FloatArray,
+    plane: Plane,
+    base_from_flange: FloatArray | None = None,
+    *,
+    sigma_px: float | None = None,
+) -> tuple[Located, ...]:
+    """Places features of an image in the base, by the plane that they lie in.
+
+    Args:
+        calibration: The camera's.
+        px: (n, 2) where the features were seen [px], pixel centres at integers.
+        plane: What they lie in.
+        base_from_flange: (4, 4) where the robot stood at the image, as it reported it; only for a
+            camera on the flange.
+        sigma_px: Noise of a feature's coordinate [px]; the calibration's corners' where None.
+
+    Returns:
+        One place a feature. Features of one image share all but the pixels' noise.
+
+    Raises:
+        DataError: There is no camera or no pose of the robot, a pixel is outside the image, or its
+            ray does not meet the plane in front of the camera.
+    """
+    eye = Eye.of(calibration)
+    noise_px, stop = eye.noise_px(sigma_px), eye.at(base_from_flange)
+    px = np.atleast_2d(np.asarray(px, dtype=float))
+    rays = _rays(eye, px)
+    return tuple(
+        _on_plane(eye, stop, plane, ray, noise_px, f"pixel ({u:.1f}, {v:.1f})")
+        for ray, (u, v) in zip(rays, px.tolist(), strict=True)
+    )
+
+
+def _rays(eye: Eye, px: FloatArray) -> FloatArray:
+    """(n, 3) points at unit depth in the camera's frame."""
+    if px.shape[1:] != (2,):
+        raise DataError(f"locate: pixels have the shape {px.shape}; (n, 2) is needed.")
+    size = np.array(eye.camera.resolution)
+    inside = np.all((px >= -0.5) & (px <= size - 0.5), axis=1)
+    plane = normalise(eye.camera, np.where(inside[:, None], px, eye.camera.matrix[2:]))
+    for at, (u, v) in enumerate(px.tolist()):
+        if not inside[at]:
+            raise DataError(
+                f"locate: pixel ({u:.1f}, {v:.1f}) is outside the camera's image of "
+                f"{size[0]} x {size[1]}.",
+                culprits=[f"pixel {at}"],
+                next_step="Give pixels of the full image, as the camera took it.",
+            )
+        if not np.isfinite(plane[at]).all():
+            raise DataError(
+                f"locate: the lens's distortion cannot be inverted at pixel ({u:.1f}, {v:.1f}).",
+                culprits=[f"pixel {at}"],
+                next_step="Calibrate with corners up to the image's edge.",
+            )
+    return np.concatenate([plane, np.ones((len(px), 1))], axis=1)
+
+
+def _on_plane(
+    eye: Eye, stop: Stop, plane: Plane, ray: FloatArray, noise_px: float, label: str
+) -> Located:
+    """Cuts a ray with the plane, and carries all that is open about both to the cut."""
+    along = stop.base_from_cam[:3, :3] @ ray
+    rise = float(plane.normal @ along)
+    gap = plane.offset_m - float(plane.normal @ stop.base_from_cam[:3, 3])
+    if abs(rise) < _PARALLEL * np.linalg.norm(along):
+        raise DataError(
+            f"locate: the ray of {label} runs parallel to the plane.", next_step=_LOOK_AT_PLANE
+        )
+    depth = gap / rise
+    if depth <= 0.0:
+        raise DataError(
+            f"locate: the ray of {label} runs away from the plane: they meet {-depth:.3g} m "
+            "behind the camera.",
+            next_step=_LOOK_AT_PLANE,
+        )
+    point_cam = depth * ray
+    place = stop.point(point_cam)
+    # The point stays on the plane: what moves its ray carries it there along the ray.
+    kept = np.eye(3) - np.outer(along, plane.normal) / rise
+    by_px, by_lens = _ray_slopes(eye, point_cam)
+    turned = kept @ stop.base_from_cam[:3, :3]
+    by_camera = kept @ stop.by_camera(point_cam)
+    by_plane = np.outer(along / rise, np.append(-place, 1.0))
+    parts = {
+        "pixels": _carried(noise_px * turned @ by_px, np.eye(2)),
+        "plane": _carried(by_plane, plane.covariance),
+        **_camera_parts(eye, stop, by_camera, turned @ by_lens),
+    }
+    return _located(eye, place, parts, ())
+
+
+_LOOK_AT_PLANE = (
+    "Check the plane (metres, in the base) and the robot's pose (base_from_flange, no inverse)."
+)
+
+
+def _ray_slopes(eye: Eye, point_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How the point at this depth moves with its pixel, (3, 2), and with the lens, (3, k)."""
+    seen = project_with_jacobian(eye.camera, point_cam[None])
+    inverse = np.zeros((3, 2))
+    inverse[:2] = np.linalg.inv(seen.by_point[0, :, :2])
+    return inverse, -inverse @ seen.by_intrinsics[0]
+
+
+def _camera_parts(
+    eye: Eye, stop: Stop, by_camera: FloatArray, by_lens: FloatArray
+) -> dict[str, FloatArray]:
+    """What the calibration and the robot add to a place, by how it moves with camera and lens."""
+    by_flange = by_camera @ stop.by_flange
+    return {
+        "calibration": _carried(np.concatenate([by_camera, by_lens], axis=1), eye.covariance),
+        "robot": _carried(by_flange, stop.flange_noise),
+        "arm": _carried(by_flange @ stop.arm_basis, np.eye(stop.arm_basis.shape[1])),
+    }
+
+
+def _carried(slope: FloatArray, spread: FloatArray) -> FloatArray:
+    return np.asarray(slope @ spread @ slope.T)
+
+
+def _located(
+    eye: Eye, place: FloatArray, parts: dict[str, FloatArray], warnings: Sequence[str]
+) -> Located:
+    """Puts the place together; sources that add nothing are left out."""
+    kept = {name: it for name, it in parts.items() if np.trace(it) > 0.0}
+    kept = kept or {"pixels": np.zeros((3, 3))}
+    found = Located(place, kept, _freedom(eye, kept), (*eye.warnings, *warnings))
+    worst_m = float(np.sqrt(max(np.linalg.eigvalsh(found.covariance)[-1], 0.0)))
+    if worst_m <= SIGMA_LIMIT_M:
+        return found
+    source = max(kept, key=lambda name: float(np.trace(kept[name])))
+    told = (
+        f"The place is known to {1e3 * worst_m:.2g} mm only in its worst direction (limit "
+        f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[source]}."
+    )
+    return Located(place, kept, found.freedom, (*found.warnings, told))
+
+
+def _freedom(eye: Eye, parts: Mapping[str, FloatArray]) -> float:
+    """Degrees of freedom of a sum of which a part rests on the robot's noise (Satterthwaite 1946).
+
+    The pixels' noise comes from thousands of corners; plane and target are declared.
+    """
+    total = sum(float(np.trace(it)) for it in parts.values())
+    estimated = sum(float(np.trace(parts[it])) for it in _ESTIMATED & parts.keys())
+    return eye.freedom * (total / estimated) ** 2 if estimated > 0.0 else np.inf
+
+
+# What is as uncertain as the robot's noise is itself.
+_ESTIMATED = {"calibration", "robot", "arm"}
+
+
+_SOURCES = {
+    "pixels": "pixel's noise: look from nearer, or less along the plane",
+    "plane": "plane's own uncertainty",
+    "calibration": "hand-eye calibration",
+    "robot": "robot's noise",
+    "arm": "arm's errors, which a kinematic calibration would take out",
+    "target": "target's uncertain size",
+}
+
+
+def locate_target(
+    calibration: Calibration,
+    seen: Corners | Image,
+    target: Target,
+    base_from_flange: FloatArray | None = None,
+    point_target_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
+    *,
+    sigma_px: float | None = None,
+) -> Located:
+    """Places a point of a target that an image shows in the base.
+
+    The target's size counts with its `square_sigma_m`, and as independent of the calibration: of
+    the board that was calibrated with, a part of that is counted twice.
+
+    Args:
+        calibration: The camera's.
+        seen: The target's corners, or the (h, w) grey image to find them in.
+        target: What is seen.
+        base_from_flange: (4, 4) where the robot stood at the image, as it reported it; only for a
+            camera on the flange.
+        point_target_m: (3,) the point in the target's frame [m].
+        sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
+
+    Raises:
+        DataError: There is no camera or no pose of the robot, or the image does not show the
+            target.
+    """
+    eye = Eye.of(calibration)
+    stop = eye.at(base_from_flange)
+    view = see(eye, seen, target, "image", sigma_px)
+    point = np.asarray(point_target_m, dtype=float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise DataError(f"locate: point_target_m is {point.tolist()}; three metres are needed.")
+    places = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
+    pose, point_cam = view.cam_from_target[0], places[0]
+    turned = stop.base_from_cam[:3, :3] @ point_slope(pose, point)
+    parts = {
+        "pixels": _carried(turned, view.covariance[0]),
+        "target": _carried((turned @ view.by_scale[0])[:, None], np.array([[view.scale_sigma**2]])),
+        **_camera_parts(eye, stop, stop.by_camera(point_cam), turned @ view.by_lens[0]),
+    }
+    found = _located(eye, stop.point(point_cam), parts, view.warnings)
+    rivals = _rivals(view, places, found)
+    if not rivals:
+        return found
+    return Located(found.p_base, found.parts, found.freedom, (*found.warnings, rivals))
+
+
+def _rivals(view: SeenTarget, places: FloatArray, found: Located) -> str:
+    """Says that another pose fits the image as well, where the point would lie elsewhere."""
+    away_mm = 1e3 * float(np.linalg.norm(places - places[0], axis=1).max())
+    if away_mm <= found.radius95_mm:
+        return ""
+    why = (
+        "The board looks the same when it is turned"
+        if len(set(view.turns)) > 1
+        else "Seen so flat, the target may as well be tilted the other way"
+    )
+    return (
+        f"{why}: the point would lie {away_mm:.2g} mm away then. Look from another side, from "
+        "nearer, or at a board without symmetry."
+    )

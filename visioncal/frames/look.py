@@ -1,0 +1,194 @@
+"""A look through a calibrated camera: a target's pose in one image, and what moves it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from visioncal.errors import DataError
+from visioncal.estimator.appearance import (
+    BOARD_NAMES,
+    SCALE,
+    Appearance,
+    Compressed,
+    board_basis,
+    compress,
+)
+from visioncal.estimator.corners import CornerStack
+from visioncal.estimator.gating import gate
+from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.planar import determines_pose
+from visioncal.finders import NotFound, find_target
+from visioncal.finders.imaging import blur_at_corners, why_hard_to_see
+from visioncal.frames.chain import Eye
+from visioncal.stages.pnp import ViewPoses, measure_poses
+from visioncal.targets import corner_positions, rotations
+from visioncal.types import Camera, Corners, FloatArray, Image, Target
+
+# Corners scatter more than this by chance in one look of ten thousand.
+_FALSE_ALARM = 1e-4
+# Wrong corners spoil the pose that they are judged by: so often it is made anew without them.
+_ROUNDS = 3
+# Edges wider than this hide an image's corners; the widest that detection takes.
+_MAX_BLUR_PX = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTarget:
+    """A target as one image shows it: c poses that it allows, the best by reprojection first.
+
+    Attributes:
+        cam_from_target: (c, 4, 4).
+        covariance: (c, 6, 6) of the right perturbations, by the pixels' noise alone.
+        by_lens: (c, 6, k) how each moves with the camera's intrinsics.
+        by_scale: (c, 6) how each moves with the target's size, as a share of it.
+        scale_sigma: How well the size is known, as a share of it.
+        turns: (c,) which of the target's own symmetries each has applied.
+        warnings: What is odd about the image, in sentences.
+    """
+
+    cam_from_target: FloatArray
+    covariance: FloatArray
+    by_lens: FloatArray
+    by_scale: FloatArray
+    scale_sigma: float
+    turns: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+
+def see(
+    eye: Eye, seen: Corners | Image, target: Target, label: str, sigma_px: float | None = None
+) -> SeenTarget:
+    """Finds the poses of a target in one image.
+
+    Args:
+        eye: The calibrated camera.
+        seen: The target's corners, or the (h, w) grey image to find them in.
+        target: What is seen.
+        label: What the image is called in messages.
+        sigma_px: Noise of a corner's coordinate [px]; the calibration's where None. Corners that
+            scatter significantly more count with what they show, and a warning says so.
+
+    Raises:
+        DataError: The target is not in the image, its corners do not determine a pose, or they do
+            not fit any pose of it.
+    """
+    corners = seen if isinstance(seen, Corners) else _found(eye, seen, target, label)
+    _check(corners, target, label)
+    noise_px = eye.noise_px(sigma_px)
+    with one_blas_thread():
+        poses, corners, squares = _fitted(eye.camera, corners, target, label, noise_px)
+        looks = [_slopes(eye.camera, poses, at, corners, target) for at in range(len(poses.turns))]
+    noise_px, warnings = _noise(noise_px, squares, 2 * len(corners.ids) - 6, label)
+    # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
+    variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
+    return SeenTarget(
+        np.array([it.cam_from_target[0] for it in looks]),
+        np.array([variance * covariance(it.information[0]) for it in looks]),
+        np.array([it.by_shared[0, :, :lens] for it in looks]),
+        np.array([it.by_shared[0, :, lens + SCALE] for it in looks]),
+        target.square_sigma_m / target.square_m,
+        poses.turns,
+        warnings,
+    )
+
+
+def check_size(eye: Eye, image: Image, label: str) -> None:
+    """Refuses an image of another size than the camera's.
+
+    Raises:
+        DataError: So it is.
+    """
+    width, height = eye.camera.resolution
+    if image.shape != (height, width):
+        shown = " x ".join(map(str, image.shape[1::-1] + image.shape[2:]))
+        raise DataError(
+            f"{label}: it has {shown} pixels, and the calibrated camera has {width} x {height}, "
+            "grey.",
+            culprits=[label],
+            next_step="Take the image with the same camera, binning and region as calibrated.",
+        )
+
+
+def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
+    check_size(eye, image, label)
+    seen = find_target(image, target)
+    if isinstance(seen, NotFound):
+        cause = why_hard_to_see(image, _MAX_BLUR_PX)
+        raise DataError(
+            f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
+            culprits=[label],
+        )
+    return Corners(0, seen.ids, seen.px, blur_at_corners(image, seen.px))
+
+
+def _check(corners: Corners, target: Target, label: str) -> None:
+    positions = corner_positions(target)
+    ids = corners.ids
+    if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):
+        raise DataError(
+            f"{label}: corners {ids.min()} to {ids.max()}, and target {target.name} has "
+            f"{len(positions)}.",
+            culprits=[label],
+        )
+    if not determines_pose(positions[ids]):
+        raise DataError(
+            f"{label}: {len(ids)} corners of target {target.name} do not determine its pose: it "
+            "takes four, of which two lie off every line.",
+            culprits=[label],
+        )
+
+
+def _fitted(
+    camera: Camera, corners: Corners, target: Target, label: str, noise_px: float
+) -> tuple[ViewPoses, Corners, float]:
+    """The poses, the corners that fit the best of them, and the sum of their squares [px^2]."""
+    positions = corner_positions(target)
+    for _ in range(_ROUNDS):
+        (poses,) = measure_poses({corners.view: corners}, target, camera, noise_px)
+        stack = CornerStack.of({corners.view: corners}, positions)
+        residuals = _compressed(camera, stack, target, poses.cam_from_target[:1]).residuals
+        passed = gate(stack, residuals)
+        if passed.reasons:
+            reason = next(iter(passed.reasons.values()))
+            raise DataError(f"{label}: target {target.name}: {reason}.", culprits=[label])
+        if passed.is_open:
+            break
+        kept = passed.mask
+        corners = Corners(corners.view, corners.ids[kept], corners.px[kept], corners.blur_px)
+    return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
+
+
+def _slopes(
+    camera: Camera, poses: ViewPoses, at: int, corners: Corners, target: Target
+) -> Compressed:
+    """One of the poses with all that moves it, under the numbering that it stands for."""
+    # Turned, corner i lies where corner p[i] was: what was seen as that one is i.
+    ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
+    order = np.argsort(ids)
+    turned = Corners(corners.view, ids[order], corners.px[order], corners.blur_px)
+    stack = CornerStack.of({turned.view: turned}, corner_positions(target))
+    return _compressed(camera, stack, target, poses.cam_from_target[at : at + 1])
+
+
+def _compressed(
+    camera: Camera, stack: CornerStack, target: Target, starts: FloatArray
+) -> Compressed:
+    flat = Appearance(camera, np.zeros(len(BOARD_NAMES)))
+    return compress(stack, board_basis(corner_positions(target)), flat, starts)
+
+
+def _noise(
+    noise_px: float, squares: float, freedom: int, label: str
+) -> tuple[float, tuple[str, ...]]:
+    """The noise to count with: what is known, or what the corners show where that is more."""
+    limit = noise_px**2 * float(chi2.ppf(1.0 - _FALSE_ALARM, freedom))
+    shown = float(np.sqrt(squares / freedom))
+    # Rounding of exact corners is no scatter.
+    if squares <= limit or shown < 1e-6:
+        return noise_px, ()
+    return shown, (
+        f"{label}: the corners scatter by {shown:.2g} px around the target's pose, and "
+        f"{noise_px:.2g} px was to be expected: look whether the image is sharp, and the target "
+        "flat and of the size that is stated.",
+    )

@@ -1,0 +1,206 @@
+"""Touches: where the flange stood when a point of the tool met a point of the cell."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean, some_of
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.transforms import invert, rotation_angle
+from visioncal.types import FloatArray, Mask
+
+# No arm reaches this far [m], and no joint of one turns this far [rad].
+_FAR_M, _WIDE_RAD = 20.0, 4 * np.pi
+# Poses and the model's, of one row: farther apart the model is of another arm or of another frame.
+_SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class TouchRows:
+    """The rows of a file of touches, n in all.
+
+    Attributes:
+        source: What they were read from, for messages and for the record.
+        labels: (n,) the rows' view numbers, as text.
+        places: (n,) where each stands: `touches.csv, line 3`.
+        base_from_flange: (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose.
+        joints_rad: (n, j) joint angles [rad], NaN in a row without; None where there are none.
+        kinds: (n,) what was touched; empty where the row does not say.
+        points: (n,) which point was touched; empty likewise.
+    """
+
+    source: str
+    labels: tuple[str, ...]
+    places: tuple[str, ...]
+    base_from_flange: FloatArray
+    joints_rad: FloatArray | None
+    kinds: tuple[str, ...]
+    points: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def of_kinds(self, allowed: Sequence[str], default: str) -> "TouchRows":
+        """Returns the rows with every kind filled in.
+
+        Args:
+            allowed: The kinds that make sense here.
+            default: What a row without a kind is.
+
+        Raises:
+            DataError: A row is of another kind.
+        """
+        kinds = tuple(it.strip().lower() or default for it in self.kinds)
+        wrong = [at for at, it in enumerate(kinds) if it not in allowed]
+        if wrong:
+            raise DataError(
+                f"{self.places[wrong[0]]}: kind is {self.kinds[wrong[0]]!r}; "
+                f"{some_of(allowed)} or nothing, for {default}, is needed.",
+                culprits=[self.places[at] for at in wrong],
+                next_step=did_you_mean(kinds[wrong[0]], allowed),
+            )
+        return replace(self, kinds=kinds)
+
+    def rows(self, chosen: Mask) -> "TouchRows":
+        """Returns the rows of an (n,) mask."""
+        at = np.flatnonzero(chosen)
+        return TouchRows(
+            self.source,
+            tuple(self.labels[it] for it in at),
+            tuple(self.places[it] for it in at),
+            self.base_from_flange[chosen],
+            None if self.joints_rad is None else self.joints_rad[chosen],
+            tuple(self.kinds[it] for it in at),
+            tuple(self.points[it] for it in at),
+        )
+
+
+def touches_of(session: Session) -> TouchRows:
+    """Takes the rows of a session's views.csv for touches."""
+    nowhere = np.full((4, 4), np.nan)
+    poses, joints = [], []
+    for view in session.views:
+        pose = view.base_from_flange()
+        poses.append(nowhere if pose is None else np.asarray(pose.as_matrix()))
+        joints.append(view.joints_rad)
+    size = max((len(it) for it in joints if it is not None), default=0)
+    missing = np.full(size, np.nan)
+    return TouchRows(
+        session.name,
+        tuple(str(it.number) for it in session.views),
+        tuple(f"views.csv, view {it.number}" for it in session.views),
+        np.array(poses),
+        np.array([missing if it is None else it for it in joints]) if size else None,
+        tuple(it.text.get("kind", "") for it in session.views),
+        tuple(it.text.get("point", "") for it in session.views),
+    )
+
+
+def flange_poses(rows: TouchRows, robot: Robot | None, *, calibrated: bool = False) -> FloatArray:
+    """Collects where the flange was.
+
+    Args:
+        rows: The touches.
+        robot: The arm's model, where one is known.
+        calibrated: Whether the model is better than what the controller reports: then joints come
+            first.
+
+    Returns:
+        (n, 4, 4) `base_from_flange` [m].
+
+    Raises:
+        DataError: A row has no pose, joints do not fit the model, or the numbers are in other units
+            than metres and radians.
+    """
+    _check_lengths(rows)
+    reported = np.isfinite(rows.base_from_flange).all(axis=(1, 2))
+    modelled, poses = _modelled(rows, robot, needed=not reported.all())
+    without = np.flatnonzero(~reported & ~modelled)
+    if len(without):
+        places = [rows.places[it] for it in without]
+        raise DataError(
+            f"{some_of(places)}: no pose of the robot.",
+            culprits=places,
+            next_step="Fill in x_m to qw, or joint angles and --robot-model.",
+        )
+    first = modelled if calibrated else modelled & ~reported
+    return np.where(first[:, None, None], poses, rows.base_from_flange)
+
+
+def _check_lengths(rows: TouchRows) -> None:
+    away = np.linalg.norm(rows.base_from_flange[:, :3, 3], axis=1)
+    far = np.flatnonzero(away > _FAR_M)
+    if len(far):
+        raise DataError(
+            f"{rows.places[far[0]]}: the flange is {away[far[0]]:.4g} m from the base, and no arm "
+            f"reaches {_FAR_M:g} m: these look like millimetres.",
+            culprits=[rows.places[it] for it in far],
+            next_step="Say --robot-unit mm, or write metres.",
+        )
+
+
+def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Mask, FloatArray]:
+    """Which rows the arm's model gives a pose of, and these."""
+    poses, there = rows.base_from_flange.copy(), np.zeros(len(rows), dtype=bool)
+    if rows.joints_rad is None:
+        return there, poses
+    there = np.asarray(np.isfinite(rows.joints_rad).all(axis=1))
+    _check_angles(rows, there)
+    if robot is None:
+        if needed and there.any():
+            raise DataError(
+                f"{rows.source}: there are joint angles, but no model of the robot.",
+                culprits=[rows.source],
+                next_step="Name it with --robot-model, or fill in x_m to qw.",
+            )
+        return np.zeros(len(rows), dtype=bool), poses
+    if rows.joints_rad.shape[1] != robot.joint_count:
+        raise DataError(
+            f"{rows.source}: a row has {rows.joints_rad.shape[1]} joint angles, but {robot.name} "
+            f"has {robot.joint_count} joints.",
+            culprits=[rows.source],
+        )
+    poses[there] = robot.base_from_flange(rows.joints_rad[there])
+    _check_same_arm(rows, poses, there, robot)
+    return there, poses
+
+
+def _check_angles(rows: TouchRows, there: Mask) -> None:
+    if rows.joints_rad is None:
+        return
+    largest = np.abs(np.where(there[:, None], rows.joints_rad, 0.0)).max(axis=1, initial=0.0)
+    wide = np.flatnonzero(largest > _WIDE_RAD)
+    if len(wide):
+        raise DataError(
+            f"{rows.places[wide[0]]}: a joint stands at {largest[wide[0]]:.4g} rad, more than two "
+            "turns: these look like degrees.",
+            culprits=[rows.places[it] for it in wide],
+            next_step="Say --joint-unit deg, or write radians.",
+        )
+
+
+def _check_same_arm(rows: TouchRows, poses: FloatArray, there: Mask, robot: Robot) -> None:
+    both = np.flatnonzero(there & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
+    if not len(both):
+        return
+    away = invert(poses[both]) @ rows.base_from_flange[both]
+    apart_m, apart_rad = np.linalg.norm(away[:, :3, 3], axis=1), rotation_angle(away)
+    odd = (apart_m > _SAME_ARM_M) | (apart_rad > _SAME_ARM_RAD)
+    if odd.any():
+        at = int(np.argmax(odd))
+        raise DataError(
+            f"{rows.places[both[at]]}: the joints lead through {robot.name} to a flange "
+            f"{1e3 * apart_m[at]:.0f} mm and {np.rad2deg(apart_rad[at]):.1f} deg away from the "
+            "pose that is reported.",
+            culprits=[rows.places[it] for it in both[odd]],
+            next_step="Check the robot's model and its base, and whether the controller reports "
+            "the flange without a tool.",
+        )
+
+
+def numbered(names: Collection[str]) -> dict[str, int]:
+    """Numbers names from 0, in the order of their first appearance."""
+    return {name: at for at, name in enumerate(dict.fromkeys(names))}
