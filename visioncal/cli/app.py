@@ -15,6 +15,7 @@ from visioncal.cli.report import report_command
 from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
 from visioncal.cli.target import target_app
+from visioncal.cli.tcp import tcp_command
 from visioncal.errors import VisioncalError
 from visioncal.version import __version__
 
@@ -35,6 +36,7 @@ app.command("report")(report_command)
 app.command("diff")(diff_command)
 app.command("convert")(convert_command)
 app.command("export")(export_command)
+app.command("tcp")(tcp_command)
 app.command("review")(review_command)
 app.command("simulate")(simulate_command)
 app.add_typer(target_app, name="target")

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, Verdict
 from visioncal.errors import VisioncalError
 from visioncal.transforms import pose_difference
 from visioncal.types import Progress as Told
@@ -70,14 +70,18 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         console.print(escape(error.next_step))
 
 
+def print_verdict(verdict: Verdict, name: str) -> None:
+    """Prints whether something can be trusted, and why."""
+    console, colour = messages(), _COLOURS[verdict.status]
+    console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
+    for reason in verdict.reasons:
+        console.print(f"  - {escape(reason)}")
+
+
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     """Prints a result for people: the verdict first, then the figures it rests on."""
     console = messages()
-    verdict = calibration.verdict
-    colour = _COLOURS[verdict.status]
-    console.print(f"[{colour}]{verdict.status}[/]  {escape(calibration.session_name)}")
-    for reason in verdict.reasons:
-        console.print(f"  - {escape(reason)}")
+    print_verdict(calibration.verdict, calibration.session_name)
     for name, edge in calibration.edges.items():
         x, y, z = 1e3 * edge.transform.translation
         console.print(

@@ -48,12 +48,12 @@ def convert_command(
     Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
     nothing was written, and the message says what is missing or wrong.
     """
-    robot_names = _names(robot_columns, "--robot-columns")
-    camera_names = _names(camera_columns, "--camera-columns")
+    robot_names = option.names_in(robot_columns, "--robot-columns")
+    camera_names = option.names_in(camera_columns, "--camera-columns")
     wishes = Wishes(
         robot=PoseWishes(robot_names, robot_form, robot_unit, robot_inverse),
         camera=PoseWishes(camera_names, camera_form, camera_unit, camera_inverse),
-        joints=_names(joint_columns, "--joint-columns"),
+        joints=option.names_in(joint_columns, "--joint-columns"),
         joints_deg=joint_unit == "deg",
         image=image_column,
         camera_file=camera_file,
@@ -72,18 +72,6 @@ def convert_command(
     for warning in session.warnings:
         messages().print(escape(f"note: {warning}"))
     messages().print(escape(f"wrote {dest}\nsha256 {session.digest()}"))
-
-
-def _names(words: str | None, option: str) -> tuple[str, ...]:
-    if words is None:
-        return ()
-    names = tuple(it.strip() for it in words.split(","))
-    if not all(names) or len(set(names)) < len(names):
-        raise DataError(
-            f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",
-            culprits=[option],
-        )
-    return names
 
 
 def _size(words: str | None) -> tuple[int, int] | None:

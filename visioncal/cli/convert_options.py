@@ -5,6 +5,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
+from visioncal.errors import DataError
 from visioncal.formats import FOREIGN_FORMATS
 from visioncal.types import Mount
 
@@ -157,3 +158,20 @@ TryOthers: TypeAlias = Annotated[
 TakeBest: TypeAlias = Annotated[
     bool, _option("--yes", panel=_DOUBT, words="Take the best one where it stands out clearly.")
 ]
+
+
+def names_in(words: str | None, option: str) -> tuple[str, ...]:
+    """Splits an option of names with commas between.
+
+    Raises:
+        DataError: A name is empty or there twice.
+    """
+    if words is None:
+        return ()
+    names = tuple(it.strip() for it in words.split(","))
+    if not all(names) or len(set(names)) < len(names):
+        raise DataError(
+            f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",
+            culprits=[option],
+        )
+    return names

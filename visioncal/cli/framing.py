@@ -1,0 +1,187 @@
+"""What the commands that place a frame share: options, where the frame goes, how it is told."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+from rich.markup import escape
+
+from visioncal.calibration import Calibration, Frame, FrameFile
+from visioncal.calibration.frame import frames_document
+from visioncal.cli.console import messages, print_verdict
+from visioncal.cli.convert_options import names_in
+from visioncal.errors import DataError
+from visioncal.formats import PoseWishes, Wishes
+from visioncal.joining import rewrite
+from visioncal.robot import Robot, load_robot
+from visioncal.stored import load_calibration
+from visioncal.transforms import pose_difference
+
+CalibrationOption: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "-c",
+        "--calibration",
+        help="An output folder of calibrate: what it knows is used, and the frame joins it.",
+    ),
+]
+OutOption: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--out", help="A file of frames (.json) to put it into instead; made where missing."
+    ),
+]
+NameOption: TypeAlias = Annotated[
+    str | None, typer.Option("--name", help="What to call it: gripper, jig_2.")
+]
+ForceOption: TypeAlias = Annotated[
+    bool, typer.Option("--force", help="Replace a frame of the same name.")
+]
+JsonOption: TypeAlias = Annotated[
+    bool, typer.Option("--json", help="Print the frame as JSON to stdout.")
+]
+TouchNoise: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--touch-noise-mm", help="What a touch is known to repeat to, per axis."),
+]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a frame goes.
+
+    Attributes:
+        name: The transform's name.
+        calibration: What is known of the cell; None for nothing.
+        folder: The output folder that the frame joins; None where it does not.
+        file: The file of frames that it goes into; None likewise.
+    """
+
+    name: str
+    calibration: Calibration | None
+    folder: Path | None
+    file: Path | None
+
+    @classmethod
+    def of(cls, name: str, known: Path | None, out: Path | None, *, force: bool) -> "Place":
+        """Finds out what is known and where the frame will go, before anything is computed.
+
+        Raises:
+            DataError: A frame of that name is there, or the place cannot take one.
+        """
+        calibration = None if known is None else load_calibration(known)
+        folder = None if known is None or out is not None else _folder(known)
+        place = cls(name, calibration, folder, out)
+        if not force and (there := place._there()) is not None:
+            raise DataError(
+                f"{there} already has {name}, and nothing is overwritten.",
+                culprits=[name],
+                next_step="Replace it with --force, or give this one another name with --name.",
+            )
+        return place
+
+    def _there(self) -> Path | None:
+        """The place that has a frame of this name already."""
+        if self.file is not None:
+            there = self.file.exists() and self.name in FrameFile.load(self.file).frames
+            return self.file if there else None
+        taken = self.calibration is not None and self.name in self.calibration.frames
+        return self.folder if taken else None
+
+    def keep(self, frame: Frame) -> tuple[Path, ...]:
+        """Writes the frame where it goes; nowhere if nothing was named."""
+        if self.file is not None:
+            frames = dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
+            FrameFile(frames | {self.name: frame}).save(self.file)
+            return (self.file,)
+        if self.folder is None or self.calibration is None:
+            return ()
+        frames = {**self.calibration.frames, self.name: frame}
+        return rewrite(self.folder, replace(self.calibration, frames=frames))
+
+
+def _folder(known: Path) -> Path:
+    folder = known if known.is_dir() else known.parent
+    if known.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
+        raise DataError(
+            f"{known} is no output folder that a frame could join.",
+            culprits=[str(known)],
+            next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
+        )
+    return folder
+
+
+def touch_wishes(
+    columns: str | None,
+    form: str | None,
+    unit: str | None,
+    inverse: bool | None,
+    joint_columns: str | None,
+    joint_unit: str,
+) -> Wishes:
+    """What the user says of how touches are written."""
+    return Wishes(
+        robot=PoseWishes(names_in(columns, "--robot-columns"), form, unit, inverse),
+        joints=names_in(joint_columns, "--joint-columns"),
+        joints_deg=joint_unit == "deg",
+    )
+
+
+def named_robot(model: str | None) -> Robot | None:
+    """The robot that the user names."""
+    return None if model is None else load_robot(model)
+
+
+def metres(millimetres: float | None, option: str) -> float | None:
+    """Turns an option in millimetres into metres.
+
+    Raises:
+        DataError: It is not positive.
+    """
+    if millimetres is None:
+        return None
+    if not 0.0 < millimetres < 1e3:
+        raise DataError(
+            f"{option} is {millimetres:g}; millimetres above 0 and under 1000 are needed.",
+            culprits=[option],
+        )
+    return 1e-3 * millimetres
+
+
+def tell(place: Place, frame: Frame, files: tuple[Path, ...], *, as_json: bool) -> None:
+    """Prints a frame for people, or as JSON."""
+    if as_json:
+        typer.echo(json.dumps(frames_document({place.name: frame}), indent=2))
+        return
+    console = messages()
+    print_verdict(frame.verdict, place.name)
+    x, y, z = 1e3 * frame.edge.transform.translation
+    turn = ", ".join(f"{it:.3f}" for it in frame.edge.transform.rotation.as_rotvec(degrees=True))
+    rotation = (
+        f"turned by ({turn}) deg, sigma {frame.edge.sigma_deg:.2g} deg"
+        if frame.oriented
+        else "rotation not measured"
+    )
+    console.print(
+        f"{place.name}: ({x:.3f}, {y:.3f}, {z:.3f}) mm, sigma {frame.edge.sigma_mm:.2g} mm; "
+        f"{rotation}"
+    )
+    console.print(
+        escape(f"{frame.method}: rms {frame.rms_mm:.2g} mm, noise {frame.noise_mm:.2g} mm per axis")
+    )
+    _tell_before(place, frame)
+    for file in files:
+        console.print(escape(f"wrote {file}"))
+    if not files:
+        console.print("nothing was written: -c joins it to a calibration, -o puts it into a file")
+
+
+def _tell_before(place: Place, frame: Frame) -> None:
+    before = None if place.calibration is None else place.calibration.frames.get(place.name)
+    if before is not None:
+        mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
+        messages().print(
+            f"it replaces the one of {before.created}, {mm:.2g} mm and {deg:.2g} deg away"
+        )

@@ -1,0 +1,40 @@
+"""What tools and fixtures are called: `flange_from_gripper`, `base_from_jig_2`."""
+
+import re
+from typing import Literal, TypeAlias
+
+from visioncal.errors import DataError
+
+FrameKind: TypeAlias = Literal["tool", "fixture"]
+
+PARENTS: dict[FrameKind, str] = {"tool": "flange", "fixture": "base"}
+# Frames that every cell has; another of the same name would hide them.
+_TAKEN = ("cell", "base", "flange", "cam", "target", "image", "instrument")
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
+
+
+def transform_name(kind: FrameKind, name: str | None) -> str:
+    """Names the transform that places a tool or a fixture.
+
+    Args:
+        kind: Which of them it is.
+        name: What the user calls it; the kind's own name where None.
+
+    Raises:
+        DataError: The name cannot stand in a transform's name, or is taken.
+    """
+    name = kind if name is None else name
+    if not _NAME.fullmatch(name) or "_from_" in name:
+        raise DataError(
+            f"{name[:60]!r} cannot name a {kind}: up to 40 small letters, digits and _ are needed, "
+            "a letter first.",
+            culprits=[name[:60]],
+            next_step=f"Say --name {kind}_2, or the like.",
+        )
+    if name in _TAKEN:
+        raise DataError(
+            f"{name!r} cannot name a {kind}: every cell has a frame of that name.",
+            culprits=[name],
+            next_step=f"Say --name {kind}_{name}, or the like.",
+        )
+    return f"{PARENTS[kind]}_from_{name}"

@@ -1,0 +1,255 @@
+"""A tool from touches: the fit, the words for it, and whether to trust it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, cast
+
+import numpy as np
+
+from visioncal.calibration import Calibration, Edge, Frame, Observation
+from visioncal.errors import DataError, DegenerateError, VisioncalError
+from visioncal.estimator.closure import Noise
+from visioncal.estimator.pivot import PivotFit, fit_pivot
+from visioncal.estimator.readings import readings_that_close
+from visioncal.estimator.touching import Touches, TouchKind
+from visioncal.figures import figure
+from visioncal.files import some_of
+from visioncal.frames.touches import TouchRows, flange_poses, numbered
+from visioncal.frames.verdicts import Doubt, verdict_of
+from visioncal.robot import Robot
+from visioncal.transforms import invert, rotation_angle
+from visioncal.types import FloatArray
+
+TOUCH_KINDS = ("point", "z", "xz")
+
+
+@dataclass(frozen=True)
+class TcpOptions:
+    """Where doubt begins and where trust ends: (check, bad) limits.
+
+    Attributes:
+        sigma_mm: Predicted sigma of the tip's worst direction [mm].
+        sigma_deg: The same of the rotation [deg].
+        noise_mm: Noise of a touch per axis [mm]; a careful hand repeats to 0.1 mm or better.
+        touches: Touches in the fit; fewer leave too little to check it with.
+    """
+
+    sigma_mm: tuple[float, float] = (0.5, 2.0)
+    sigma_deg: tuple[float, float] = (0.3, 1.0)
+    noise_mm: tuple[float, float] = (0.5, 3.0)
+    touches: int = 5
+
+
+def touched_tool(
+    rows: TouchRows,
+    calibration: Calibration | None = None,
+    robot: Robot | None = None,
+    *,
+    touch_noise_m: float | None = None,
+    options: TcpOptions | None = None,
+) -> Frame:
+    """Finds a tool's tip, and its rotation where that was touched too.
+
+    Args:
+        rows: The touches. Of kind `point`, the tip is at the point; of kind `z`, the point lies on
+            the tool's positive z axis; of kind `xz`, in its xz plane on the side of positive x.
+        calibration: Of the same robot, where there is one: its noise and its arm are used.
+        robot: A model for joint angles, where the calibration has none.
+        touch_noise_m: What a touch is known to repeat to, per axis [m].
+        options: Where doubt begins.
+
+    Returns:
+        `flange_from_tool`.
+
+    Raises:
+        DataError: Touches are missing, wrongly written, or contradict each other.
+        DegenerateError: They leave a direction of the tool open.
+    """
+    rows = rows.of_kinds(TOUCH_KINDS, "point")
+    known = None if calibration is None else calibration.robot
+    poses = flange_poses(rows, robot if robot is not None else known)
+    touches = _touches(rows, poses)
+    try:
+        fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
+    except (DataError, DegenerateError) as error:
+        raise _with_reading(error, touches) from error
+    doubts = list(_doubts(fit, touches, options or TcpOptions()))
+    return Frame(
+        Edge(fit.flange_from_tool, fit.covariance),
+        fit.oriented,
+        _method(rows),
+        rows.source,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        1e3 * fit.rms_m,
+        1e3 * fit.sigma_m,
+        tuple(_observations(fit, touches)),
+        verdict_of(doubts, _praise(fit, touches)),
+        _details(fit, touches),
+    )
+
+
+def robot_noise(calibration: Calibration | None) -> Noise:
+    """Errors of the flange from stop to stop, per axis, as calibrated; zero where nothing is known."""
+    found = {} if calibration is None else calibration.noise
+    return Noise(
+        float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
+        1e-3 * found.get("robot_translation_mm", 0.0),
+    )
+
+
+def _touches(rows: TouchRows, poses: FloatArray) -> Touches:
+    numbers = numbered(rows.points)
+    return Touches(
+        poses,
+        np.array([numbers[it] for it in rows.points], dtype=np.int64),
+        cast("tuple[TouchKind, ...]", rows.kinds),
+        rows.labels,
+        tuple(numbers),
+    )
+
+
+def _with_reading(error: VisioncalError, touches: Touches) -> VisioncalError:
+    """Adds how the poses should be read, where that explains the error."""
+    hint = _reading_hint(touches)
+    if not hint:
+        return error
+    step = f"{hint} {error.next_step}".strip()
+    return type(error)(error.message, culprits=error.culprits, next_step=step)
+
+
+def _reading_hint(touches: Touches) -> str:
+    found = readings_that_close(touches)
+    if not found:
+        return ""
+    best = found[0]
+    return (
+        f"Read {best.words}, the touches close to {figure(1e3 * best.rms_m)} mm instead of "
+        f"{figure(1e3 * best.as_read_m)} mm: are the columns in that order?"
+    )
+
+
+def _method(rows: TouchRows) -> str:
+    counts = {kind: rows.kinds.count(kind) for kind in TOUCH_KINDS}
+    points = len({it for it, kind in zip(rows.points, rows.kinds, strict=True) if kind == "point"})
+    tip = f"pivot of {counts['point']} touches of {_counted(points, 'point')}"
+    if not counts["z"]:
+        return tip
+    return f"{tip}; rotation from {counts['z']} along z and {counts['xz']} in the xz plane"
+
+
+def _counted(count: int, word: str) -> str:
+    return f"one {word}" if count == 1 else f"{count} {word}s"
+
+
+def _observations(fit: PivotFit, touches: Touches) -> Iterator[Observation]:
+    for at, label in enumerate(touches.labels):
+        off_mm = 1e3 * float(fit.residuals_m[at])
+        yield Observation(
+            label,
+            used=bool(fit.agrees[at]),
+            reason=_wrong(fit, touches, at) if not fit.agrees[at] or fit.doubtful[at] else "",
+            kind=touches.kinds[at],
+            residual_mm=off_mm,
+        )
+
+
+def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
+    """Says what is wrong with a touch, or may be."""
+    off = f"{figure(1e3 * float(fit.residuals_m[at]))} mm off"
+    if fit.doubtful[at]:
+        return f"{off}: one of the touches that contradict each other"
+    limit = float(np.sqrt(fit.surprise[at] / fit.limit[at]))
+    words = f"{off}, {figure(limit)} times what the others allow"
+    belongs = fit.belongs_to[at]
+    if belongs is not None:
+        return f"{words}; it fits point {touches.names[belongs]!r}: is its name exchanged?"
+    return f"{words}: the tip had slipped, or the pose is of another moment"
+
+
+def _doubts(fit: PivotFit, touches: Touches, options: TcpOptions) -> Iterator[Doubt]:
+    yield from _wrong_touches(fit, touches)
+    noise_mm, (check, bad) = 1e3 * fit.sigma_m, options.noise_mm
+    if noise_mm > check:
+        hint = _reading_hint(touches)
+        yield Doubt(
+            f"The touches agree to {figure(noise_mm)} mm only (per axis; doubt begins at "
+            f"{check:g}). "
+            + (
+                hint
+                or "Touch again with a sharp tip; an arm that was never "
+                "calibrated is off by a millimetre from posture to posture."
+            ),
+            noise_mm > bad,
+        )
+    elif not fit.explained:
+        yield Doubt(
+            "The touches scatter by more than a touch is stated to, without one that stands out: "
+            f"{figure(noise_mm)} mm per axis. Touch again, or state --touch-noise as it is."
+        )
+    if fit.looks_inverse:
+        yield Doubt(
+            "The tip would be farther from the flange than the point from the base: poses read the "
+            "other way round look like this. If the columns hold flange_from_base, say "
+            "--robot-inverse."
+        )
+    yield from _weak(fit, options)
+    used = int(np.sum(fit.agrees & touches.are("point")))
+    if used < options.touches:
+        yield Doubt(
+            f"Only {used} touches of a point are used: {options.touches} or more give the result "
+            "something to be checked with."
+        )
+
+
+def _wrong_touches(fit: PivotFit, touches: Touches) -> Iterator[Doubt]:
+    for at in np.flatnonzero(~fit.agrees).tolist():
+        yield Doubt(f"Touch {touches.labels[at]} was left out: {_wrong(fit, touches, at)}.")
+    doubtful = [touches.labels[it] for it in np.flatnonzero(fit.doubtful)]
+    if doubtful:
+        yield Doubt(
+            f"Touches {some_of(doubtful)} contradict each other, and nothing tells which is wrong: "
+            "all are used. Touch twice more."
+        )
+
+
+def _weak(fit: PivotFit, options: TcpOptions) -> Iterator[Doubt]:
+    for it in fit.worst:
+        scale, unit = (np.rad2deg(1.0), "deg") if it.is_rotation else (1e3, "mm")
+        check, bad = options.sigma_deg if it.is_rotation else options.sigma_mm
+        if it.sigma * scale > check:
+            yield Doubt(
+                f"{it.words[0].upper()}{it.words[1:]} is known to {figure(it.sigma * scale)} "
+                f"{unit} only (doubt begins at {check:g}). Add touches tilted by 30 to 45 degrees "
+                "about other axes.",
+                it.sigma * scale > bad,
+            )
+
+
+def _praise(fit: PivotFit, touches: Touches) -> str:
+    worst = fit.worst[0]
+    told = "" if fit.oriented else " The rotation was not touched: it is the flange's own."
+    return (
+        f"{len(touches)} touches agree to {figure(1e3 * fit.sigma_m)} mm per axis, and "
+        f"{worst.words}, the worst direction, is known to {figure(1e3 * worst.sigma)} mm.{told}"
+    )
+
+
+def _details(fit: PivotFit, touches: Touches) -> dict[str, Any]:
+    turns = invert(touches.base_from_flange)[:, None] @ touches.base_from_flange[None]
+    return {
+        "noise_95_mm": [1e3 * it for it in fit.sigma_95_m],
+        "turn_deg": float(np.rad2deg(rotation_angle(turns).max())),
+        "points_m": {
+            _point_name(name): point.tolist()
+            for name, point in zip(touches.names, fit.points, strict=True)
+        },
+        "points_sigma_mm": {
+            _point_name(name): 1e3 * float(np.sqrt(np.trace(spread)))
+            for name, spread in zip(touches.names, fit.points_covariance, strict=True)
+        },
+    }
+
+
+def _point_name(name: str) -> str:
+    return name or "point"
