@@ -14,7 +14,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.groups import Agreement, GroupFit, Groups, agreeing_groups
+from visioncal.estimator.agreement import Agreement, agreeing_groups
+from visioncal.estimator.groups import GroupFit, Groups
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.observability import SIGMA_LIMIT_M, Direction
 from visioncal.estimator.placing import (

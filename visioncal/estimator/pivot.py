@@ -2,7 +2,7 @@
 
 The linear solution starts a joint fit of the tool and of the touched points, whitened by what is
 known of the robot's noise, so that touches along the tool's axes carry the tip's uncertainty into
-its rotation. Touches that do not agree are left out (see `groups`) and named.
+its rotation. Touches that do not agree are left out (see `agreement`) and named.
 """
 
 from dataclasses import dataclass, replace
@@ -11,8 +11,9 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from visioncal.errors import DataError
+from visioncal.estimator.agreement import Agreement, agreeing_groups
 from visioncal.estimator.closure import Noise
-from visioncal.estimator.groups import Agreement, GroupFit, agreeing_groups, fit_groups
+from visioncal.estimator.groups import GroupFit, fit_groups
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.observability import Direction
 from visioncal.estimator.touching import Placed, Touches, TouchProblem, in_tool
@@ -37,7 +38,7 @@ class PivotFit:
         points_covariance: (k, 3, 3) of them [m^2].
         agrees: (n,) touches that the answer was made from.
         doubtful: (n,) touches of which some are wrong, while nothing tells which: all are used.
-        explained: Whether noise explains the used touches (see `groups.Agreement`).
+        explained: Whether noise explains the used touches (see `agreement.Agreement`).
         surprise: (n,) squared Mahalanobis distance of each touch from what the others predict, one
             on average where it is noise.
         limit: (n,) what it may be; infinite where the others do not predict the touch.

@@ -11,14 +11,8 @@ import numpy as np
 from scipy.stats import t as t_distribution
 
 from visioncal.errors import DataError
-from visioncal.estimator.groups import (
-    Agreement,
-    GroupFit,
-    Groups,
-    agreeing_groups,
-    fit_groups,
-    small_sets,
-)
+from visioncal.estimator.agreement import Agreement, agreeing_groups
+from visioncal.estimator.groups import GroupFit, Groups, fit_groups, small_sets
 from visioncal.estimator.numbering import Numbering, find_numbering
 from visioncal.estimator.observability import SIGMA_LIMIT_M, Direction
 from visioncal.estimator.placing import left_out_words, noise_words, refuse_poor, worst_directions

@@ -90,7 +90,7 @@ def touched_tool(
 
 
 def robot_noise(calibration: Calibration | None) -> Noise:
-    """Errors of the flange from stop to stop, per axis, as calibrated; zero where nothing is known."""
+    """Errors of the flange from stop to stop, as calibrated; zero where nothing is known."""
     found = {} if calibration is None else calibration.noise
     return Noise(
         float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
