@@ -118,8 +118,11 @@ def _with_arm(
 ) -> tuple[_Answer, Arm, ArmErrors | None]:
     """Fits again with errors of the arm, which may have passed for another lens or board.
 
-    Errors of any arm's shape tell which values are free, but are not estimated.
+    Errors of any arm's shape tell which values are free, but are not estimated. Their size is that
+    under the stated lens and board: a board that changes its size with the arm hides a part of it.
     """
+    stated = settle(problem, arm, problem.first, start)
+    errors = arm_errors(arm, stated.data, stated.fit.edges) or errors
     erring = replace(arm, errors=errors)
     answer = _chosen(problem, erring, settle(problem, erring, problem.first, start))
     if arm.of_links:
