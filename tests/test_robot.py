@@ -136,7 +136,7 @@ def test_a_urdf_is_read_up_to_the_tip(tmp_path: Path) -> None:
         @ elementary("z", along=0.4)
         for turn, bend in q
     ]
-    # Pinocchio renormalises (cosine, sine): a few units in the last place.
+    # Products of a few matrices with entries near 1: some units in the last place.
     np.testing.assert_allclose(robot.base_from_flange(q), expected, atol=1e-14)
 
 
@@ -179,7 +179,10 @@ def test_what_is_no_urdf_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture
     ("change", "words"),
     [
         ({"schema": 2}, "schema is 2"),
-        ({"convention": "hayati"}, 'convention is \'hayati\'; "standard" or "modified"'),
+        (
+            {"convention": "craig"},
+            'convention is \'craig\'; "standard" or "modified" or "hayati" is needed',
+        ),
         ({"joint": []}, r"one \[\[joint\]\] table for each joint"),
         ({"joint": [{"a_m": 0.0, "d_m": 0.1}]}, "joint joint_1: alpha_rad is missing"),
         (
@@ -198,7 +201,8 @@ def test_a_wrong_table_is_refused_by_field(change: dict[str, Any], words: str) -
 
 
 def test_an_unknown_robot_lists_the_names() -> None:
-    with pytest.raises(DataError, match="no robot named 'ur5f'; the names are panda") as caught:
+    words = "no robot named 'ur5f'; the names are generic-6r-1800, irb120, panda"
+    with pytest.raises(DataError, match=words) as caught:
         load_robot("ur5f")
     assert "ur5" in caught.value.next_step
 

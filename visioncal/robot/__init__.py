@@ -1,0 +1,45 @@
+"""Robot models: kinematics and their derivatives, from a DH table, a URDF or a calibration.
+
+This is the only package that knows Pinocchio, and it imports it where a model is built.
+"""
+
+from visioncal.robot.chain import FUNCTION_NAMES, Chain
+from visioncal.robot.conversion import PARALLEL_RAD, convert_table, parallel_axes, table_of
+from visioncal.robot.files import load_robot, read_robot_document, robot_file, robot_names
+from visioncal.robot.model import Robot
+from visioncal.robot.recognising import Recognised, recognised_convention
+from visioncal.robot.tables import (
+    CONVENTIONS,
+    Convention,
+    DHTable,
+    table_document,
+    table_from_document,
+)
+from visioncal.robot.urdfs import corrected_urdf
+from visioncal.robot.writing import small_urdf, table_toml, unwritten, ur_kinematics_yaml
+
+__all__ = [
+    "CONVENTIONS",
+    "FUNCTION_NAMES",
+    "PARALLEL_RAD",
+    "Chain",
+    "Convention",
+    "DHTable",
+    "Recognised",
+    "Robot",
+    "convert_table",
+    "corrected_urdf",
+    "load_robot",
+    "parallel_axes",
+    "read_robot_document",
+    "recognised_convention",
+    "robot_file",
+    "robot_names",
+    "small_urdf",
+    "table_document",
+    "table_from_document",
+    "table_of",
+    "table_toml",
+    "unwritten",
+    "ur_kinematics_yaml",
+]

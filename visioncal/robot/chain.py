@@ -1,0 +1,237 @@
+"""A serial arm as placements and axes: the one form to which every description is brought."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.files import Table
+from visioncal.transforms import exp
+from visioncal.types import FloatArray, Mask
+
+# Columns of a joint's function: offset, ratio, sine, cosine.
+FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")
+IDENTITY_FUNCTION = (0.0, 1.0, 0.0, 0.0)
+# Printed to three digits, a rotation is within this of one; beyond, the numbers are something else.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """The geometry of a serial arm with n joints.
+
+    The pose of the tip is `placement_1 M_1 placement_2 M_2 ... placement_{n+1}`, where M_i turns
+    about (or moves along) axis i by the joint's effective position
+    `offset + ratio q + sine sin(q) + cosine cos(q)`: gear ratio and the eccentricity of an encoder
+    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration).
+
+    Attributes:
+        joint_names: The joints from the base to the tip.
+        prismatic: (n,) whether a joint moves along its axis [m] instead of turning about it [rad].
+        axes: (n, 3) unit vectors in the joints' frames.
+        placements: (n + 1, 4, 4) each joint's frame in the one before it (the first in the base),
+            before its own motion, and the tip in the last joint's [m].
+        lower: (n,) lower limits of q [rad or m]; -inf for a joint without limits.
+        upper: (n,) upper limits of q [rad or m]; inf for a joint without limits.
+        functions: (n, 4) offset [rad or m], ratio, sine and cosine [rad] of each joint.
+    """
+
+    joint_names: tuple[str, ...]
+    prismatic: Mask
+    axes: FloatArray
+    placements: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    functions: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def twists(self) -> FloatArray:
+        """(n, 6) motions (rotation, translation) of the joints' frames for a unit of position."""
+        turning = np.where(self.prismatic[:, None], 0.0, self.axes)
+        moving = np.where(self.prismatic[:, None], self.axes, 0.0)
+        return np.concatenate([turning, moving], axis=1)
+
+    def function_basis(self, q: FloatArray) -> FloatArray:
+        """Derivatives of the effective positions by the joints' functions.
+
+        Args:
+            q: (m, n) positions that the encoders tell [rad or m].
+
+        Returns:
+            (m, n, 4): 1, q, sin(q), cos(q), the last two zero for a prismatic joint.
+        """
+        turning = np.where(self.prismatic, 0.0, 1.0)
+        return np.stack([np.ones_like(q), q, turning * np.sin(q), turning * np.cos(q)], axis=-1)
+
+    def effective(self, q: FloatArray) -> FloatArray:
+        """Effective positions (m, n) of the joints where the encoders tell (m, n) `q`."""
+        return np.asarray(np.einsum("mnk,nk->mn", self.function_basis(q), self.functions))
+
+    def slopes(self, q: FloatArray) -> FloatArray:
+        """Derivatives (m, n) of the effective positions by (m, n) `q`."""
+        _, ratio, sine, cosine = self.functions.T
+        turning = np.where(self.prismatic, 0.0, 1.0)
+        return np.asarray(ratio + turning * (sine * np.cos(q) - cosine * np.sin(q)))
+
+    def with_offsets_placed(self) -> "Chain":
+        """The same arm with the functions' offsets in the placements."""
+        steps = exp(self.twists * self.functions[:, :1])
+        functions = self.functions.copy()
+        functions[:, 0] = 0.0
+        placements = self.placements.copy()
+        moved = self.functions[:, 0] != 0.0
+        placements[:-1][moved] = placements[:-1][moved] @ steps[moved]
+        return replace(self, placements=placements, functions=functions)
+
+
+def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
+    """Writes a chain as a description that `Robot.from_document` reads back, to the last bit."""
+    joints = []
+    for place, joint in enumerate(chain.joint_names):
+        row: dict[str, Any] = {
+            "name": joint,
+            "type": "prismatic" if chain.prismatic[place] else "revolute",
+            "axis": chain.axes[place].tolist(),
+            "placement": chain.placements[place].tolist(),
+        }
+        limits = {"lower": chain.lower[place], "upper": chain.upper[place]}
+        row |= {key: float(it) for key, it in limits.items() if np.isfinite(it)}
+        row |= dict(zip(FUNCTION_NAMES, chain.functions[place].tolist(), strict=True))
+        joints.append(row)
+    return {
+        "schema": 1,
+        "name": name,
+        "tip": tip,
+        "kind": "chain",
+        "joint": joints,
+        "flange": {"placement": chain.placements[-1].tolist()},
+    }
+
+
+def chain_from_document(table: Table) -> Chain:
+    """Reads what `chain_document` writes.
+
+    Raises:
+        DataError: A field is missing or no number, axis or rigid transform.
+    """
+    rows = joint_tables(table)
+    names = tuple(name for name, _ in rows)
+    lower, upper = (
+        np.array([row.number(key) if key in row.content else none for _, row in rows])
+        for key, none in (("lower", -np.inf), ("upper", np.inf))
+    )
+    for (_, row), low, high in zip(rows, lower, upper, strict=True):
+        if low >= high:
+            raise row.refuse("lower", float(low), f"less than upper = {float(high)!r}")
+    tables = [*(row for _, row in rows), subtable(table, "flange")]
+    return Chain(
+        names,
+        np.array([row.choice("type", ("revolute", "prismatic")) == "prismatic" for _, row in rows]),
+        np.array([_axis(row) for _, row in rows]),
+        np.array([_placement(row) for row in tables]),
+        lower,
+        upper,
+        np.array([joint_function(row, FUNCTION_NAMES) for _, row in rows]),
+    )
+
+
+def joint_tables(table: Table) -> list[tuple[str, Table]]:
+    """The rows of a table of joints with their names.
+
+    Raises:
+        DataError: There is no row, or two of one name.
+    """
+    rows = table.content.get("joint")
+    if not isinstance(rows, Sequence) or not rows or not all(isinstance(r, Mapping) for r in rows):
+        raise table.refuse("joint", rows, "one [[joint]] table for each joint")
+    names = [
+        Table(row, f"{table.label}, joint {place}").text("name", f"joint_{place}")
+        for place, row in enumerate(rows, start=1)
+    ]
+    if len(set(names)) < len(names):
+        raise table.refuse("joint", names, "a name of its own for each joint")
+    return [
+        (name, Table(row, f"{table.label}, joint {name}"))
+        for name, row in zip(names, rows, strict=True)
+    ]
+
+
+def subtable(table: Table, key: str) -> Table:
+    """A table inside a table; empty where it is absent.
+
+    Raises:
+        DataError: It is something else.
+    """
+    content = table.content.get(key, {})
+    if not isinstance(content, Mapping):
+        raise table.refuse(key, content, f"a [{key}] table")
+    return Table(content, f"{table.label}, {key}")
+
+
+def joint_function(row: Table, keys: Sequence[str]) -> list[float]:
+    """A joint's function: offset, ratio, sine, cosine under the given keys; an empty one is left.
+
+    Raises:
+        DataError: A value is no number, or the ratio is not above zero.
+    """
+    return [
+        row.number(key, none, positive=name == "ratio") if key else none
+        for key, none, name in zip(keys, IDENTITY_FUNCTION, FUNCTION_NAMES, strict=True)
+    ]
+
+
+def number_list(row: Table, key: str, size: int) -> FloatArray:
+    """A list of so many finite numbers.
+
+    Raises:
+        DataError: The field is something else.
+    """
+    values = row.content.get(key)
+    needed = f"a list of {size} numbers"
+    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != size:
+        raise row.refuse(key, values, needed)
+    return np.array([Table({key: value}, row.label).number(key) for value in values])
+
+
+def _axis(row: Table) -> FloatArray:
+    axis = number_list(row, "axis", 3)
+    if abs(np.linalg.norm(axis) - 1.0) > _ROTATION_TOLERANCE:
+        raise row.refuse("axis", axis.tolist(), "a vector of length 1")
+    return axis
+
+
+def _placement(row: Table) -> FloatArray:
+    rows = row.content.get("placement")
+    needed = "a list of 4 rows of 4 numbers, a rigid transform [m]"
+    if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
+        raise row.refuse("placement", rows, needed)
+    matrix = np.array(
+        [number_list(Table({"placement": it}, row.label), "placement", 4) for it in rows]
+    )
+    check_rigid(matrix, row.label)
+    return matrix
+
+
+def check_rigid(matrix: FloatArray, label: str) -> None:
+    """Checks that (4, 4) numbers are a rigid transform.
+
+    Raises:
+        DataError: They are not.
+    """
+    rotation = matrix[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if (
+        off > _ROTATION_TOLERANCE
+        or np.linalg.det(rotation) < 0
+        or matrix[3].tolist() != [0, 0, 0, 1]
+    ):
+        raise DataError(
+            f"{label}: placement is no rigid transform: a rotation, a position [m] and the last "
+            "row 0, 0, 0, 1 are needed.",
+            culprits=[f"{label}: placement"],
+        )

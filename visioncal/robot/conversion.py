@@ -1,0 +1,279 @@
+"""Between the conventions of joint tables, and from any chain to a table.
+
+What a row has to say of two consecutive axes is how the next one lies in the frame of the last.
+`_between` finds its numbers; what is left is a turn about and a way along the next axis, which
+commute with its joint and go into its row.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.robot.chain import Chain
+from visioncal.robot.model import Robot
+from visioncal.robot.tables import Convention, DHTable, about_x, about_z
+from visioncal.transforms import compose, invert, skew
+from visioncal.types import FloatArray, Mask
+
+# Consecutive axes closer than this to parallel get Hayati's beta [rad]. Their common normal lies
+# at a distance of their offset over the angle, and so do the errors of d grow against those of a.
+PARALLEL_RAD = float(np.deg2rad(5.0))
+# Axes closer than this are parallel [rad], and meet when they pass so close [m]: a common normal at
+# 1e8 times their offset has lost as many digits as the angle that is neglected.
+_EXACTLY = 1e-8
+# Rounding of a product of a few transforms with entries near 1.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class _Row:
+    """theta, d, a, alpha, beta from one axis to the next."""
+
+    theta: float = 0.0
+    d: float = 0.0
+    a: float = 0.0
+    alpha: float = 0.0
+    beta: float = 0.0
+
+    @property
+    def across(self) -> FloatArray:
+        return about_x(*(np.asarray(it) for it in (self.a, self.alpha, self.beta)))
+
+    @property
+    def transform(self) -> FloatArray:
+        return np.asarray(about_z(np.asarray(self.theta), np.asarray(self.d)) @ self.across)
+
+
+def convert_table(
+    table: DHTable, convention: Convention, *, parallel_rad: float = PARALLEL_RAD
+) -> DHTable:
+    """Writes a table in another convention; the arm stays the same.
+
+    Between standard and modified no number changes, only its row. In Hayati's form beta takes the
+    place of d where axes are nearly, not exactly, parallel. Back from it d is again the way to the
+    common normal, some hundred metres for a milliradian.
+
+    Args:
+        table: The table.
+        convention: The convention that is wanted.
+        parallel_rad: Consecutive axes closer than this to parallel count as such (`hayati`).
+
+    Returns:
+        The table. Poses agree to 1e-12, or 1e-8 where axes are less than 1e-4 and more than 0 rad
+        from parallel; converted back it is the same table again.
+    """
+    if convention == table.convention:
+        return table
+    off = _off_parallel(table.along_x[:, :3, 2])
+    # Before the first axis and behind the last there is no other to be parallel to.
+    off[[0, -1]] = np.inf
+    parallel = (off < parallel_rad) & (convention == "hayati")
+    rows, moved = [], np.zeros(2)
+    for place, row in enumerate(_rows(table)):
+        link = replace(row, theta=row.theta + moved[0], d=row.d + moved[1])
+        flat = bool(parallel[place + 1])
+        keeps = link.d == 0.0 or bool(off[place + 1] < _EXACTLY) if flat else link.beta == 0.0
+        rows.append(link if keeps else _between(link.transform, link, flat=flat))
+        moved = np.zeros(2) if keeps else _left_over(link.transform, rows[-1])
+    return _with_rows(replace(table, convention=convention, parallel=parallel), rows)
+
+
+def table_of(
+    robot: Robot,
+    convention: Convention,
+    *,
+    parallel_rad: float = PARALLEL_RAD,
+    like: DHTable | None = None,
+) -> DHTable:
+    """Writes any robot as a joint table.
+
+    The rows follow from the joints' axes alone. What rows cannot hold is constant: `base` before
+    the first axis and `flange` behind the last. Both are as small as they can be; where the first
+    axis is the base's z and the last one the flange's, they are the identity.
+
+    Args:
+        robot: The robot, of a URDF, a table or a calibration.
+        convention: The convention that is wanted.
+        parallel_rad: Consecutive axes closer than this to parallel count as such (`hayati`).
+        like: A table of nearly the same arm, whose choices are kept: which way each x points, d
+            between parallel axes, and the nominal base and flange. None for the x that turns least
+            from the one before.
+
+    Returns:
+        The table. Offsets of the joints' functions are in its theta and d.
+    """
+    chain = _about_z(robot.chain.with_offsets_placed())
+    like = None if like is None else convert_table(like, convention, parallel_rad=parallel_rad)
+    hints = [_Row()] * len(chain) if like is None else _rows(like)
+    first = np.eye(4) if like is None else like.along_x[0]
+    base = _base(chain.placements[0], np.eye(4) if like is None else like.base, first)
+    rows, flats = [], []
+    rest = invert(base @ first) @ chain.placements[0]
+    for hint, placement in zip(hints[:-1], chain.placements[1:-1], strict=True):
+        link = rest @ placement
+        near = bool(_off_parallel(link[:3, 2]) < parallel_rad)
+        flats.append(near and convention == "hayati")
+        rows.append(_between(link, hint, flat=flats[-1]))
+        rest = invert(rows[-1].transform) @ link
+    last, flange = _last_row(rest @ chain.placements[-1], hints[-1], like, parallel_rad)
+    count, none = len(chain), np.zeros(len(chain) + 1)
+    table = DHTable(
+        name=robot.name,
+        tip=robot.tip,
+        convention=convention,
+        joint_names=chain.joint_names,
+        prismatic=chain.prismatic,
+        theta_rad=none[1:],
+        d_m=none[1:],
+        a_m=none if like is None else like.a_m,
+        alpha_rad=none if like is None else like.alpha_rad,
+        beta_rad=none,
+        parallel=np.array([False, *flats, False]),
+        base=base,
+        flange=flange,
+        lower=chain.lower,
+        upper=chain.upper,
+        functions=np.hstack([np.zeros((count, 1)), chain.functions[:, 1:]]),
+    )
+    return _with_rows(table, [*rows, last])
+
+
+def parallel_axes(robot: Robot, parallel_rad: float = PARALLEL_RAD) -> Mask:
+    """(n - 1,) which consecutive axes of a robot are closer than an angle to parallel."""
+    links = _about_z(robot.chain).placements[1:-1]
+    return np.asarray(_off_parallel(links[:, :3, 2]) < parallel_rad)
+
+
+def _rows(table: DHTable) -> list[_Row]:
+    """The table as Z_i X_i, whatever its convention."""
+    columns = (table.theta_rad, table.d_m, table.a_m[1:], table.alpha_rad[1:], table.beta_rad[1:])
+    return [_Row(*map(float, numbers)) for numbers in zip(*columns, strict=True)]
+
+
+def _with_rows(table: DHTable, rows: list[_Row]) -> DHTable:
+    """A table with other Z_i X_i; X_0 stays."""
+    return replace(
+        table,
+        theta_rad=np.array([row.theta for row in rows]),
+        d_m=np.array([row.d for row in rows]),
+        a_m=np.array([table.a_m[0], *(row.a for row in rows)]),
+        alpha_rad=np.array([table.alpha_rad[0], *(row.alpha for row in rows)]),
+        beta_rad=np.array([table.beta_rad[0], *(row.beta for row in rows)]),
+    )
+
+
+def _about_z(chain: Chain) -> Chain:
+    """The chain with each joint's frame turned so that its axis is z."""
+    turns = np.array([np.eye(4), *map(_swing, chain.axes), np.eye(4)])
+    return replace(
+        chain,
+        axes=np.tile([0.0, 0.0, 1.0], (len(chain), 1)),
+        placements=invert(turns[:-1]) @ chain.placements @ turns[1:],
+    )
+
+
+def _swing(direction: FloatArray) -> FloatArray:
+    """The least rotation (4, 4) that takes z to a unit vector."""
+    x, y, z = direction
+    if z < _EXACTLY - 1.0:
+        return np.diag([1.0, -1.0, -1.0, 1.0])
+    cross = skew(np.array([-y, x, 0.0]))
+    return compose(np.eye(3) + cross + cross @ cross / (1.0 + z), np.zeros(3))
+
+
+def _off_parallel(directions: FloatArray) -> FloatArray:
+    """(...,) angles [rad] of (..., 3) unit vectors against the line of z."""
+    return np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), np.abs(directions[..., 2]))
+
+
+def _left_over(link: FloatArray, row: _Row) -> FloatArray:
+    """Turn about [rad] and way along [m] the next axis that a row leaves to it."""
+    rest = invert(row.transform) @ link
+    return np.array([np.arctan2(rest[1, 0], rest[0, 0]), rest[2, 3]])
+
+
+def _between(link: FloatArray, hint: _Row, *, flat: bool) -> _Row:
+    """The row from an axis to the next.
+
+    Args:
+        link: (4, 4) the next axis' frame in the frame of this one, z along the axes.
+        hint: Numbers nearby: of the two ways that x can point, the one nearer to its theta is
+            taken, and its d where axes are exactly parallel.
+        flat: Whether the row is Hayati's, with beta and d = 0.
+    """
+    direction, position = link[:3, 2], link[:3, 3]
+    parallel = bool(_off_parallel(direction) < _EXACTLY)
+    if not (flat or parallel):
+        return _common_normal(direction, position, hint)
+    d = hint.d if parallel else 0.0
+    x, y, _ = position - direction * (position[2] - d) / direction[2]
+    a = float(np.hypot(x, y))
+    if a < _EXACTLY:
+        theta, sign = hint.theta, 1.0
+        a = float(np.cos(theta) * x + np.sin(theta) * y)
+    else:
+        theta, sign = _nearer(float(np.arctan2(y, x)), hint.theta, forward=True)
+    c, s = np.cos(theta), np.sin(theta)
+    across = np.array([c * direction[0] + s * direction[1], c * direction[1] - s * direction[0]])
+    if parallel:
+        across[:] = 0.0
+    alpha = _near(float(np.arctan2(-across[1], direction[2])), hint.alpha)
+    return _Row(theta, d, sign * a, alpha, float(np.arcsin(across[0])))
+
+
+def _common_normal(direction: FloatArray, position: FloatArray, hint: _Row) -> _Row:
+    """The row with x along the common normal of z and another axis (Denavit, Hartenberg 1955)."""
+    sine = np.hypot(direction[0], direction[1])
+    normal = np.array([-direction[1], direction[0]]) / sine
+    a, alpha = float(position[:2] @ normal), float(np.arctan2(sine, direction[2]))
+    along = position[:2] @ direction[:2] / sine**2
+    forward = a > 0.0 or abs(a) < _EXACTLY
+    theta, sign = _nearer(float(np.arctan2(normal[1], normal[0])), hint.theta, forward=forward)
+    d = float(position[2] - along * direction[2])
+    return _Row(theta, d, sign * a, _near(sign * alpha, hint.alpha))
+
+
+def _near(angle: float, to: float) -> float:
+    """The angle plus those turns that bring it nearest to another."""
+    away = float(np.remainder(angle - to + np.pi, 2.0 * np.pi) - np.pi)
+    # Half a turn either way is the same; tables print +pi.
+    return to + (abs(away) if np.isclose(abs(away), np.pi, rtol=0, atol=_ROUNDING) else away)
+
+
+def _nearer(theta: float, hint: float, *, forward: bool) -> tuple[float, float]:
+    """The one of theta and its opposite that is nearer to a hint, and the sign that goes with it.
+
+    Where both are a quarter turn away it is the one that is `forward`.
+    """
+    way, back = _near(theta, hint), _near(theta + np.pi, hint)
+    gain = abs(back - hint) - abs(way - hint)
+    if abs(gain) < _EXACTLY:
+        gain = 1.0 if forward else -1.0
+    return (way, 1.0) if gain > 0.0 else (back, -1.0)
+
+
+def _base(placement: FloatArray, nominal: FloatArray, first: FloatArray) -> FloatArray:
+    """The base so that the first axis is z behind it and X_0, as near to the nominal as can be."""
+    away = invert(nominal @ first) @ placement
+    direction, position = away[:3, 2], away[:3, 3]
+    tilt = _swing(direction)
+    tilt[:3, 3] = position - direction * (position @ direction)
+    if np.abs(tilt - np.eye(4)).max() < _ROUNDING:
+        return nominal
+    return np.asarray(nominal @ first @ tilt @ invert(first))
+
+
+def _last_row(
+    link: FloatArray, hint: _Row, like: DHTable | None, parallel_rad: float
+) -> tuple[_Row, FloatArray]:
+    """The last row, and the flange behind it."""
+    if like is None and _off_parallel(link[:3, 2]) >= parallel_rad:
+        row = _between(link, hint, flat=False)
+        return row, invert(row.transform) @ link
+    flange = np.eye(4) if like is None else like.flange
+    away = link @ invert(hint.across @ flange)
+    # The turn about z next to a tilt: the quaternion's z over its w.
+    theta = _near(float(np.arctan2(away[1, 0] - away[0, 1], away[0, 0] + away[1, 1])), hint.theta)
+    row = replace(hint, theta=theta, d=float(away[2, 3]))
+    left = invert(row.transform) @ link
+    return row, flange if np.abs(left - flange).max() < _ROUNDING else left

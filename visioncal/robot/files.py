@@ -1,0 +1,76 @@
+"""The robots that come with visioncal, and the files that describe others."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from visioncal.errors import DataError
+from visioncal.files import find_described, parse_toml, read_text
+from visioncal.robot.model import Robot
+
+# Far above any arm's URDF; a larger file is something else.
+_MAX_URDF_BYTES = 10_000_000
+
+
+def _shipped() -> dict[str, Path]:
+    """The robots that come with visioncal, by name."""
+    folder = Path(__file__).resolve().parents[1] / "robots"
+    return {path.stem: path for path in folder.glob("*.toml")}
+
+
+def robot_names() -> tuple[str, ...]:
+    """Lists the names of the robots that come with visioncal."""
+    return tuple(sorted(_shipped()))
+
+
+def read_robot_document(
+    name_or_path: str, *, tip: str | None = None, folder: Path | None = None
+) -> dict[str, Any]:
+    """Reads a robot's description without building its model.
+
+    Args:
+        name_or_path: A name among `robot_names()`, or the path of a DH `.toml` or a `.urdf`.
+        tip: The frame that poses are of. A DH table has one end, which gets this name; in a URDF
+            it is a link or joint.
+        folder: Relative paths start here; the working directory where None.
+
+    Returns:
+        What `Robot.from_document` needs, with nothing else; it can be written as JSON.
+
+    Raises:
+        DataError: There is no such robot, or its file is too large or no TOML.
+    """
+    path = find_described(
+        name_or_path, what="robot", shipped=_shipped(), suffixes=(".toml", ".urdf"), folder=folder
+    )
+    if path.suffix.lower() == ".toml":
+        table = parse_toml(read_text(path), path.name)
+        named = {"name": path.stem, "tip": "flange"} | table
+        return named if tip is None else named | {"tip": tip}
+    size = path.stat().st_size
+    if size > _MAX_URDF_BYTES:
+        raise DataError(
+            f"{path} has {size / 1e6:.0f} MB; a URDF of at most {_MAX_URDF_BYTES / 1e6:.0f} MB is "
+            "read.",
+            culprits=[str(path)],
+            next_step="Meshes belong into files of their own.",
+        )
+    return {"schema": 1, "name": path.stem, "tip": tip or "", "urdf": read_text(path)}
+
+
+def robot_file(document: Mapping[str, Any]) -> tuple[str, str]:
+    """Writes a robot's description as a file that `load_robot` reads: (file name, content)."""
+    if "urdf" in document:
+        return "robot.urdf", str(document["urdf"])
+    return "robot.toml", tomli_w.dumps(document)
+
+
+def load_robot(name_or_path: str, tip: str | None = None, folder: Path | None = None) -> Robot:
+    """Loads a robot's model; the arguments are those of `read_robot_document`.
+
+    Raises:
+        DataError: There is no such robot, or its description is wrong.
+    """
+    return Robot.from_document(read_robot_document(name_or_path, tip=tip, folder=folder))

@@ -1,0 +1,178 @@
+"""Pinocchio's models of an arm: the only place that knows the library, imported when needed."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.files import Table, did_you_mean
+from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
+from visioncal.types import FloatArray
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+# The tips by which arms commonly call the frame of the reported poses, the best first.
+_USUAL_TIPS = ("tool0", "flange")
+
+
+def build_model(name: str, tip: str, chain: Chain) -> "pin.Model":
+    """Builds Pinocchio's model of a chain, whose positions are the joints' effective ones."""
+    import pinocchio as pin
+
+    along = {(1.0, 0.0, 0.0): "X", (0.0, 1.0, 0.0): "Y", (0.0, 0.0, 1.0): "Z"}
+    model, last = pin.Model(), 0
+    model.name = name
+    for place, joint in enumerate(chain.joint_names):
+        kind = "P" if chain.prismatic[place] else "R"
+        letter = along.get(tuple(chain.axes[place].tolist()))
+        unaligned = (
+            pin.JointModelPrismaticUnaligned if kind == "P" else pin.JointModelRevoluteUnaligned
+        )
+        motion = (
+            unaligned(chain.axes[place])
+            if letter is None
+            else getattr(pin, f"JointModel{kind}{letter}")()
+        )
+        last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
+    tip_placement = pin.SE3(chain.placements[-1])
+    model.addFrame(pin.Frame(tip, last, 0, tip_placement, pin.FrameType.OP_FRAME))
+    return model
+
+
+def flange_poses(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
+    """Forward kinematics.
+
+    Args:
+        model: Of `build_model`.
+        tip: Its frame.
+        positions: (m, n) effective positions [rad or m].
+
+    Returns:
+        (m, 4, 4) `base_from_tip` [m].
+    """
+    import pinocchio as pin
+
+    data, frame = model.createData(), model.getFrameId(tip)
+    poses = np.empty((len(positions), 4, 4))
+    for row, configuration in enumerate(positions):
+        pin.forwardKinematics(model, data, configuration)
+        poses[row] = pin.updateFramePlacement(model, data, frame).homogeneous
+    return poses
+
+
+def joint_frames(model: "pin.Model", positions: FloatArray) -> FloatArray:
+    """The (n, 4, 4) frames of the joints in the base, after their motion, at (n,) positions."""
+    import pinocchio as pin
+
+    data = model.createData()
+    pin.forwardKinematics(model, data, positions)
+    return np.array([joint.homogeneous for joint in data.oMi[1:]])
+
+
+def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
+    """How the tip moves with the joints' placements: Pinocchio's kinematic regressor.
+
+    Args:
+        model: Of `build_model`.
+        tip: Its frame.
+        positions: (m, n) effective positions [rad or m].
+
+    Returns:
+        (m, 6, 6 n) right perturbations of `base_from_tip` by right perturbations of the placements,
+        both (rotation, translation).
+    """
+    import pinocchio as pin
+
+    data, frame = model.createData(), model.getFrameId(tip)
+    count = model.njoints - 1
+    derivatives = np.empty((len(positions), 6, 6 * count))
+    for row, configuration in enumerate(positions):
+        pin.forwardKinematics(model, data, configuration)
+        pin.updateFramePlacement(model, data, frame)
+        derivatives[row] = pin.computeFrameKinematicRegressor(model, data, frame, pin.LOCAL)
+    # Pinocchio puts translations first.
+    halves = derivatives.reshape(-1, 2, 3, count, 2, 3)[:, ::-1, :, :, ::-1]
+    return halves.reshape(-1, 6, 6 * count)
+
+
+def chain_of_urdf(table: Table) -> tuple[Chain, str]:
+    """Reads the chain from a URDF's root to the tip: (the chain, the tip's name).
+
+    Raises:
+        DataError: The URDF cannot be parsed or lacks the tip, or a joint before it has more than
+            one degree of freedom.
+    """
+    import pinocchio as pin
+
+    try:
+        model = pin.buildModelFromXML(table.text("urdf"))
+    except (ValueError, RuntimeError) as error:
+        raise DataError(
+            f"{table.label}: the URDF cannot be parsed: {error}.",
+            culprits=[table.label],
+            next_step="Expand xacro first (xacro robot.urdf.xacro > robot.urdf); check_urdf names "
+            "the place.",
+        ) from error
+    tip = _find_tip(table, [frame.name for frame in model.frames][1:])
+    on_way = list(model.supports[model.frames[model.getFrameId(tip)].parentJoint])[1:]
+    for joint in on_way:
+        if model.joints[joint].nv != 1:
+            raise DataError(
+                f"{table.label}: joint {model.names[joint]} before {tip} has "
+                f"{model.joints[joint].nv} degrees of freedom; revolute, continuous and prismatic "
+                "joints are read.",
+                culprits=[model.names[joint]],
+            )
+    if not on_way:
+        raise DataError(
+            f"{table.label}: no joint lies between the URDF's root and {tip}.",
+            culprits=[f"{table.label}: tip"],
+            next_step="Name the frame of the reported poses as tip in [robot].",
+        )
+    others = [joint for joint in range(1, model.njoints) if joint not in on_way]
+    return _chain_of_model(pin.buildReducedModel(model, others, pin.neutral(model)), tip), tip
+
+
+def _chain_of_model(model: "pin.Model", tip: str) -> Chain:
+    """Takes the chain out of a model that holds no joint besides."""
+    import pinocchio as pin
+
+    neutral, axes, prismatic = pin.neutral(model), [], []
+    for joint in list(model.joints)[1:]:
+        data = joint.createData()
+        joint.calc(data, neutral)
+        moving, turning = np.split(np.asarray(data.S).ravel(), 2)
+        prismatic.append(not turning.any())
+        axes.append(moving if prismatic[-1] else turning)
+    joints = list(model.joints)[1:]
+    unbounded = np.array([joint.nq == 2 for joint in joints])
+    places = [joint.idx_q for joint in joints]
+    placements = [*list(model.jointPlacements)[1:], model.frames[model.getFrameId(tip)].placement]
+    return Chain(
+        tuple(model.names)[1:],
+        np.array(prismatic),
+        np.array(axes),
+        np.array([placement.homogeneous for placement in placements]),
+        np.where(unbounded, -np.inf, model.lowerPositionLimit[places]),
+        np.where(unbounded, np.inf, model.upperPositionLimit[places]),
+        np.tile(IDENTITY_FUNCTION, (len(joints), 1)),
+    )
+
+
+def _find_tip(table: Table, frames: list[str]) -> str:
+    """Finds the tip among a URDF's frames; one that is not named is the usual one."""
+    tip = table.text("tip", "")
+    usual = [name for name in _USUAL_TIPS if name in frames]
+    if not tip and usual:
+        return usual[0]
+    if tip in frames:
+        return tip
+    links = ", ".join(dict.fromkeys(frames))
+    what = f"has no frame {tip!r}" if tip else "has no tool0 or flange, and no tip is named"
+    raise DataError(
+        f"{table.label}: the URDF {what}; its frames are {links}.",
+        culprits=[f"{table.label}: tip"],
+        next_step=f"{did_you_mean(tip, frames)} Name the frame of the reported poses as tip in "
+        "[robot].".strip(),
+    )

@@ -1,0 +1,241 @@
+"""Robot models: kinematics of a serial arm, and its derivatives by what a calibration changes.
+
+The base frame is that of the table's first row or the URDF's root link; for a UR's table it is the
+frame that the controller calls base.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.files import Table
+from visioncal.robot.chain import Chain, chain_document, chain_from_document
+from visioncal.robot.kinematics import (
+    build_model,
+    chain_of_urdf,
+    flange_poses,
+    joint_frames,
+    placement_derivatives,
+)
+from visioncal.robot.tables import chain_of_table, table_from_document
+from visioncal.transforms import exp
+from visioncal.types import FloatArray
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial arm with its nominal or corrected geometry.
+
+    Joints are those between the base and the tip, in this order; others are held at their neutral
+    position. A prismatic joint's "angle" and limits are lengths [m].
+
+    Attributes:
+        name: The robot's name.
+        tip: The frame of its end, called flange here.
+        document: What recreates it: `Robot.from_document(document)`.
+        chain: Its geometry.
+    """
+
+    name: str
+    tip: str
+    document: Mapping[str, Any]
+    chain: Chain
+    _model: "pin.Model" = field(repr=False)
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "Robot":
+        """Builds a robot from its description.
+
+        Args:
+            document: A DH table (name, tip, convention, [[joint]], base, flange); or name, tip and
+                the URDF's text; or a chain as `corrected` writes it.
+
+        Raises:
+            DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
+                the tip.
+        """
+        name = Table(document, "robot").text("name")
+        table = Table(document, f"robot {name}")
+        tip = table.text("tip", "flange")
+        table.integer("schema", 1, 1)
+        if "urdf" in document:
+            chain, tip = chain_of_urdf(table)
+        elif "kind" in document:
+            table.choice("kind", ("chain",))
+            chain = chain_from_document(table)
+        else:
+            chain = chain_of_table(table_from_document(document))
+        return cls(name, tip, dict(document), chain, build_model(name, tip, chain))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints' names."""
+        return self.chain.joint_names
+
+    @property
+    def joint_count(self) -> int:
+        """The number n of joints between base and tip."""
+        return len(self.chain)
+
+    @property
+    def lower_rad(self) -> FloatArray:
+        """(n,) lower limits [rad]; -inf for a joint without limits."""
+        return self.chain.lower
+
+    @property
+    def upper_rad(self) -> FloatArray:
+        """(n,) upper limits [rad]; inf for a joint without limits."""
+        return self.chain.upper
+
+    def base_from_flange(self, q: FloatArray) -> FloatArray:
+        """Computes the forward kinematics.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, 4, 4) `base_from_flange` [m].
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        return flange_poses(self._model, self.tip, self._effective(q))
+
+    def link_frames(self, q: FloatArray) -> FloatArray:
+        """Computes where the joints and the flange are, for drawing.
+
+        Args:
+            q: (n,) joint angles [rad].
+
+        Returns:
+            (n + 1, 4, 4) the joints' frames, after their motion, and the flange in the base [m].
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        joints = joint_frames(self._model, self._effective(np.asarray(q)[None])[0])
+        return np.array([*joints, joints[-1] @ self.chain.placements[-1]])
+
+    def placement_jacobian(self, q: FloatArray) -> FloatArray:
+        """How the flange moves when links are placed otherwise.
+
+        Placements are those of `chain.placements`: six columns (rotation [rad], translation [m])
+        for each joint's frame in the one before it, and six for the flange in the last. Both the
+        flange and the placements are perturbed on the right, so each column is an adjoint of the
+        flange seen from a joint (Pinocchio, computeFrameKinematicRegressor), and the last six are
+        the identity.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, 6, 6 (n + 1)) derivatives of `log(base_from_flange^-1 base_from_flange(step))`.
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        links = placement_derivatives(self._model, self.tip, self._effective(q))
+        own = np.broadcast_to(np.eye(6), (len(links), 6, 6))
+        return np.concatenate([links, own], axis=2)
+
+    def joint_jacobian(self, q: FloatArray) -> FloatArray:
+        """How the flange moves with the joints.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, 6, n) right perturbations (rotation, translation) of `base_from_flange` for each
+            joint, in the flange's frame [rad and m for 1 rad].
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        return self._axis_jacobian(q) * self.chain.slopes(np.asarray(q, dtype=float))[:, None, :]
+
+    def function_jacobian(self, q: FloatArray) -> FloatArray:
+        """How the flange moves when the joints' functions change.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, 6, 4 n) right perturbations of `base_from_flange` for each joint's offset [rad],
+            ratio, sine and cosine [rad], as `chain.functions` has them.
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        moved = self._axis_jacobian(q)
+        basis = self.chain.function_basis(np.asarray(q, dtype=float))
+        columns = moved[:, :, :, None] * basis[:, None]
+        return columns.reshape(*moved.shape[:2], 4 * self.joint_count)
+
+    def corrected(
+        self, placements: FloatArray | None = None, functions: FloatArray | None = None
+    ) -> "Robot":
+        """Builds the robot with another geometry.
+
+        Args:
+            placements: (n + 1, 6) twists (rotation [rad], translation [m]); each placement is
+                multiplied on the right by its exponential. None leaves them.
+            functions: (n, 4) what is added to each joint's offset [rad], ratio, sine and cosine
+                [rad]. None leaves them.
+
+        Returns:
+            The robot, whose document stands alone and gives it back to the last bit.
+
+        Raises:
+            DataError: A shape is wrong, a ratio is not above zero, or a prismatic joint has
+                eccentricity.
+        """
+        chain = self.chain
+        if placements is not None:
+            twists = self._shaped(placements, (self.joint_count + 1, 6), "placements")
+            chain = replace(chain, placements=chain.placements @ exp(twists))
+        if functions is not None:
+            added = self._shaped(functions, (self.joint_count, 4), "functions")
+            chain = replace(chain, functions=chain.functions + added)
+            if np.any(chain.functions[chain.prismatic, 2:]):
+                raise DataError(
+                    f"robot {self.name}: a prismatic joint has no eccentricity; sine and cosine of "
+                    "zero are needed.",
+                    culprits=[self.name],
+                )
+        return Robot.from_document(chain_document(self.name, self.tip, chain))
+
+    def _axis_jacobian(self, q: FloatArray) -> FloatArray:
+        """How the flange (m, 6, n) moves with the joints' effective positions.
+
+        A joint's motion commutes with a turn of its placement about the same axis.
+        """
+        links = placement_derivatives(self._model, self.tip, self._effective(q))
+        columns = links.reshape(-1, 6, self.joint_count, 6)
+        return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
+
+    def _effective(self, q: FloatArray) -> FloatArray:
+        """The effective positions (m, n) of (m, n) joint angles, whose shape is checked."""
+        q = np.asarray(q, dtype=float)
+        if q.ndim != 2 or q.shape[1] != self.joint_count:
+            raise DataError(
+                f"robot {self.name} has {self.joint_count} joints up to {self.tip}; joint angles "
+                f"of shape (m, {self.joint_count}) are needed, not {q.shape}.",
+                culprits=[self.name],
+            )
+        return self.chain.effective(q)
+
+    def _shaped(self, values: FloatArray, shape: tuple[int, int], what: str) -> FloatArray:
+        values = np.asarray(values, dtype=float)
+        if values.shape != shape or not np.isfinite(values).all():
+            raise DataError(
+                f"robot {self.name}: {what} of shape {shape} and finite numbers are needed, not "
+                f"{values.shape}.",
+                culprits=[self.name],
+            )
+        return values

@@ -1,0 +1,302 @@
+"""Tables of joints after Denavit and Hartenberg, and the documents that hold them."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias, cast
+
+import numpy as np
+
+from visioncal.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
+from visioncal.errors import DataError
+from visioncal.files import Table
+from visioncal.robot.chain import Chain, joint_function, joint_tables, number_list, subtable
+from visioncal.transforms import compose
+from visioncal.types import FloatArray, Mask
+
+Convention: TypeAlias = Literal["standard", "modified", "hayati"]
+CONVENTIONS: tuple[Convention, ...] = ("standard", "modified", "hayati")
+# The offset is theta_offset_rad or d_m.
+_FUNCTION_KEYS = ("", "gear_ratio", "sine_rad", "cosine_rad")
+_POSE_KEYS = ("xyz_m", "rpy_rad")
+
+
+@dataclass(frozen=True, eq=False)
+class DHTable:
+    """A table of n joints in one of three conventions.
+
+    All three are the same product
+    `base X_0 Z_1(q_1) X_1 Z_2(q_2) ... Z_n(q_n) X_n flange` with
+    `Z_i = Rz(theta_i + q_i) Tz(d_i)` and `X_i = Tx(a_i) Rx(alpha_i) Ry(beta_i)`; they differ in
+    what stands in one row:
+
+    - `standard` (Denavit and Hartenberg 1955): row i is Z_i X_i; X_0 belongs to the base.
+    - `modified` (Craig 1986; Khalil and Kleinfinger 1986): row i is X_{i-1} Z_i; X_n belongs to
+      the flange.
+    - `hayati` (Hayati and Mirmirani 1985): as standard, and where axes i and i + 1 are nearly
+      parallel, beta_i stands for d_i, which has no meaning there: the common normal of such axes
+      may lie anywhere, and the plane through the origin across axis i takes its place. A d_i of
+      exactly parallel axes is kept as it is.
+
+    Attributes:
+        name: The robot's name.
+        tip: The frame at its end.
+        convention: How rows are formed.
+        joint_names: The joints from the base to the tip.
+        prismatic: (n,) whether q adds to d [m] instead of theta [rad].
+        theta_rad: (n,) turns about z.
+        d_m: (n,) ways along z.
+        a_m: (n + 1,) ways along x; the first is of X_0.
+        alpha_rad: (n + 1,) turns about x.
+        beta_rad: (n + 1,) turns about y; zero but for Hayati's parallel rows.
+        parallel: (n + 1,) which X_i lie between axes that count as parallel; only in `hayati`.
+        base: (4, 4) the constant before X_0 [m].
+        flange: (4, 4) the constant behind X_n [m].
+        lower: (n,) lower limits of q [rad or m], -inf for none.
+        upper: (n,) upper limits of q [rad or m], inf for none.
+        functions: (n, 4) the joints' functions as in `Chain`, their offsets zero.
+    """
+
+    name: str
+    tip: str
+    convention: Convention
+    joint_names: tuple[str, ...]
+    prismatic: Mask
+    theta_rad: FloatArray
+    d_m: FloatArray
+    a_m: FloatArray
+    alpha_rad: FloatArray
+    beta_rad: FloatArray
+    parallel: Mask
+    base: FloatArray
+    flange: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    functions: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def along_z(self) -> FloatArray:
+        """(n, 4, 4) the constants Z_i."""
+        return about_z(self.theta_rad, self.d_m)
+
+    @property
+    def along_x(self) -> FloatArray:
+        """(n + 1, 4, 4) the constants X_i."""
+        return about_x(self.a_m, self.alpha_rad, self.beta_rad)
+
+
+def about_z(theta_rad: FloatArray, d_m: FloatArray) -> FloatArray:
+    """(..., 4, 4) `Rz(theta) Tz(d)`."""
+    c, s = np.cos(theta_rad), np.sin(theta_rad)
+    o, one = np.zeros_like(c), np.ones_like(c)
+    rotation = np.stack([c, -s, o, s, c, o, o, o, one], axis=-1).reshape(*c.shape, 3, 3)
+    return compose(rotation, np.stack([o, o, d_m], axis=-1))
+
+
+def about_x(a_m: FloatArray, alpha_rad: FloatArray, beta_rad: FloatArray) -> FloatArray:
+    """(..., 4, 4) `Tx(a) Rx(alpha) Ry(beta)`."""
+    c, s = np.cos(alpha_rad), np.sin(alpha_rad)
+    cb, sb = np.cos(beta_rad), np.sin(beta_rad)
+    o = np.zeros_like(c)
+    entries = [cb, o, sb, s * sb, c, -s * cb, -c * sb, s, c * cb]
+    rotation = np.stack(entries, axis=-1).reshape(*c.shape, 3, 3)
+    return compose(rotation, np.stack([a_m, o, o], axis=-1))
+
+
+def chain_of_table(table: DHTable) -> Chain:
+    """The geometry of a table, with all joints about z.
+
+    A joint's frame before its motion is where its row begins (standard, hayati), or where its row
+    ends but for q (modified); Rz and Tz commute, so both are the same arm.
+    """
+    along_z, along_x, count = table.along_z, table.along_x, len(table)
+    last = along_x[-1] @ table.flange
+    if table.convention == "modified":
+        placements = [*(along_x[:-1] @ along_z), last]
+        placements[0] = table.base @ placements[0]
+    else:
+        placements = [table.base @ along_x[0], *(along_z[:-1] @ along_x[1:-1]), along_z[-1] @ last]
+    return Chain(
+        table.joint_names,
+        table.prismatic,
+        np.tile([0.0, 0.0, 1.0], (count, 1)),
+        np.array(placements),
+        table.lower,
+        table.upper,
+        table.functions,
+    )
+
+
+def table_from_document(document: Mapping[str, Any]) -> DHTable:
+    """Reads a table from a robot's description.
+
+    Each `[[joint]]` holds a_m, alpha_rad, d_m, and may hold name, theta_offset_rad, beta_rad
+    (hayati), type, lower_deg and upper_deg (lower_m and upper_m where prismatic; 360 deg where
+    absent), gear_ratio, sine_rad and cosine_rad. `[base]` and `[flange]` hold xyz_m and rpy_rad;
+    `[flange]` may be a row of the convention instead, with theta_rad.
+
+    Raises:
+        DataError: A field is missing, unknown or out of range.
+    """
+    name = Table(document, "robot").text("name")
+    table = Table(document, f"robot {name}")
+    needed = cast(tuple[str, ...], CONVENTIONS)
+    convention = cast(Convention, table.choice("convention", needed))
+    rows = joint_tables(table)
+    tables = [row for _, row in rows]
+    prismatic = np.array([_is_prismatic(row) for row in tables])
+    limits = np.array([_limits(row) for row in tables])
+    across = np.array([_across(row, convention) for row in tables])
+    flange, last = _flange(subtable(table, "flange"), convention)
+    nothing = np.zeros((1, 4))
+    modified = convention == "modified"
+    a, alpha, beta, parallel = np.vstack([across, last] if modified else [nothing, across]).T
+    return DHTable(
+        name,
+        table.text("tip", "flange"),
+        convention,
+        tuple(joint for joint, _ in rows),
+        prismatic,
+        np.array([row.number("theta_offset_rad", 0.0) for row in tables]),
+        np.array([row.number("d_m") for row in tables]),
+        a,
+        alpha,
+        beta,
+        parallel > 0.0,
+        _pose(subtable(table, "base")),
+        flange,
+        limits[:, 0],
+        limits[:, 1],
+        np.array([joint_function(row, _FUNCTION_KEYS) for row in tables]),
+    )
+
+
+def table_document(table: DHTable, source: str = "") -> dict[str, Any]:
+    """Writes a table as a description that `table_from_document` reads.
+
+    Args:
+        table: The table.
+        source: Where its values come from.
+
+    Returns:
+        The description. What a convention has no row for goes into `[base]` and `[flange]`.
+    """
+    modified = table.convention == "modified"
+    before = table.base if modified else table.base @ table.along_x[0]
+    document: dict[str, Any] = {
+        "schema": 1,
+        "name": table.name,
+        "tip": table.tip,
+        "convention": table.convention,
+        "source": source,
+        "joint": [_row(table, place) for place in range(len(table))],
+    }
+    if not np.array_equal(before, np.eye(4)):
+        document["base"] = _pose_document(before)
+    if modified:
+        document |= _flange_row(table)
+    elif not np.array_equal(table.flange, np.eye(4)):
+        document["flange"] = _pose_document(table.flange)
+    return document
+
+
+def _row(table: DHTable, place: int) -> dict[str, Any]:
+    across = place if table.convention == "modified" else place + 1
+    row: dict[str, Any] = {"name": table.joint_names[place]}
+    prismatic = bool(table.prismatic[place])
+    if prismatic:
+        row["type"] = "prismatic"
+    row["a_m"] = float(table.a_m[across])
+    row["alpha_rad"] = float(table.alpha_rad[across])
+    if table.parallel[across]:
+        row["beta_rad"] = float(table.beta_rad[across])
+    row["d_m"] = float(table.d_m[place])
+    row["theta_offset_rad"] = float(table.theta_rad[place])
+    for key, value in (("lower", table.lower[place]), ("upper", table.upper[place])):
+        if prismatic:
+            row |= {f"{key}_m": float(value)} if math.isfinite(value) else {}
+        else:
+            row[f"{key}_deg"] = math.degrees(value)
+    values = zip(_FUNCTION_KEYS, table.functions[place].tolist(), (0.0, 1.0, 0.0, 0.0), strict=True)
+    return row | {key: value for key, value, none in values if key and value != none}
+
+
+def _is_prismatic(row: Table) -> bool:
+    return row.choice("type", ("revolute", "prismatic"), "revolute") == "prismatic"
+
+
+def _limits(row: Table) -> tuple[float, float]:
+    """The limits of q [rad or m]; an angle may be infinite, as TOML writes it."""
+    if _is_prismatic(row):
+        keys = ("lower_m", "upper_m")
+        lower, upper = (
+            row.number(key) if key in row.content else none
+            for key, none in zip(keys, (-math.inf, math.inf), strict=True)
+        )
+    else:
+        keys = ("lower_deg", "upper_deg")
+        lower, upper = (
+            math.inf * sign
+            if row.content.get(key) == math.inf * sign
+            else row.number(key, sign * 360.0)
+            for key, sign in zip(keys, (-1.0, 1.0), strict=True)
+        )
+    if lower >= upper:
+        raise row.refuse(keys[0], lower, f"less than {keys[1]} = {upper!r}")
+    return (lower, upper) if _is_prismatic(row) else (math.radians(lower), math.radians(upper))
+
+
+def _across(row: Table, convention: Convention) -> tuple[float, float, float, float]:
+    """a, alpha, beta, and whether the row is of parallel axes."""
+    parallel = "beta_rad" in row.content
+    if parallel and convention != "hayati":
+        raise DataError(
+            f"{row.label}: beta_rad has no place in the convention {convention!r}.",
+            culprits=[f"{row.label}: beta_rad"],
+            next_step='Leave it out, or write convention = "hayati".',
+        )
+    beta = row.number("beta_rad", 0.0)
+    return row.number("a_m"), row.number("alpha_rad"), beta, float(parallel)
+
+
+def _flange(row: Table, convention: Convention) -> tuple[FloatArray, FloatArray]:
+    """The constant behind X_n, and X_n as (1, 4) where the convention leaves it to the flange."""
+    nothing = np.zeros((1, 4))
+    if not row.content or any(key in row.content for key in _POSE_KEYS):
+        return _pose(row), nothing
+    across = np.array([_across(row, convention)])
+    a, alpha, beta, _ = across[0]
+    along = about_z(np.asarray(row.number("theta_rad", 0.0)), np.asarray(row.number("d_m")))
+    if convention == "modified":
+        return along, across
+    return along @ about_x(a, alpha, beta), nothing
+
+
+def _flange_row(table: DHTable) -> dict[str, Any]:
+    """`[flange]` of a modified table: a row where one is enough, else a pose."""
+    flange = table.flange
+    theta = math.atan2(flange[1, 0], flange[0, 0])
+    if np.array_equal(flange, about_z(np.asarray(theta), flange[2, 3])):
+        numbers = (table.a_m[-1], table.alpha_rad[-1], flange[2, 3], theta)
+        if not any(numbers):
+            return {}
+        keys = ("a_m", "alpha_rad", "d_m", "theta_rad")
+        return {"flange": dict(zip(keys, map(float, numbers), strict=True))}
+    return {"flange": _pose_document(table.along_x[-1] @ flange)}
+
+
+def _pose(row: Table) -> FloatArray:
+    """A constant transform (4, 4) [m]; the identity where the table is empty."""
+    if not row.content:
+        return np.eye(4)
+    xyz, rpy = (number_list(row, key, 3) for key in _POSE_KEYS)
+    return compose(ROTATION_FORMS[POSE_FORMS["rpy"].rotation].read(rpy[None])[0], xyz)
+
+
+def _pose_document(pose: FloatArray) -> dict[str, Any]:
+    # A negative zero would only raise questions.
+    numbers = (write_pose(pose, POSE_FORMS["rpy"]) + 0.0).tolist()
+    return {"xyz_m": numbers[:3], "rpy_rad": numbers[3:]}

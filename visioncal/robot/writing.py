@@ -1,0 +1,152 @@
+"""A robot's geometry as files: joint tables, small URDFs, and the kinematics of UR's driver."""
+
+from dataclasses import replace
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import tomli_w
+
+from visioncal.conventions import POSE_FORMS, write_pose
+from visioncal.errors import DataError
+from visioncal.files import one_line
+from visioncal.robot.chain import FUNCTION_NAMES, IDENTITY_FUNCTION, chain_document
+from visioncal.robot.conversion import table_of
+from visioncal.robot.model import Robot
+from visioncal.robot.tables import DHTable, table_document
+from visioncal.types import FloatArray
+
+# The links of ur_description in its file of kinematics, in order.
+_UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_UR_FIELDS = ("x", "y", "z", "roll", "pitch", "yaw")
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def table_toml(table: DHTable, source: str) -> str:
+    """Writes a joint table as a `.toml` that `load_robot` reads.
+
+    Args:
+        table: The table.
+        source: Where its values come from.
+    """
+    return tomli_w.dumps(table_document(table, source))
+
+
+def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
+    """Writes a (4, 4) pose [m] as xyz and rpy, each number so that it reads back the same."""
+    # A negative zero would only raise questions.
+    numbers = [repr(it) for it in (write_pose(pose, POSE_FORMS["rpy"]) + 0.0).tolist()]
+    return numbers[:3], numbers[3:]
+
+
+def unwritten(robot: Robot) -> tuple[str, ...]:
+    """What a corrected robot has that neither a URDF nor a table of others can hold, in words."""
+    said = []
+    for joint, function in zip(robot.joint_names, robot.chain.functions, strict=True):
+        parts = [
+            f"{name} {value:.9g}"
+            for name, value, none in zip(FUNCTION_NAMES, function, IDENTITY_FUNCTION, strict=True)
+            if name != "offset" and value != none
+        ]
+        said += [f"{joint}: {', '.join(parts)}"] if parts else []
+    return tuple(said)
+
+
+def small_urdf(robot: Robot) -> str:
+    """Writes a URDF of bare links: the joints with their axes and limits, and the tip.
+
+    Joint offsets go into the origins. A URDF has no place for gear ratio and eccentricity; a
+    comment says which are missing.
+    """
+    chain = robot.chain.with_offsets_placed()
+    links = ["base", *(f"link_{place}" for place in range(1, len(chain) + 1))]
+    lines = [
+        '<?xml version="1.0"?>',
+        f"<robot name={quoteattr(robot.name)}>",
+        *comment_lines(robot),
+    ]
+    lines += [f"  <link name={quoteattr(link)}/>" for link in [*links, robot.tip]]
+    for place, joint in enumerate(chain.joint_names):
+        limits = (chain.lower[place], chain.upper[place])
+        bounded = bool(np.isfinite(limits).all())
+        turning = "revolute" if bounded else "continuous"
+        kind = "prismatic" if chain.prismatic[place] else turning
+        lines.append(f'  <joint name={quoteattr(joint)} type="{kind}">')
+        lines += _joint_lines(links[place], links[place + 1], chain.placements[place])
+        axis = " ".join(repr(it) for it in chain.axes[place].tolist())
+        lines.append(f'    <axis xyz="{axis}"/>')
+        if bounded:
+            lower, upper = map(float, limits)
+            lines.append(
+                f'    <limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/>'
+            )
+        lines.append("  </joint>")
+    lines.append(f'  <joint name={quoteattr(f"{links[-1]}-{robot.tip}")} type="fixed">')
+    lines += _joint_lines(links[-1], robot.tip, chain.placements[-1])
+    return "\n".join([*lines, "  </joint>", "</robot>", ""])
+
+
+def comment_lines(robot: Robot) -> list[str]:
+    """The lines of an XML comment on what is missing; none where nothing is."""
+    missing = unwritten(robot)
+    # XML ends a comment at two hyphens.
+    text = one_line("; ".join(missing)).replace("--", "- -")
+    return [f"  <!-- Not in this file, for URDF cannot say it: {text} -->"] if missing else []
+
+
+def _joint_lines(parent: str, child: str, placement: FloatArray) -> list[str]:
+    xyz, rpy = numbers_text(placement)
+    return [
+        f"    <parent link={quoteattr(parent)}/>",
+        f"    <child link={quoteattr(child)}/>",
+        f'    <origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"/>',
+    ]
+
+
+def ur_kinematics_yaml(robot: Robot, *, calibration_hash: str, like: DHTable | None = None) -> str:
+    """Writes the `kinematics` file that ur_description takes as `kinematics_params_file`.
+
+    Each link's x, y, z [m] and roll, pitch, yaw [rad] place its joint in the link before it, the
+    shoulder in base_link_inertia, which is the controller's base; joints turn about z. wrist_3 is
+    the flange, tool0 (ur_description, urdf/ur_macro.xacro and config/ur*/default_kinematics.yaml).
+    A part of the flange's placement has no field there: a comment says it.
+
+    Args:
+        robot: The robot. Where its base is ROS's base_link, a half turn before base_link_inertia,
+            that turn is left out.
+        calibration_hash: The `hash` of the arm's own file, as ur_calibration extracts it; the
+            driver compares it with the arm it is connected to and complains of another.
+        like: The nominal table, so that the links lie as they do there.
+
+    Raises:
+        DataError: The robot has not six revolute joints.
+    """
+    if robot.joint_count != len(_UR_LINKS) or robot.chain.prismatic.any():
+        raise DataError(
+            f"robot {robot.name}: ur_description's kinematics are of six revolute joints, not of "
+            f"{', '.join(robot.joint_names)}.",
+            culprits=[robot.name],
+        )
+    table = table_of(_in_controllers_base(robot), "hayati", like=like)
+    placements = table.along_x[:-1] @ table.along_z
+    placements[0] = table.base @ placements[0]
+    lines = [f"# {one_line(it)}" for it in unwritten(robot)]
+    rest = table.along_x[-1] @ table.flange
+    if np.abs(rest - np.eye(4)).max() > 0.0:
+        xyz, rpy = numbers_text(rest)
+        lines.append(f"# flange in wrist_3: xyz {' '.join(xyz)} rpy {' '.join(rpy)}")
+    lines.append("kinematics:")
+    for link, placement in zip(_UR_LINKS, placements, strict=True):
+        xyz, rpy = numbers_text(placement)
+        lines.append(f"  {link}:")
+        lines += [f"    {key}: {it}" for key, it in zip(_UR_FIELDS, [*xyz, *rpy], strict=True)]
+    return "\n".join([*lines, f"  hash: {calibration_hash}", ""])
+
+
+def _in_controllers_base(robot: Robot) -> Robot:
+    """A UR with the controller's base: at zero its arm points along -x there, along x in ROS's."""
+    chain = robot.chain
+    if robot.base_from_flange(np.zeros((1, len(chain))))[0, 0, 3] <= 0.0:
+        return robot
+    placements = np.array([_HALF_TURN @ chain.placements[0], *chain.placements[1:]])
+    turned = replace(chain, placements=placements)
+    return Robot.from_document(chain_document(robot.name, robot.tip, turned))
