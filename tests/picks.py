@@ -14,7 +14,7 @@ from visioncal.calibration import Calibration
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
-from visioncal.pipeline.result import _calibration
+from visioncal.pipeline.result import result_of
 from visioncal.simulation import Cell, project, rays
 from visioncal.simulation.boards import Sheet, corners_m
 from visioncal.targets import corner_positions
@@ -41,7 +41,7 @@ class Pick:
 
 def calibration_of(cell: Cell, **changes) -> Calibration:
     """The result that the session of a simulated cell gives."""
-    return _calibration(calibrated(cell, **changes))
+    return result_of(calibrated(cell, **changes))
 
 
 def pick_by_plane(cell: Cell, calibration: Calibration, rng: np.random.Generator) -> Pick:

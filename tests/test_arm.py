@@ -55,7 +55,8 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
         # A scale of thirty to fifty random effects: its own sigma is some 15 %, and another basis
         # than the arm's own makes it another number.
         assert 4e-4 < known.arm.sigma < 3e-3
-        assert any("follow the arm's posture" in it for it in known.warnings)
+        told = known.notes if joints else known.warnings
+        assert any(("was calibrated" if joints else "arm's posture") in it for it in told)
         error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
         surprises.append(error @ np.linalg.solve(spread, error) / 12)
     # Without it, this is about a hundred.

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kept import assert_same, assert_same_evidence
-from samples import Sample, made_up, with_frames
+from samples import Sample, made_up, tool_frame, with_frames
 
 import visioncal.recording
-from visioncal.calibration import Calibration, to_document
+from visioncal.calibration import Calibration, FrameFile, to_document
+from visioncal.cli.calibrate import calibrate_command
 from visioncal.errors import DataError
-from visioncal.joining import rewrite
+from visioncal.frames.seen_frame import SEEN_BY
+from visioncal.joining import leftover, rewrite
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import Run, run
 from visioncal.recording import read_calibration, read_evidence, read_session
@@ -125,3 +127,54 @@ def test_results_of_another_session_are_refused(sample, folder):
     with pytest.raises(DataError, match="does not exist"):
         rewrite(folder / "absent", sample.calibration)
     assert contents(folder) == before
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    """A session of pose pairs, which are calibrated in no time."""
+    cell = simulate(CellOptions(views=12, seed=1))
+    return write_session(cell, tmp_path / "pairs", images=False)
+
+
+def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):
+    out = tmp_path / "out"
+    calibrate_command(pairs, out)
+    assert leftover(out) is None
+    assert not (out / "frames.json").exists()
+    # Of what had joined, the fixture was placed by the camera.
+    capsys.readouterr()
+    joined = with_frames(sample).calibration.frames
+    fixture = joined["base_from_fixture"]
+    seen = replace(fixture, details={**fixture.details, SEEN_BY: "yesterday"})
+    frames = {**joined, "base_from_fixture": seen}
+    replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
+    FrameFile({"flange_from_old": tool_frame(), "flange_from_tool": tool_frame()}).save(
+        out / "frames.json"
+    )
+    calibrate_command(pairs, out)
+    assert not Calibration.load(out).frames
+    kept = FrameFile.load(out / "frames.json").frames
+    assert kept.keys() == {"flange_from_old", *frames}
+    assert kept["base_from_fixture"].details[SEEN_BY] == "yesterday"
+    told = capsys.readouterr().err
+    assert "flange_from_tool, base_from_fixture had joined the result that this one" in told
+    assert "It had another flange_from_tool of an earlier time." in told
+    assert "calibrated before: base_from_fixture." in told
+
+
+def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
+    out = tmp_path / "out"
+    calibrate_command(pairs, out)
+    frames = with_frames(sample).calibration.frames
+    replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
+    (out / "frames.json").write_text("not frames", encoding="utf-8")
+    before = contents(out)
+    with pytest.raises(DataError, match=r"frames\.json: not JSON"):
+        calibrate_command(pairs, out)
+    assert contents(out) == before
+
+
+def test_an_unreadable_result_has_nothing_to_lose(tmp_path):
+    (tmp_path / "calibration.json").write_text("an earlier result", encoding="utf-8")
+    assert leftover(tmp_path) is None
+    assert leftover(tmp_path / "nowhere") is None

@@ -397,9 +397,11 @@ def test_a_board_in_a_rendered_image_lies_where_it_stands(rendered):
     calibration, truth = visioncal.calibrate(session), read_truth(rendered)
     at = 4
     image = decode_image(session.images.read(session.views[at].image))
-    reported = session.views[at].base_from_flange().as_matrix()
+    reported = session.views[at].base_from_flange()
     point = np.array([0.135, 0.09, 0.0])
-    found = locate_target(calibration, image, session.target, reported, point)
+    found = visioncal.locate_target(calibration, image, session.target, reported, point)
+    by_matrix = locate_target(calibration, image, session.target, reported.as_matrix(), point)
+    np.testing.assert_array_equal(by_matrix.p_base, found.p_base)
     # What stands still is the board, and what the view saw of it is in cam_from_target.
     flange_from_cam = truth.transforms["flange_from_cam"]
     pose = truth.base_from_flange[at] @ flange_from_cam @ truth.cam_from_target[at]

@@ -3,12 +3,11 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import pytest
 from picks import Stand, calibration_of, corners_at, really
+from plates import CENTRES, looking, marked_plate
 
-from visioncal.calibration import CameraResult
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.errors import DataError
 from visioncal.frames.chain import Eye
@@ -17,9 +16,8 @@ from visioncal.frames.markers import seen_markers
 from visioncal.frames.seen import place_seen
 from visioncal.frames.sight import Sight, places
 from visioncal.simulation import CellOptions, charuco_target, checkerboard_target, exact, simulate
-from visioncal.targets import aruco_dictionary
 from visioncal.transforms import compose, exp, invert, log
-from visioncal.types import Camera, Target
+from visioncal.types import Target
 
 BOARD = charuco_target()
 MARKER = Target("marker", "marker", 1, 1, 0.06, 6e-5, dictionary="DICT_5X5_100", marker_id=3)
@@ -41,11 +39,6 @@ def calibrated_cell(mount, seed):
 @pytest.fixture(scope="module", params=[IN_HAND, TO_HAND])
 def cell(request):
     return calibrated_cell(request.param, 2)
-
-
-def looking(tilt, spin, distance_m):
-    """A target before the camera's middle, (4, 4) `cam_from_target`."""
-    return compose(exp(np.array([*tilt, spin, 0, 0, 0]))[:3, :3], np.array([0.0, 0.0, distance_m]))
 
 
 def place_of(cell, parent, rng, target=BOARD):
@@ -190,6 +183,28 @@ def test_one_image_is_checked_by_nothing_and_two_do_not_tell_which_is_right(cell
     assert torn.scatter > 5.0
 
 
+def test_images_of_one_stop_share_the_robots_error(cell):
+    made, calibration = cell
+    parent = "base" if made.options.mount == IN_HAND else "flange"
+    rng = np.random.default_rng(9)
+    (sight,) = sights_of(made, parent, place_of(made, parent, rng), rng, count=1)
+    eye = Eye.of(calibration)
+    (place, *_) = places(eye, sight, see(eye, sight.seen, BOARD, "image", 0.1), parent)
+    robot = place.by_flange @ eye.flange_noise @ place.by_flange.T
+    same = [replace(sight, label=f"image {at}") for at in range(4)]
+    found = place_seen(calibration, same, BOARD, parent, sigma_px=0.1)
+    # The pixels' noise is averaged, that of the one stop is not.
+    np.testing.assert_allclose(found.independent, place.pixels / 4 + robot, rtol=1e-6, atol=1e-20)
+    assert "of one stop of the robot" in found.warnings[0]
+    # Poses that were read anew differ a little: the stop's number tells that it is one.
+    moved = sight.base_from_flange @ exp(np.full(6, 1e-6))
+    numbered = [replace(it, stop=5) for it in same[:3]]
+    numbered.append(replace(same[3], base_from_flange=moved, stop=5))
+    found = place_seen(calibration, numbered, BOARD, parent, sigma_px=0.1)
+    # To the share of a micrometre in a lever of half a metre.
+    np.testing.assert_allclose(found.independent, place.pixels / 4 + robot, rtol=1e-4, atol=1e-16)
+
+
 def test_a_marker_seen_flat_on_may_be_tilted_the_other_way():
     cell = cell_of(TO_HAND, seed=6, pixel_sigma_px=0.3, views=8)
     calibration, rng = calibration_of(cell), np.random.default_rng(6)
@@ -238,55 +253,9 @@ def test_what_is_missing_is_named(cell):
         place_seen(calibration, [sights[0], sights[0]], BOARD, parent)
 
 
-CLEAR = Camera("brown", (1280, 800), np.array([900.0, 900.0, 640.0, 400.0]), np.zeros(5))
-CENTRES = {0: (-0.12, -0.06), 7: (0.1, -0.05), 21: (0.11, 0.07), 30: (-0.1, 0.06)}
-
-
 @pytest.fixture(scope="module")
 def marked():
-    """A calibrated camera without distortion, and four pictures of four markers on a plate."""
-    cell = cell_of(IN_HAND, seed=9)
-    calibration = calibration_of(cell)
-    true = cell.transforms["flange_from_cam"]
-    edge = replace(calibration.edges["flange_from_cam"], matrix=true)
-    calibration = replace(
-        calibration,
-        edges={**calibration.edges, "flange_from_cam": edge},
-        camera=CameraResult(CLEAR, estimated=False),
-    )
-    base_from_plate = compose(
-        np.diag([1.0, -1.0, -1.0]), cell.transforms["base_from_target"][:3, 3]
-    )
-    sights, rng = [], np.random.default_rng(0)
-    for at, tilt in enumerate([(0.4, 0.1), (-0.3, 0.3), (0.1, -0.5), (0.3, -0.3)]):
-        cam_from_plate = looking(tilt, 0.1 * at, 0.45)
-        flange = base_from_plate @ invert(cam_from_plate) @ invert(true)
-        reported = flange @ invert(exp(rng.normal(0.0, np.repeat([5e-5, 3e-5], 3))))
-        sights.append(Sight(f"picture {at}", picture(cam_from_plate), reported))
-    return calibration, base_from_plate, sights
-
-
-def picture(cam_from_plate, sharper=4):
-    """What the camera sees of the markers: each drawn through its homography, finely."""
-    width, height = CLEAR.resolution
-    canvas = np.full((height * sharper, width * sharper), 180, np.uint8)
-    fx, fy, cx, cy = CLEAR.matrix
-    for marker, (x, y) in CENTRES.items():
-        tile = cv2.aruco.generateImageMarker(aruco_dictionary("DICT_5X5_100"), marker, 210)
-        tile = np.pad(tile, 30, constant_values=255)
-        half = 0.02 * 135 / 105
-        corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
-        points = np.column_stack([corners + np.array([x, y]), np.zeros(4)])
-        cam = points @ cam_from_plate[:3, :3].T + cam_from_plate[:3, 3]
-        px = np.column_stack([fx * cam[:, 0] / cam[:, 2] + cx, fy * cam[:, 1] / cam[:, 2] + cy])
-        # Pixel centres are at integers: a finer raster's first centre lies at -0.5 + 0.5 / n.
-        fine = (px + 0.5) * sharper - 0.5
-        ends = np.array([[0, 0], [270, 0], [270, 270], [0, 270]]) - 0.5
-        warp = cv2.getPerspectiveTransform(ends.astype(np.float32), fine.astype(np.float32))
-        cv2.warpPerspective(
-            tile, warp, canvas.shape[::-1], canvas, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
-        )
-    return cv2.resize(canvas, CLEAR.resolution, interpolation=cv2.INTER_AREA)
+    return marked_plate()
 
 
 def test_markers_are_measured_points_with_a_common_part(marked):

@@ -5,6 +5,7 @@
     >>> calibration.transforms["flange_from_cam"]
     >>> calibration.covariance("flange_from_cam")
     >>> calibration.verdict
+    >>> visioncal.locate(calibration, px, visioncal.Plane.horizontal(0.02), base_from_flange)
 
 The names below are imported on first use, so that `import visioncal` costs nothing.
 """
@@ -23,6 +24,13 @@ if TYPE_CHECKING:
         DriverError,
         VisioncalError,
     )
+    from visioncal.frames.locate import locate, locate_target
+    from visioncal.frames.located import Located
+    from visioncal.frames.picks import locate_views
+    from visioncal.frames.plane import Plane
+    from visioncal.frames.seen import place_seen
+    from visioncal.frames.seen_frame import seen_frame
+    from visioncal.frames.sight import Sight
     from visioncal.pipeline import calibrate
     from visioncal.session import Session
 
@@ -32,9 +40,17 @@ _HOMES = {
     "DataError": "visioncal.errors",
     "DegenerateError": "visioncal.errors",
     "DriverError": "visioncal.errors",
+    "Located": "visioncal.frames.located",
+    "Plane": "visioncal.frames.plane",
     "Session": "visioncal.session",
+    "Sight": "visioncal.frames.sight",
     "VisioncalError": "visioncal.errors",
     "calibrate": "visioncal.pipeline",
+    "locate": "visioncal.frames.locate",
+    "locate_target": "visioncal.frames.locate",
+    "locate_views": "visioncal.frames.picks",
+    "place_seen": "visioncal.frames.seen",
+    "seen_frame": "visioncal.frames.seen_frame",
 }
 
 __all__ = [
@@ -43,10 +59,18 @@ __all__ = [
     "DataError",
     "DegenerateError",
     "DriverError",
+    "Located",
+    "Plane",
     "Session",
+    "Sight",
     "VisioncalError",
     "__version__",
     "calibrate",
+    "locate",
+    "locate_target",
+    "locate_views",
+    "place_seen",
+    "seen_frame",
 ]
 
 

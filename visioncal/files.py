@@ -164,8 +164,9 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Words a hint at the known names nearest to `word`; empty where none is near."""
-    near = difflib.get_close_matches(word.lower(), sorted(known), n=3, cutoff=0.6)
-    return f"Did you mean {' or '.join(near)}?" if near else ""
+    names = {it.lower(): it for it in sorted(known)}
+    near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=0.6)
+    return f"Did you mean {' or '.join(names[it] for it in near)}?" if near else ""
 
 
 def one_line(text: str) -> str:

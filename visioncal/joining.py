@@ -1,12 +1,16 @@
-"""Writes a result anew that an earlier calibration has written, with what has joined it since."""
+"""What has joined the result of an earlier calibration: written with it anew, or kept beside."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, Frame, FrameFile
 from visioncal.errors import DataError
-from visioncal.outputs import write_outputs
+from visioncal.files import some_of
+from visioncal.frames.seen_frame import rests_on_camera
+from visioncal.outputs import CALIBRATION, write_outputs
 from visioncal.pipeline import Run
-from visioncal.stored import load_stored
+from visioncal.stored import FRAMES, load_stored
 
 
 def rewrite(folder: Path, calibration: Calibration) -> tuple[Path, ...]:
@@ -37,3 +41,60 @@ def rewrite(folder: Path, calibration: Calibration) -> tuple[Path, ...]:
         )
     run = Run(calibration, stored.evidence)
     return write_outputs(folder, stored.session, run, stored.note)
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """Frames of a result that is about to be replaced by one that does not have them.
+
+    Attributes:
+        file: Where they are kept.
+        frames: By the transforms that place them.
+        before: What the file holds already.
+    """
+
+    file: Path
+    frames: Mapping[str, Frame]
+    before: Mapping[str, Frame]
+
+    def keep(self) -> None:
+        """Writes them, beside what the file holds under other names."""
+        FrameFile({**self.before, **self.frames}).save(self.file)
+
+    @property
+    def words(self) -> str:
+        """What became of them, and which of them to place anew, for the user."""
+        seen = [name for name, frame in self.frames.items() if rests_on_camera(frame)]
+        told = (
+            f"{some_of(list(self.frames))} had joined the result that this one replaces: kept in "
+            f"{self.file}."
+        )
+        replaced = sorted(self.before.keys() & self.frames.keys())
+        if replaced:
+            told += f" It had another {some_of(replaced)} of an earlier time."
+        if seen:
+            told += (
+                f" By images of the camera as it was calibrated before: {some_of(seen)}. Place "
+                "these again."
+            )
+        return told
+
+
+def leftover(folder: Path) -> Leftover | None:
+    """Finds the frames that a new result in a folder would lose; None where there are none.
+
+    Args:
+        folder: Where a result is to be written. One that cannot be read is no error: it has
+            nothing to lose.
+
+    Raises:
+        DataError: There is a file of frames beside them that cannot be read, nor be replaced.
+    """
+    try:
+        frames = Calibration.load(folder / CALIBRATION).frames
+    except DataError:
+        return None
+    if not frames:
+        return None
+    file = folder / FRAMES
+    return Leftover(file, frames, FrameFile.load(file).frames if file.exists() else {})

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -105,12 +106,19 @@ class Calibration:
         Raises:
             DataError: The session named no known robot, or q has another number of joints.
         """
-        if self.robot is None:
+        arm = self.calibrated_robot
+        if arm is None:
             raise DataError(
                 "this calibration holds no robot model.",
                 next_step="Name one in the session's [robot] table and calibrate again.",
             )
-        return RigidTransform.from_matrix(self.robot.base_from_flange(np.atleast_2d(q)))
+        return RigidTransform.from_matrix(arm.base_from_flange(np.atleast_2d(q)))
+
+    @cached_property
+    def calibrated_robot(self) -> Robot | None:
+        """The arm as it was calibrated, or else its nominal model, where there is one."""
+        found = self.stages.get("kinematics", {})
+        return Robot.from_document(found["robot"]) if "robot" in found else self.robot
 
     def save(self, path: Path | str) -> None:
         """Writes calibration.json, whole or not at all."""

@@ -11,6 +11,8 @@ from visioncal.cli.convert import convert_command
 from visioncal.cli.demo import demo_command
 from visioncal.cli.diff import diff_command
 from visioncal.cli.export import export_command
+from visioncal.cli.fixture import fixture_command
+from visioncal.cli.locate import locate_command
 from visioncal.cli.report import report_command
 from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
@@ -37,6 +39,8 @@ app.command("diff")(diff_command)
 app.command("convert")(convert_command)
 app.command("export")(export_command)
 app.command("tcp")(tcp_command)
+app.command("locate")(locate_command)
+app.command("fixture")(fixture_command)
 app.command("review")(review_command)
 app.command("simulate")(simulate_command)
 app.add_typer(target_app, name="target")

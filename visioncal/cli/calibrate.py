@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from visioncal.calibration import to_document
 from visioncal.cli.console import messages, print_summary, shown_progress
+from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import run
 from visioncal.session import Session
@@ -23,6 +25,12 @@ def calibrate_command(
         SolverName,
         typer.Option(help="The joint fit, or a closed form by name; all are compared anyway."),
     ] = "joint",
+    level: Annotated[
+        str,
+        typer.Option(
+            help="How far to go: auto, hand-eye (nominal arm), offsets (of its joints), kinematics."
+        ),
+    ] = "auto",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print calibration.json to stdout.")
     ] = False,
@@ -32,17 +40,23 @@ def calibrate_command(
 ) -> None:
     """Turn a session into a hand-eye calibration, with reasons to trust it or not.
 
-    Writes calibration.json, report.html and recording.rrd. Exit status 0: there is a result, with
-    a verdict; 2: the input or the motion cannot give one, and an existing folder stays as it was.
+    Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
+    earlier result there are kept in frames.json. Exit status 0: there is a result, with a verdict;
+    2: the input or the motion cannot give one, and an existing folder stays as it was.
     """
     loaded = Session.load(session)
+    left = leftover(out)
     with shown_progress(quiet=as_json) as told:
-        result = run(loaded, solver=solver, progress=told)
+        result = run(loaded, solver=solver, level=level, progress=told)
         told("write", 0, 1)
+        if left is not None:
+            left.keep()
         files = write_outputs(out, loaded, result)
     if as_json:
         typer.echo(json.dumps(to_document(result.calibration), indent=2))
-        return
-    print_summary(result.calibration, verbose=verbose)
-    for file in files:
-        messages().print(f"wrote {file}")
+    else:
+        print_summary(result.calibration, verbose=verbose)
+        for file in files:
+            messages().print(f"wrote {file}")
+    if left is not None:
+        messages().print(escape(left.words))

@@ -13,6 +13,7 @@ from visioncal.calibration.frame import frames_document
 from visioncal.cli.console import messages, print_verdict
 from visioncal.cli.convert_options import names_in
 from visioncal.errors import DataError
+from visioncal.figures import figure
 from visioncal.formats import PoseWishes, Wishes
 from visioncal.joining import rewrite
 from visioncal.robot import Robot, load_robot
@@ -169,7 +170,10 @@ def tell(place: Place, frame: Frame, files: tuple[Path, ...], *, as_json: bool) 
         f"{rotation}"
     )
     console.print(
-        escape(f"{frame.method}: rms {frame.rms_mm:.2g} mm, noise {frame.noise_mm:.2g} mm per axis")
+        escape(
+            f"{frame.method}: rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per "
+            "axis"
+        )
     )
     _tell_before(place, frame)
     for file in files:

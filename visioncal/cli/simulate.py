@@ -41,6 +41,12 @@ def simulate_command(
     robot_sigma_mrad: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation [mrad].")
     ] = 0.05,
+    arm_sigma_mm: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Departure of the arm's lengths [mm].")
+    ] = 0.0,
+    arm_sigma_mrad: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Departure of its angles [mrad].")
+    ] = 0.0,
     wrong_views: Annotated[
         int, typer.Option(min=0, help="Views whose reported pose is wrong.")
     ] = 0,
@@ -65,6 +71,8 @@ def simulate_command(
         state_intrinsics=with_intrinsics,
         robot_sigma_m=1e-3 * robot_sigma_mm,
         robot_sigma_rad=1e-3 * robot_sigma_mrad,
+        dh_sigma_m=1e-3 * arm_sigma_mm,
+        dh_sigma_rad=1e-3 * arm_sigma_mrad,
         wrong_views=wrong_views,
         board_scale=board_scale,
         seed=seed,

@@ -10,10 +10,10 @@ from rich.markup import escape
 from visioncal.cli.console import messages
 from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
-from visioncal.files import check_free, read_bytes, write_atomically
+from visioncal.files import check_free, write_atomically
 from visioncal.finders.identify import identify
 from visioncal.finders.identify_text import describe, to_document, to_toml
-from visioncal.finders.imaging import decode_image
+from visioncal.finders.imaging import read_image
 from visioncal.printing import (
     Page,
     Request,
@@ -24,7 +24,7 @@ from visioncal.printing import (
     write_board,
 )
 from visioncal.targets import load_target, target_document, target_from_document, target_names
-from visioncal.types import Image, Target, TargetKind
+from visioncal.types import Target, TargetKind
 
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",
@@ -182,7 +182,7 @@ def check_command(
         )
     if out is not None:
         check_free(out, force=force)
-    identity = identify(_decoded(image))
+    identity = identify(read_image(image))
     if square_m is not None:
         _checked(identity.target(image.stem, square_m))
     description = to_toml(identity, square_m, image.name)
@@ -197,18 +197,6 @@ def check_command(
         for note in identity.notes:
             messages().print(escape(note))
         messages().print(escape(f"wrote {out}"))
-
-
-def _decoded(path: Path) -> Image:
-    image = decode_image(read_bytes(path))
-    if isinstance(image, str):
-        raise DataError(
-            f"{path} is {image}.",
-            culprits=[str(path)],
-            next_step="A photograph is needed, as png, jpg or tif; a page of a PDF has to be saved "
-            "as one.",
-        )
-    return image
 
 
 def _checked(target: Target) -> None:

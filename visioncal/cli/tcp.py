@@ -27,6 +27,13 @@ from visioncal.cli.framing import (
     tell,
     touch_wishes,
 )
+from visioncal.cli.seeing import (
+    PointOption,
+    frame_by_images,
+    image_session,
+    refuse_given,
+    touch_options,
+)
 from visioncal.formats.touches import read_touches
 from visioncal.frames.naming import transform_name
 from visioncal.frames.tcp import touched_tool
@@ -37,12 +44,13 @@ def tcp_command(
         Path,
         typer.Argument(
             help="A table with a row a touch: the columns of views.csv, kind (point, z or xz) and "
-            "point."
+            "point. Or a session whose images show a target on the tool."
         ),
     ],
     calibration: CalibrationOption = None,
     out: OutOption = None,
     name: NameOption = None,
+    point: PointOption = None,
     touch_noise: TouchNoise = None,
     robot_columns: RobotColumns = None,
     robot_form: RobotForm = None,
@@ -54,13 +62,29 @@ def tcp_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find a tool's tip, and its rotation, from touches of fixed points.
+    """Find a tool's tip, and its rotation, from touches of fixed points; or from images.
 
     A touch of kind point has the tip at the point; of kind z, the point lies on the tool's positive
-    z axis; of kind xz, in its xz plane on the side of positive x. Exit status 2: nothing was
-    written, for the reason given.
+    z axis; of kind xz, in its xz plane on the side of positive x. In images, a target on the tool
+    gives both, by the camera that -c names. Exit status 2: nothing was written, for the reason
+    given.
     """
     place = Place.of(transform_name("tool", name), calibration, out, force=force)
+    for_touches = touch_options(
+        robot_columns,
+        robot_form,
+        robot_unit,
+        robot_inverse,
+        joint_columns,
+        robot_model,
+        touch_noise,
+    )
+    session = image_session(touches, for_touches)
+    if session is not None:
+        frame = frame_by_images(session, place, "tool", point, quiet=as_json)
+        tell(place, frame, place.keep(frame), as_json=as_json)
+        return
+    refuse_given({"--point-mm": point}, "touches say where the tool's point is")
     wishes = touch_wishes(
         robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
     )

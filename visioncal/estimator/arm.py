@@ -72,12 +72,13 @@ class ArmErrors:
         """Returns the errors of some views."""
         return replace(self, basis=self.basis[rows])
 
-    def shared(self) -> Shared:
-        """Puts the effects as unknowns of the chain."""
+    def shared(self, values: FloatArray | None = None) -> Shared:
+        """Puts the effects as unknowns of the chain, at their (p,) present values."""
         size = self.basis.shape[2]
         nothing = np.zeros(size)
+        at = nothing if values is None else values
         known = np.eye(size) / self.sigma**2
-        return Shared(known, nothing, nothing, np.zeros_like(self.basis), self.basis)
+        return Shared(known, known @ at, nothing, np.zeros_like(self.basis), self.basis)
 
 
 def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:

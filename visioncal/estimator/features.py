@@ -111,6 +111,13 @@ class FeatureFit:
         used = self.residuals[self.agreement.agrees]
         return float(np.sqrt(np.mean(np.sum(used**2, axis=1))))
 
+    @property
+    def by_points(self) -> FloatArray:
+        """(n, 6, 3) how the frame's right perturbation moves with each touched point."""
+        fit = self.agreement.fit
+        observed = np.where(fit.groups.observed[:, :, None], fit.state[:3, :3].T, 0.0)
+        return np.asarray(fit.gains @ observed)
+
     def covariance_at(self, noise_m: float) -> FloatArray:
         """(6, 6) covariance of the frame, were that the noise beyond what is known [m]."""
         fit = self.agreement.fit

@@ -143,6 +143,17 @@ class GroupFit(Generic[State]):
     used: Mask
     settled: bool
 
+    @property
+    def gains(self) -> FloatArray:
+        """(m, p, d) how the unknowns' step moves with each group's residuals; zero if unused.
+
+        By these an error that several groups share, and that their weights do not know of, is
+        carried to the answer.
+        """
+        weights = np.linalg.inv(self.groups.spread(self.sigma))
+        weighted = np.where(self.used[:, None, None], weights @ self.groups.jacobian, 0.0)
+        return np.asarray(-self.covariance @ np.swapaxes(weighted, 1, 2))
+
     @cached_property
     def sigma_95(self) -> tuple[float, float]:
         """95 % interval of sigma [m] by the profile likelihood; (0, inf) without any freedom."""

@@ -1,4 +1,4 @@
-"""How well a fixture is placed: its worst directions in words, and when they are too poor."""
+"""How well a frame is placed: its worst directions in words, and when they are too poor."""
 
 from collections.abc import Sequence
 
@@ -60,17 +60,40 @@ def worst_directions(
     """
     level = TOUCH_NOISE_M if sigma_m is None else min(max(sigma_m, LEAST_NOISE_M), SIGMA_LIMIT_M)
     spread = covariance(fit.groups.subset(fit.used).information(level))[:6, :6]
-    at_centre = base_from_fixture[:3, :3] @ np.hstack([-skew(centre), np.eye(3)])
+    return worst_of(base_from_fixture, spread, "fixture", "base", centre)
+
+
+def worst_of(
+    matrix: FloatArray,
+    spread: FloatArray,
+    thing: str,
+    parent: str,
+    centre: FloatArray | None = None,
+) -> tuple[Direction, Direction]:
+    """Finds the worst known offset and rotation of a frame.
+
+    Args:
+        matrix: (4, 4) the frame in its parent.
+        spread: (6, 6) covariance of its right perturbation (rotation [rad], translation [m]).
+        thing: What the frame is of, for messages.
+        parent: What it hangs on, likewise.
+        centre: (3,) where the offset counts, in the frame [m]; its origin where None.
+
+    Returns:
+        The offset's worst direction in the parent, and the rotation's in the frame itself.
+    """
+    point = np.zeros(3) if centre is None else centre
+    at_centre = matrix[:3, :3] @ np.hstack([-skew(point), np.eye(3)])
     values, vectors = np.linalg.eigh(at_centre @ spread @ at_centre.T)
     offset = Direction(
-        f"the fixture's offset along the base's {axis_words(vectors[:, -1])}",
+        f"the {thing}'s offset along the {parent}'s {axis_words(vectors[:, -1])}",
         float(np.sqrt(values[-1])),
         SIGMA_LIMIT_M,
         is_rotation=False,
     )
     values, vectors = np.linalg.eigh(spread[:3, :3])
     rotation = Direction(
-        f"the fixture's rotation about its {axis_words(vectors[:, -1])}",
+        f"the {thing}'s rotation about its {axis_words(vectors[:, -1])}",
         float(np.sqrt(values[-1])),
         SIGMA_LIMIT_RAD,
         is_rotation=True,

@@ -4,7 +4,7 @@ Each point says `measured = base_from_fixture * nominal`, up to the noise that i
 one level of noise that is common to all and estimated. Scale is estimated beside, never absorbed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +65,8 @@ class PointFit:
         agreement: Which points agree and their fit, without any scale. Its residuals are measured
             less drawn, in the base [m].
         scale: What the scale would be.
-        numbering: In which order the points fit the drawing.
+        numbering: In which order the points fit the drawing; one that was measured several times
+            counts once, at its first place.
         hand_known: Whether mirrored points would have been told: else they lie in one plane, and
             the fixture's z axis may as well point the other way.
         worst: The worst known offset, amid the points, and the worst known rotation.
@@ -86,6 +87,11 @@ class PointFit:
     def covariance(self) -> FloatArray:
         """(6, 6) of its right perturbation (rotation [rad], translation [m])."""
         return self.agreement.fit.covariance
+
+    @property
+    def by_points(self) -> FloatArray:
+        """(n, 6, 3) how the frame's right perturbation moves with each measured point."""
+        return self.agreement.fit.gains
 
     @property
     def residuals(self) -> FloatArray:
@@ -160,12 +166,15 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
             do not fit the drawing at all.
         DegenerateError: The points are on a line, or nearly so.
     """
-    check_pairs(pairs)
+    points = pairs.merged()
+    check_pairs(points)
     noise = float(np.hypot(pairs.known_noise_m, expected_noise_m or 0.0))
-    numbering = find_numbering(pairs.measured, pairs.drawn, noise)
-    check_hand(pairs, numbering, noise)
+    numbering = find_numbering(points.measured, points.drawn, noise)
+    check_hand(points, numbering, noise)
     agreement, scale = _agreeing(pairs, expected_noise_m)
-    _check_numbering(pairs, numbering, agreement.agrees)
+    _check_numbering(
+        points, numbering, {pairs.labels[it] for it in np.flatnonzero(agreement.agrees)}
+    )
     fit, agrees = agreement.fit, agreement.agrees
     centre = pairs.nominal[agrees].mean(axis=0)
     worst = worst_directions(fit, fit.state.base_from_fixture, centre, fit.sigma)
@@ -208,9 +217,10 @@ def _scale_of(fit: GroupFit[Placed]) -> Scale:
     return Scale(value, sigma, chance < _FALSE_ALARM)
 
 
-def _check_numbering(pairs: PointPairs, numbering: Numbering, agrees: Mask) -> None:
+def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[str]) -> None:
     """Refuses a wrong order, unless just the points that are out of order were left out."""
-    if not numbering.is_wrong or not agrees[numbering.moved].any():
+    moved = [pairs.labels[at] for at in numbering.moved]
+    if not numbering.is_wrong or not any(it in agree for it in moved):
         return
     more = ""
     if not numbering.is_unique:
@@ -220,7 +230,7 @@ def _check_numbering(pairs: PointPairs, numbering: Numbering, agrees: Mask) -> N
         f"{1e3 * numbering.stated_rms_m:.2g} mm, in another order to "
         f"{1e3 * numbering.rms_m:.2g} mm (root mean square): "
         f"{numbering.words(pairs.drawn_labels)}{more}.",
-        culprits=[pairs.labels[at] for at in numbering.moved],
+        culprits=moved,
         next_step="Correct the points' names.",
     )
 

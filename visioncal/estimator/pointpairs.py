@@ -5,7 +5,7 @@ choice of points would mend them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -40,7 +40,7 @@ class PointPairs:
     """Measured points and the drawing's coordinates of them, n in all.
 
     Attributes:
-        labels: (n,) the points' names.
+        labels: (n,) the points' names; one that was measured several times is there several times.
         measured: (n, 3) in the base [m].
         covariances: (n, 3, 3) what is known of their noise [m^2]; zeros where nothing is.
         nominal: (n, 3) in the fixture's frame [m].
@@ -59,6 +59,23 @@ class PointPairs:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def merged(self) -> "PointPairs":
+        """Returns each point once: the median of its measurements, with their mean covariance."""
+        names = tuple(dict.fromkeys(self.labels))
+        if len(names) == len(self.labels):
+            return self
+        labels = np.array(self.labels)
+        rows = [np.flatnonzero(labels == it) for it in names]
+        first = np.array([it[0] for it in rows])
+        return replace(
+            self,
+            labels=names,
+            measured=np.array([np.median(self.measured[it], axis=0) for it in rows]),
+            covariances=np.array([self.covariances[it].mean(axis=0) for it in rows]),
+            nominal=self.nominal[first],
+            nominal_sigma_m=self.nominal_sigma_m[first],
+        )
 
     @property
     def drawn(self) -> FloatArray:

@@ -43,7 +43,10 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     there = touches.subset(touches.are("point"))
     poses = there.base_from_flange
     as_read = _linear_rms(there)
-    others = {"with quaternions as w, x, y, z": _reordered(poses)}
+    others = {
+        "with quaternions as w, x, y, z": _reordered(poses, -1),
+        "with quaternions as x, y, z, w": _reordered(poses, 1),
+    }
     if len(np.unique(there.points)) > 1:
         inverse = "the other way round, as flange_from_base"
         others |= {f"{words} and {inverse}": invert(it) for words, it in others.items()}
@@ -56,10 +59,10 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     return tuple(sorted(closing, key=lambda it: it.rms_m))
 
 
-def _reordered(poses: FloatArray) -> FloatArray:
-    """The poses had their numbers x, y, z, w been w, x, y, z."""
+def _reordered(poses: FloatArray, shift: int) -> FloatArray:
+    """The poses had the numbers that were read as x, y, z, w stood so many places further on."""
     numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    return compose(Rotation.from_quat(np.roll(numbers, -1, axis=1)).as_matrix(), poses[:, :3, 3])
+    return compose(Rotation.from_quat(np.roll(numbers, shift, axis=1)).as_matrix(), poses[:, :3, 3])
 
 
 def _linear_rms(touches: Touches) -> float:

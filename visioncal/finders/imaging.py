@@ -1,6 +1,7 @@
 """Decoding image files, and measuring how sharp they are."""
 
 import zlib
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -8,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
+from visioncal.errors import DataError
+from visioncal.files import read_bytes
 from visioncal.types import FloatArray, Image
 
 # Half-widths of the window around a corner in which its edges' width is measured [px].
@@ -51,6 +54,23 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     if image is None:
         return "unreadable: not an image that can be decoded"
     return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
+
+
+def read_image(path: Path) -> Image:
+    """Reads a (h, w) grey image; see `decode_image`.
+
+    Raises:
+        DataError: The file is missing, or no image that can be read.
+    """
+    image = decode_image(read_bytes(path))
+    if isinstance(image, str):
+        raise DataError(
+            f"{path} is {image}.",
+            culprits=[str(path)],
+            next_step="A photograph is needed, as png, jpg or tif; a page of a PDF has to be saved "
+            "as one.",
+        )
+    return image
 
 
 def _to_eight_bits(image: npt.NDArray[Any]) -> Image:

@@ -182,7 +182,7 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
     stamps = stamp_name(fields, used)
     if stamps and stamps in unnamed["time"]:
         notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
-    used |= {stamps, "view"} if _view_numbers(fields) else {stamps}
+    used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     paths, image_name, more = _images(fields, wishes, images, used)
     return Foreign(
         name=fields.name,
@@ -193,13 +193,13 @@ def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) 
         if joint_names
         else None,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
-        views=fields.views or _view_numbers(fields),
+        views=fields.views or view_numbers(fields),
         columns={it: cells for it, cells in fields.texts.items() if it not in used | {image_name}},
         notes=(*notes, *more),
     )
 
 
-def _view_numbers(fields: Fields) -> tuple[int, ...]:
+def view_numbers(fields: Fields) -> tuple[int, ...]:
     """The numbers in a column `view`, where they are whole and each is there once."""
     cells = fields.texts.get("view", ())
     whole = all(it.isascii() and it.isdecimal() and len(it) < 10 for it in cells)

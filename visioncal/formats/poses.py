@@ -190,8 +190,16 @@ def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> Float
     return np.deg2rad(joints) if degrees else joints
 
 
-def check_radians(poses: PoseNumbers, wishes: PoseWishes, whose: str) -> None:
+def check_radians(
+    poses: PoseNumbers, wishes: PoseWishes, whose: str, *, guesses: bool = True
+) -> None:
     """Checks that angles of which nobody says what they are can be radians.
+
+    Args:
+        poses: The poses.
+        wishes: What the user says of them.
+        whose: `robot` or `camera`, for messages.
+        guesses: Whether the command can try other readings.
 
     Raises:
         DataError: They turn farther than once about.
@@ -208,8 +216,8 @@ def check_radians(poses: PoseNumbers, wishes: PoseWishes, whose: str) -> None:
             "too large for radians, and the source does not say what it is.",
             culprits=[poses.places[row]],
             next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
-            "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg "
-            "...; or let --guess find it.",
+            "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
+            + ("; or let --guess find it." if guesses else ""),
         )
 
 

@@ -1,31 +1,35 @@
 """Files of touches and of CAD points: tables in any form that `convert` reads."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from visioncal.conventions import UNITS_M
+from visioncal.conventions import POSE_FORMS, UNITS_M
 from visioncal.errors import DataError
 from visioncal.files import some_of
-from visioncal.formats.columns import foreign_from, read_fields
-from visioncal.formats.fields import Fields
-from visioncal.formats.wishes import Wishes
+from visioncal.formats.columns import foreign_from, read_fields, view_numbers
+from visioncal.formats.fields import Fields, unnamed_columns
+from visioncal.formats.poses import ROBOT_KEYS, check_radians, pose_names
+from visioncal.formats.wishes import PoseWishes, Wishes
+from visioncal.frames.nominal import NominalPoints
 from visioncal.frames.touches import TouchRows, touches_of
 from visioncal.session import Session
+from visioncal.session.columns import joint_columns
 from visioncal.types import FloatArray
 
 _NAMES = ("point", "name", "label", "id")
 
 
-def read_touches(path: Path, wishes: Wishes) -> TouchRows:
+def read_touches(path: Path, wishes: Wishes, *, positions: bool = False) -> TouchRows:
     """Reads touches.
 
     Args:
         path: A table with the columns of views.csv, `kind` and `point`; of these, only the pose or
             the joints have to be there. Or a session, whose rows have them.
         wishes: How poses and joints are written, where the columns do not say.
+        positions: Whether positions will do where the table has no rotations: x_m, y_m, z_m, or
+            x, y, z with the unit given.
 
     Raises:
         DataError: It cannot be read, or a row is no pose.
@@ -33,34 +37,48 @@ def read_touches(path: Path, wishes: Wishes) -> TouchRows:
     if path.is_dir() or path.suffix.lower() == ".rrd":
         return touches_of(Session.load(path))
     fields = read_fields(path)
+    unnamed = unnamed_columns(fields)["robot"]
+    named = pose_names(fields, wishes.robot.names, unnamed, ROBOT_KEYS, ())
+    if positions and (not named or (wishes.robot.names and len(named) == 3)):
+        return _rows_of(fields, path, _positions_alone(fields, wishes.robot), None)
+    joints = wishes.joints or joint_columns(tuple(fields.numbers))
+    if not named and not joints and _has_axes(fields):
+        raise DataError(
+            f"{path.name} has positions without rotations, and a tip beside the flange needs both.",
+            culprits=[path.name],
+            next_step="Add the rotations, or name all columns with --robot-columns; or, for a "
+            "fixture, say --tool none where the positions are of the tip itself.",
+        )
     foreign = foreign_from(fields, wishes)
+    check_radians(foreign.robot, wishes.robot, "robot", guesses=False)
+    return _rows_of(fields, path, foreign.robot.poses(), foreign.joints_rad)
+
+
+def _rows_of(
+    fields: Fields, path: Path, poses: FloatArray, joints_rad: FloatArray | None
+) -> TouchRows:
     count = len(fields)
-    numbers = foreign.views or tuple(range(count))
+    numbers = fields.views or view_numbers(fields) or tuple(range(count))
+    texts = {name.lower(): cells for name, cells in fields.texts.items()}
     nothing = ("",) * count
     return TouchRows(
         path.name,
         tuple(map(str, numbers)),
         fields.places,
-        foreign.robot.poses(),
-        foreign.joints_rad,
-        foreign.columns.get("kind", nothing),
-        foreign.columns.get("point", nothing),
+        poses,
+        joints_rad,
+        texts.get("kind", nothing),
+        texts.get("point", nothing),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class NominalPoints:
-    """Points as a drawing has them, n in all.
-
-    Attributes:
-        names: (n,) their names, each once.
-        positions: (n, 3) [m] in the drawing's frame.
-        sigma_m: (n,) how well each is known [m]; 0 where the drawing is taken as exact.
-    """
-
-    names: tuple[str, ...]
-    positions: FloatArray
-    sigma_m: FloatArray
+def _positions_alone(fields: Fields, wishes: PoseWishes) -> FloatArray:
+    """Poses (n, 4, 4) without rotations."""
+    form = POSE_FORMS.get(wishes.form or "")
+    unit = wishes.unit or (form.unit if form else None)
+    poses = np.full((len(fields), 4, 4), np.nan)
+    poses[:, :3, 3] = _coordinates(fields, *_axes(fields, unit, "--robot-unit", wishes.names))
+    return poses
 
 
 def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
@@ -82,21 +100,15 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
         raise DataError(
             f"{path.name}: point {some_of(twice)} stands there more than once.", culprits=twice
         )
-    suffix, scale = _unit(fields, path, unit)
-    positions = np.column_stack([fields.column(f"{axis}{suffix}")[:, 0] for axis in "xyz"])
+    columns, length_m = _axes(fields, unit, "--cad-unit")
+    positions = _coordinates(fields, columns, length_m)
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
     if len(bad):
         raise DataError(
             f"{fields.places[bad[0]]}: a coordinate is missing.",
             culprits=[fields.places[it] for it in bad],
         )
-    sigma = np.zeros(len(fields))
-    if f"sigma{suffix}" in fields.numbers:
-        sigma = np.nan_to_num(fields.column(f"sigma{suffix}")[:, 0])
-    if (sigma < 0).any():
-        place = fields.places[int(np.argmin(sigma))]
-        raise DataError(f"{place}: a sigma is negative.", culprits=[place])
-    return NominalPoints(names, scale * positions, scale * sigma)
+    return NominalPoints(path.name, names, positions, _sigmas(fields, length_m))
 
 
 def _names(fields: Fields) -> tuple[str, ...]:
@@ -114,30 +126,62 @@ def _names(fields: Fields) -> tuple[str, ...]:
     return names
 
 
-def _unit(fields: Fields, path: Path, unit: str | None) -> tuple[str, float]:
-    """Finds the columns' suffix and the length of their unit [m]."""
-    for name, length in UNITS_M.items():
-        if all(f"{axis}_{name}" in fields.numbers for axis in "xyz"):
-            return f"_{name}", length
-    if not _has(fields, ("x", "y", "z")):
-        raise DataError(
-            f"{path.name}: columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed; there are "
-            f"{fields.listing()}.",
-            culprits=[path.name],
-        )
-    if unit is None:
-        raise DataError(
-            f"{path.name}: x, y, z are in no unit that is named.",
-            culprits=[path.name],
-            next_step="Name the columns x_mm, y_mm, z_mm, or say --cad-unit mm.",
-        )
-    if unit not in UNITS_M:
+def _sigmas(fields: Fields, length_m: float) -> FloatArray:
+    """How well each point is known (n,) [m]; zero where the table does not say."""
+    units = {f"sigma_{name}": length for name, length in UNITS_M.items()} | {"sigma": length_m}
+    column = next((it for it in units if it in fields.numbers), None)
+    if column is None:
+        return np.zeros(len(fields))
+    sigmas = units[column] * np.nan_to_num(fields.column(column)[:, 0])
+    if (sigmas < 0).any():
+        place = fields.places[int(np.argmin(sigmas))]
+        raise DataError(f"{place}: {column} is negative.", culprits=[place])
+    return np.asarray(sigmas)
+
+
+def _axes(
+    fields: Fields, unit: str | None, option: str, named: Sequence[str] = ()
+) -> tuple[tuple[str, ...], float]:
+    """Finds the columns of x, y, z, and the length of their unit [m].
+
+    Args:
+        fields: The rows.
+        unit: What they are in, where their names do not say.
+        option: By which the user says that.
+        named: The columns, where the user names them.
+    """
+    if unit is not None and unit not in UNITS_M:
         raise DataError(
             f"There is no unit of length named {unit!r}; the names are {some_of(list(UNITS_M))}.",
             culprits=[unit],
         )
-    return "", UNITS_M[unit]
+    known = {it.lower(): it for it in (*fields.texts, *fields.numbers)}
+    for name, length in UNITS_M.items():
+        wanted = named or [f"{axis}_{name}" for axis in "xyz"]
+        if all(it.lower() in known and it.endswith(f"_{name}") for it in wanted):
+            return tuple(known[it.lower()] for it in wanted), length
+    plain = tuple(named) or tuple(known.get(axis, "") for axis in "xyz")
+    if not all(plain):
+        raise DataError(
+            f"{fields.name}: columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed; there are "
+            f"{fields.listing()}.",
+            culprits=[fields.name],
+        )
+    if unit is None:
+        raise DataError(
+            f"{fields.name}: {', '.join(plain)} are in no unit that is named.",
+            culprits=[fields.name],
+            next_step=f"Name the columns x_mm, y_mm, z_mm, or say {option} mm.",
+        )
+    return plain, UNITS_M[unit]
 
 
-def _has(fields: Fields, names: Sequence[str]) -> bool:
-    return all(it in fields.numbers for it in names)
+def _has_axes(fields: Fields) -> bool:
+    known = {it.lower() for it in fields.numbers}
+    suffixes = ("", *(f"_{it}" for it in UNITS_M))
+    return any(all(f"{axis}{it}" in known for axis in "xyz") for it in suffixes)
+
+
+def _coordinates(fields: Fields, columns: Sequence[str], length_m: float) -> FloatArray:
+    """Takes three columns in a unit of some length: (n, 3) [m]; NaN where a cell is empty."""
+    return length_m * np.column_stack([fields.column(it)[:, 0] for it in columns])

@@ -5,10 +5,12 @@ where the image was taken is new, and adds to the camera's transform. Eye-to-han
 `base_from_cam` is the camera's transform itself, and no robot stands between.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
@@ -16,6 +18,9 @@ from visioncal.estimator.arm import pose_basis
 from visioncal.estimator.observability import edge_names
 from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import Camera, FloatArray, Mount
+
+# A transform, or its (4, 4) matrix.
+Pose: TypeAlias = FloatArray | RigidTransform
 
 # No arm reaches this far [m]: such numbers are in millimetres.
 FAR_M = 20.0
@@ -99,12 +104,12 @@ class Eye:
             raise DataError(f"locate: sigma_px is {sigma!r}; a standard deviation is needed.")
         return float(sigma)
 
-    def at(self, base_from_flange: FloatArray | None) -> "Stop":
+    def at(self, base_from_flange: Pose | None) -> "Stop":
         """The chain while the flange stands somewhere.
 
         Args:
-            base_from_flange: (4, 4) as the robot reported it when the image was taken. A camera
-                that stands still needs none, and takes no notice of one.
+            base_from_flange: As the robot reported it when the image was taken. A camera that
+                stands still needs none, and takes no notice of one.
 
         Raises:
             DataError: A camera on the flange needs the pose and there is none, or it is no rigid
@@ -117,8 +122,10 @@ class Eye:
                 "locate: the camera is on the flange (eye-in-hand), and the robot's pose at the "
                 "image is missing.",
                 next_step="Give base_from_flange as the robot reported it when the image was "
-                "taken.",
+                "taken: on the command line with --pose, or by a session and its --view.",
             )
+        if isinstance(base_from_flange, RigidTransform):
+            base_from_flange = np.asarray(base_from_flange.as_matrix())
         checked_pose(base_from_flange, "base_from_flange")
         return Stop(
             base_from_flange @ self.edge,
@@ -191,6 +198,27 @@ def checked_pose(pose: FloatArray, name: str) -> None:
             culprits=[name],
             next_step="It looks like millimetres: multiply it by 0.001.",
         )
+
+
+def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArray:
+    """Refuses what is no point in metres.
+
+    Returns:
+        (3,) the point [m].
+
+    Raises:
+        DataError: It is no three finite numbers, or farther off than any arm reaches.
+    """
+    point = np.asarray(point_m, dtype=float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise DataError(f"{name} is {point.tolist()}; three metres are needed.", culprits=[name])
+    if np.abs(point).max() > FAR_M:
+        raise DataError(
+            f"{name} is {point.tolist()}, and no arm reaches farther than {FAR_M:g} m.",
+            culprits=[name],
+            next_step="It looks like millimetres: multiply it by 0.001.",
+        )
+    return point
 
 
 def _together(

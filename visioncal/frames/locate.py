@@ -8,7 +8,7 @@ from visioncal.calibration import Calibration
 from visioncal.camera import normalise, project_with_jacobian
 from visioncal.errors import DataError
 from visioncal.estimator.observability import SIGMA_LIMIT_M
-from visioncal.frames.chain import Eye, Stop, point_slope
+from visioncal.frames.chain import Eye, Pose, Stop, checked_point, point_slope
 from visioncal.frames.located import Located
 from visioncal.frames.look import SeenTarget, see
 from visioncal.frames.plane import Plane
@@ -22,7 +22,7 @@ def locate(
     calibration: Calibration,
     px: FloatArray,
     plane: Plane,
-    base_from_flange: FloatArray | None = None,
+    base_from_flange: Pose | None = None,
     *,
     sigma_px: float | None = None,
 ) -> tuple[Located, ...]:
@@ -32,8 +32,8 @@ def locate(
         calibration: The camera's.
         px: (n, 2) where the features were seen [px], pixel centres at integers.
         plane: What they lie in.
-        base_from_flange: (4, 4) where the robot stood at the image, as it reported it; only for a
-            camera on the flange.
+        base_from_flange: Where the robot stood at the image, as it reported it; only for a camera
+            on the flange.
         sigma_px: Noise of a feature's coordinate [px]; the calibration's corners' where None.
 
     Returns:
@@ -150,10 +150,9 @@ def _located(
     worst_m = float(np.sqrt(max(np.linalg.eigvalsh(found.covariance)[-1], 0.0)))
     if worst_m <= SIGMA_LIMIT_M:
         return found
-    source = max(kept, key=lambda name: float(np.trace(kept[name])))
     told = (
         f"The place is known to {1e3 * worst_m:.2g} mm only in its worst direction (limit "
-        f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[source]}."
+        f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[found.largest]}."
     )
     return Located(place, kept, found.freedom, (*found.warnings, told))
 
@@ -186,10 +185,11 @@ def locate_target(
     calibration: Calibration,
     seen: Corners | Image,
     target: Target,
-    base_from_flange: FloatArray | None = None,
+    base_from_flange: Pose | None = None,
     point_target_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
     *,
     sigma_px: float | None = None,
+    label: str = "image",
 ) -> Located:
     """Places a point of a target that an image shows in the base.
 
@@ -200,10 +200,11 @@ def locate_target(
         calibration: The camera's.
         seen: The target's corners, or the (h, w) grey image to find them in.
         target: What is seen.
-        base_from_flange: (4, 4) where the robot stood at the image, as it reported it; only for a
-            camera on the flange.
+        base_from_flange: Where the robot stood at the image, as it reported it; only for a camera
+            on the flange.
         point_target_m: (3,) the point in the target's frame [m].
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
+        label: What messages call the image.
 
     Raises:
         DataError: There is no camera or no pose of the robot, or the image does not show the
@@ -211,10 +212,8 @@ def locate_target(
     """
     eye = Eye.of(calibration)
     stop = eye.at(base_from_flange)
-    view = see(eye, seen, target, "image", sigma_px)
-    point = np.asarray(point_target_m, dtype=float)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise DataError(f"locate: point_target_m is {point.tolist()}; three metres are needed.")
+    view = see(eye, seen, target, label, sigma_px)
+    point = checked_point(point_target_m, "point_target_m")
     places = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
     pose, point_cam = view.cam_from_target[0], places[0]
     turned = stop.base_from_cam[:3, :3] @ point_slope(pose, point)

@@ -48,6 +48,11 @@ class Located:
         return {name: _length_mm(spread) for name, spread in every.items()}
 
     @property
+    def largest(self) -> str:
+        """The source that most of the uncertainty is from."""
+        return max(self.parts, key=lambda name: float(np.trace(self.parts[name])))
+
+    @property
     def radius95_mm(self) -> float:
         """Radius of the ball around `p_base` that holds the true place in 95 % of cases [mm].
 

@@ -27,6 +27,9 @@ from visioncal.types import Camera, Corners, FloatArray, Image, Target
 
 # Corners scatter more than this by chance in one look of ten thousand.
 _FALSE_ALARM = 1e-4
+# Less than so many times the noise that was to be expected is counted without a word: light and
+# distance do that.
+_WORTH_A_WORD = 2.0
 # Wrong corners spoil the pose that they are judged by: so often it is made anew without them.
 _ROUNDS = 3
 # Edges wider than this hide an image's corners; the widest that detection takes.
@@ -187,6 +190,8 @@ def _noise(
     # Rounding of exact corners is no scatter.
     if squares <= limit or shown < 1e-6:
         return noise_px, ()
+    if shown < _WORTH_A_WORD * noise_px:
+        return shown, ()
     return shown, (
         f"{label}: the corners scatter by {shown:.2g} px around the target's pose, and "
         f"{noise_px:.2g} px was to be expected: look whether the image is sharp, and the target "

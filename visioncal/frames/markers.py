@@ -1,6 +1,6 @@
 """Markers on a fixture as measured points: their centres in the base, with names and covariance."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,14 @@ from visioncal.frames.agree import Agreement, Sights, agreeing
 from visioncal.frames.chain import Eye
 from visioncal.frames.look import SeenTarget, check_size, see
 from visioncal.frames.seen import doubts
-from visioncal.frames.sight import Place, Sight, check_labels, common_covariance, places
+from visioncal.frames.sight import (
+    Place,
+    Sight,
+    all_places,
+    check_labels,
+    common_covariance,
+    needs_robot,
+)
 from visioncal.targets import target_from_document
 from visioncal.types import Corners, FloatArray, Image, Target
 
@@ -100,11 +107,10 @@ def seen_markers(
         )
     common = common_covariance(eye, markers[0].looks[0].scale_sigma)
     found = [agreeing(Sights(it.views, eye.flange_noise, common, eye.freedom)) for it in markers]
-    labels = [it.label for it in sights]
     warnings = [
         told
         for marker, agreement in zip(markers, found, strict=True)
-        for told in _warnings(marker, agreement, labels)
+        for told in _warnings(eye, marker, agreement, sights)
     ]
     return SeenPoints(
         tuple(it.name for it in markers),
@@ -125,16 +131,16 @@ def _target(marker: int, dictionary: str, size_m: float, sigma_m: float | None) 
 
 def _look(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float | None) -> _Marker:
     """Looks for one marker in all images; those without it are passed over."""
-    images, views, looks = [], [], []
-    for at, sight in enumerate(sights):
-        corners = _corners(eye, sight, target)
-        if corners is None:
-            continue
-        look = see(eye, corners, target, sight.label, sigma_px)
-        images.append(at)
-        looks.append(look)
-        views.append(places(eye, sight, look, "base"))
-    return _Marker(str(target.marker_id), tuple(images), tuple(views), tuple(looks))
+    seen = [(at, _corners(eye, sight, target)) for at, sight in enumerate(sights)]
+    shown = [(at, corners) for at, corners in seen if corners is not None]
+    own = [sights[at] for at, _ in shown]
+    looks = [
+        see(eye, corners, target, sight.label, sigma_px)
+        for (_, corners), sight in zip(shown, own, strict=True)
+    ]
+    views = all_places(eye, own, looks, "base")
+    images = tuple(at for at, _ in shown)
+    return _Marker(str(target.marker_id), images, tuple(views), tuple(looks))
 
 
 def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
@@ -152,13 +158,17 @@ def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
     return Corners(0, found.ids, found.px, blur_at_corners(image, found.px))
 
 
-def _warnings(marker: _Marker, found: Agreement, labels: Sequence[str]) -> list[str]:
-    """What is odd; a mirrored pose does not matter where it leaves the centre in its place."""
-    own = [labels[at] for at in marker.images]
-    told = [it for look in marker.looks for it in look.warnings]
-    if len(own) > 1:
-        told += doubts(found, own, marker.looks, f"marker {marker.name}")
-    return told
+def _warnings(
+    eye: Eye, marker: _Marker, found: Agreement, sights: Sequence[Sight]
+) -> Iterator[str]:
+    """What is odd. One image is not: the other markers check it."""
+    for look in marker.looks:
+        yield from look.warnings
+    if len(marker.images) > 1:
+        own = [sights[at] for at in marker.images]
+        stops = len({it.stop_key for it in own}) if needs_robot(eye, "base") else None
+        labels = [it.label for it in own]
+        yield from doubts(found, labels, marker.looks, stops, f"marker {marker.name}")
 
 
 def _shares(found: Agreement, views: Sequence[Sequence[Place]]) -> list[tuple[Place, FloatArray]]:

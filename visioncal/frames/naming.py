@@ -7,7 +7,7 @@ from visioncal.errors import DataError
 
 FrameKind: TypeAlias = Literal["tool", "fixture"]
 
-PARENTS: dict[FrameKind, str] = {"tool": "flange", "fixture": "base"}
+PARENTS: dict[FrameKind, Literal["flange", "base"]] = {"tool": "flange", "fixture": "base"}
 # Frames that every cell has; another of the same name would hide them.
 _TAKEN = ("cell", "base", "flange", "cam", "target", "image", "instrument")
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)

@@ -1,7 +1,8 @@
 """A tool or a fixture placed by a target on it, as the calibrated camera sees it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.stats import chi2
@@ -10,8 +11,15 @@ from visioncal.calibration import Calibration, Edge
 from visioncal.frames.agree import Agreement, Sights, agreeing
 from visioncal.frames.chain import Eye
 from visioncal.frames.look import SeenTarget, see
-from visioncal.frames.sight import Parent, Sight, check_labels, common_covariance, places
-from visioncal.transforms import pose_difference
+from visioncal.frames.sight import (
+    Parent,
+    Sight,
+    all_places,
+    check_labels,
+    common_covariance,
+    needs_robot,
+)
+from visioncal.transforms import adjoint, compose, invert, pose_difference
 from visioncal.types import FloatArray, Mask, Target
 
 # Images scatter more than this by chance in one set of ten thousand.
@@ -57,10 +65,30 @@ class Seen:
         """The transform with its covariance."""
         return Edge(self.matrix, self.covariance)
 
+    def at(self, point_m: FloatArray) -> Self:
+        """The same of a frame with the target's axes whose origin is a point of the target.
+
+        Args:
+            point_m: (3,) in the target's frame [m].
+        """
+        target_from_point = compose(np.eye(3), point_m)
+        carry = adjoint(invert(target_from_point))
+        return replace(
+            self,
+            matrix=self.matrix @ target_from_point,
+            independent=carry @ self.independent @ carry.T,
+            common=carry @ self.common @ carry.T,
+        )
+
     @property
     def rms_mm(self) -> float:
         """Root mean square distance of the images that agree from their mean [mm]."""
         return float(np.sqrt(np.mean(self.away_mm[self.agrees] ** 2)))
+
+    @property
+    def rms_deg(self) -> float:
+        """The same in rotation [deg]."""
+        return float(np.sqrt(np.mean(self.away_deg[self.agrees] ** 2)))
 
 
 def place_seen(
@@ -90,8 +118,16 @@ def place_seen(
     check_labels(sights)
     eye = Eye.of(calibration)
     looks = [see(eye, it.seen, target, it.label, sigma_px) for it in sights]
-    views = [places(eye, it, look, parent) for it, look in zip(sights, looks, strict=True)]
+    return place_looks(eye, sights, looks, parent)
+
+
+def place_looks(
+    eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
+) -> Seen:
+    """Places a target by what was seen of it in each of the images; see `place_seen`."""
+    views = all_places(eye, sights, looks, parent)
     common = common_covariance(eye, looks[0].scale_sigma)
+    stops = len({it.stop_key for it in sights}) if needs_robot(eye, parent) else None
     found = agreeing(Sights(views, eye.flange_noise, common, eye.freedom))
     labels = tuple(it.label for it in sights)
     return Seen(
@@ -106,13 +142,17 @@ def place_seen(
         (
             *eye.warnings,
             *(told for look in looks for told in look.warnings),
-            *doubts(found, labels, looks),
+            *doubts(found, labels, looks, stops),
         ),
     )
 
 
 def doubts(
-    found: Agreement, labels: Sequence[str], looks: Sequence[SeenTarget], thing: str = "target"
+    found: Agreement,
+    labels: Sequence[str],
+    looks: Sequence[SeenTarget],
+    stops: int | None,
+    thing: str = "target",
 ) -> Iterator[str]:
     """Says what of an agreement of images is not as it should be.
 
@@ -120,6 +160,7 @@ def doubts(
         found: The agreement.
         labels: The images' names.
         looks: What was seen in them.
+        stops: At how many stops of the robot they were taken; None where it has no part.
         thing: What was seen, in words.
     """
     count = len(labels)
@@ -130,7 +171,15 @@ def doubts(
         )
     inside = int(found.agrees.sum())
     if count == 1:
-        yield f"One image places the {thing}: nothing checks it. Take another, from another side."
+        yield (
+            f"One image places the {thing}: nothing checks it. Take another"
+            f"{', from another side' if stops else ''}."
+        )
+    elif stops == 1:
+        yield (
+            f"All {count} images are of one stop of the robot, whose error they share: nothing "
+            "checks it. Take others, from other sides."
+        )
     elif _is_torn(found):
         worst = int(np.where(found.agrees, found.surprise, -1.0).argmax())
         yield (

@@ -5,7 +5,8 @@ base_from_target = base_from_flange * flange_from_cam * cam_from_target    eye-i
 flange_from_target = flange_from_base * base_from_cam * cam_from_target    eye-to-hand
 flange_from_target = flange_from_cam * cam_from_target                     eye-in-hand
 
-The robot counts where it stands between parent and target: in the second and the third.
+The robot counts where it stands between parent and target: in the second and the third. Images of
+one stop share its error there.
 """
 
 from collections.abc import Sequence
@@ -33,11 +34,21 @@ class Sight:
         seen: The target's corners, or the (h, w) grey image to find them in.
         base_from_flange: (4, 4) where the robot stood at the image, as it reported it; None where
             no robot stands between parent and target.
+        stop: Number of the robot's stop, where stops are numbered; else images with the same pose
+            are of one.
     """
 
     label: str
     seen: Corners | Image
     base_from_flange: FloatArray | None = None
+    stop: int | None = None
+
+    @property
+    def stop_key(self) -> object:
+        """What tells the robot's stops apart; of an image without a pose, its label."""
+        if self.stop is not None:
+            return self.stop
+        return self.label if self.base_from_flange is None else self.base_from_flange.tobytes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +58,9 @@ class Place:
     Attributes:
         matrix: (4, 4) `parent_from_target`.
         pixels: (6, 6) covariance of its right perturbation by the pixels' noise.
-        by_flange: (6, 6) how it moves with the flange at this stop; zero where none is between.
+        by_flange: (6, 6) how it moves with the flange at this stop; zero where none is between. Of
+            k images of one stop it is sqrt(k) times as much: their mean then has the variance of
+            the error that they share.
         by_common: (6, c) how it moves with what all images share: see `common_covariance`.
     """
 
@@ -68,7 +81,20 @@ def needs_robot(eye: Eye, parent: Parent) -> bool:
     return (eye.mount == "eye-in-hand") == (parent == "base")
 
 
-def places(eye: Eye, sight: Sight, view: SeenTarget, parent: Parent) -> tuple[Place, ...]:
+def all_places(
+    eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
+) -> list[tuple[Place, ...]]:
+    """Carries what images of one target allow to the parent's frame; see `places`."""
+    stops = [it.stop_key for it in sights]
+    return [
+        places(eye, sight, look, parent, stops.count(stop))
+        for sight, look, stop in zip(sights, looks, stops, strict=True)
+    ]
+
+
+def places(
+    eye: Eye, sight: Sight, view: SeenTarget, parent: Parent, of_stop: int = 1
+) -> tuple[Place, ...]:
     """Carries the poses that one image allows to the parent's frame.
 
     Args:
@@ -76,13 +102,15 @@ def places(eye: Eye, sight: Sight, view: SeenTarget, parent: Parent) -> tuple[Pl
         sight: The image.
         view: What was seen in it.
         parent: The frame that the target is to be placed in.
+        of_stop: How many images are of its stop of the robot.
 
     Raises:
         DataError: The robot's pose is needed and missing, or it is none.
     """
     flange = sight.base_from_flange
     if not needs_robot(eye, parent):
-        return _carried(eye, view, eye.edge, np.zeros((len(view.turns), 6, 6)), np.eye(4))
+        still = np.zeros((len(view.turns), 6, 6))
+        return _carried(eye, view, eye.edge, still, np.eye(4), of_stop)
     if flange is None:
         raise DataError(
             f"{sight.label}: the robot stands between the {parent} and what the camera "
@@ -93,10 +121,10 @@ def places(eye: Eye, sight: Sight, view: SeenTarget, parent: Parent) -> tuple[Pl
     checked_pose(flange, f"{sight.label}: base_from_flange")
     if parent == "base":
         by_flange = adjoint(invert(eye.edge @ view.cam_from_target))
-        return _carried(eye, view, flange @ eye.edge, by_flange, flange)
+        return _carried(eye, view, flange @ eye.edge, by_flange, flange, of_stop)
     flange_from_cam = invert(flange) @ eye.edge
     by_flange = -adjoint(invert(flange_from_cam @ view.cam_from_target))
-    return _carried(eye, view, flange_from_cam, by_flange, flange)
+    return _carried(eye, view, flange_from_cam, by_flange, flange, of_stop)
 
 
 def _carried(
@@ -105,6 +133,7 @@ def _carried(
     parent_from_cam: FloatArray,
     by_flange: FloatArray,
     base_from_flange: FloatArray,
+    of_stop: int,
 ) -> tuple[Place, ...]:
     arm = eye.arm_basis(base_from_flange)
     by_edge = adjoint(invert(view.cam_from_target))
@@ -112,7 +141,7 @@ def _carried(
         Place(
             parent_from_cam @ pose,
             view.covariance[at],
-            by_flange[at],
+            np.sqrt(of_stop) * by_flange[at],
             np.concatenate(
                 [by_edge[at], view.by_lens[at], view.by_scale[at][:, None], by_flange[at] @ arm],
                 axis=1,

@@ -1,6 +1,6 @@
 """A tool from touches: the fit, the words for it, and whether to trust it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
@@ -9,14 +9,20 @@ import numpy as np
 
 from visioncal.calibration import Calibration, Edge, Frame, Observation
 from visioncal.errors import DataError, DegenerateError, VisioncalError
-from visioncal.estimator.closure import Noise
 from visioncal.estimator.pivot import PivotFit, fit_pivot
 from visioncal.estimator.readings import readings_that_close
 from visioncal.estimator.touching import Touches, TouchKind
 from visioncal.figures import figure
-from visioncal.files import some_of
-from visioncal.frames.touches import TouchRows, flange_poses, numbered
-from visioncal.frames.verdicts import Doubt, verdict_of
+from visioncal.frames.touches import TouchRows, flange_poses, numbered, refuse_copies, robot_noise
+from visioncal.frames.verdicts import (
+    Doubt,
+    disputed,
+    noisy,
+    off_words,
+    placed_name,
+    verdict_of,
+    weak_directions,
+)
 from visioncal.robot import Robot
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray
@@ -69,12 +75,13 @@ def touched_tool(
     rows = rows.of_kinds(TOUCH_KINDS, "point")
     known = None if calibration is None else calibration.robot
     poses = flange_poses(rows, robot if robot is not None else known)
+    refuse_copies(poses, rows.places)
     touches = _touches(rows, poses)
     try:
         fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
     except (DataError, DegenerateError) as error:
         raise _with_reading(error, touches) from error
-    doubts = list(_doubts(fit, touches, options or TcpOptions()))
+    doubts = list(_doubts(fit, touches, rows.places, options or TcpOptions()))
     return Frame(
         Edge(fit.flange_from_tool, fit.covariance),
         fit.oriented,
@@ -86,15 +93,6 @@ def touched_tool(
         tuple(_observations(fit, touches)),
         verdict_of(doubts, _praise(fit, touches)),
         _details(fit, touches),
-    )
-
-
-def robot_noise(calibration: Calibration | None) -> Noise:
-    """Errors of the flange from stop to stop, as calibrated; zero where nothing is known."""
-    found = {} if calibration is None else calibration.noise
-    return Noise(
-        float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
-        1e-3 * found.get("robot_translation_mm", 0.0),
     )
 
 
@@ -156,74 +154,52 @@ def _observations(fit: PivotFit, touches: Touches) -> Iterator[Observation]:
 
 def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
     """Says what is wrong with a touch, or may be."""
-    off = f"{figure(1e3 * float(fit.residuals_m[at]))} mm off"
+    words = off_words(float(fit.residuals_m[at]), float(fit.surprise[at]), float(fit.limit[at]))
     if fit.doubtful[at]:
-        return f"{off}: one of the touches that contradict each other"
-    limit = float(np.sqrt(fit.surprise[at] / fit.limit[at]))
-    words = f"{off}, {figure(limit)} times what the others allow"
+        return f"{words}: one of the touches that contradict each other"
     belongs = fit.belongs_to[at]
     if belongs is not None:
         return f"{words}; it fits point {touches.names[belongs]!r}: is its name exchanged?"
     return f"{words}: the tip had slipped, or the pose is of another moment"
 
 
-def _doubts(fit: PivotFit, touches: Touches, options: TcpOptions) -> Iterator[Doubt]:
-    yield from _wrong_touches(fit, touches)
-    noise_mm, (check, bad) = 1e3 * fit.sigma_m, options.noise_mm
-    if noise_mm > check:
-        hint = _reading_hint(touches)
-        yield Doubt(
-            f"The touches agree to {figure(noise_mm)} mm only (per axis; doubt begins at "
-            f"{check:g}). "
-            + (
-                hint
-                or "Touch again with a sharp tip; an arm that was never "
-                "calibrated is off by a millimetre from posture to posture."
-            ),
-            noise_mm > bad,
-        )
-    elif not fit.explained:
-        yield Doubt(
-            "The touches scatter by more than a touch is stated to, without one that stands out: "
-            f"{figure(noise_mm)} mm per axis. Touch again, or state --touch-noise as it is."
-        )
+def _doubts(
+    fit: PivotFit, touches: Touches, places: Sequence[str], options: TcpOptions
+) -> Iterator[Doubt]:
+    rows = range(len(touches))
+    yield from disputed(
+        [placed_name(f"Touch {touches.labels[it]}", places[it]) for it in rows],
+        [_wrong(fit, touches, it) for it in rows],
+        fit.agrees,
+        fit.doubtful,
+        "Touch twice more.",
+    )
+    yield from noisy(
+        1e3 * fit.sigma_m,
+        options.noise_mm,
+        _reading_hint(touches)
+        or "Touch again with a sharp tip; an arm that was never calibrated is off by a millimetre "
+        "from posture to posture.",
+        explained=fit.explained,
+    )
     if fit.looks_inverse:
         yield Doubt(
             "The tip would be farther from the flange than the point from the base: poses read the "
             "other way round look like this. If the columns hold flange_from_base, say "
             "--robot-inverse."
         )
-    yield from _weak(fit, options)
+    yield from weak_directions(
+        fit.worst,
+        options.sigma_mm,
+        options.sigma_deg,
+        "Add touches tilted by 30 to 45 degrees about other axes.",
+    )
     used = int(np.sum(fit.agrees & touches.are("point")))
     if used < options.touches:
         yield Doubt(
             f"Only {used} touches of a point are used: {options.touches} or more give the result "
             "something to be checked with."
         )
-
-
-def _wrong_touches(fit: PivotFit, touches: Touches) -> Iterator[Doubt]:
-    for at in np.flatnonzero(~fit.agrees).tolist():
-        yield Doubt(f"Touch {touches.labels[at]} was left out: {_wrong(fit, touches, at)}.")
-    doubtful = [touches.labels[it] for it in np.flatnonzero(fit.doubtful)]
-    if doubtful:
-        yield Doubt(
-            f"Touches {some_of(doubtful)} contradict each other, and nothing tells which is wrong: "
-            "all are used. Touch twice more."
-        )
-
-
-def _weak(fit: PivotFit, options: TcpOptions) -> Iterator[Doubt]:
-    for it in fit.worst:
-        scale, unit = (np.rad2deg(1.0), "deg") if it.is_rotation else (1e3, "mm")
-        check, bad = options.sigma_deg if it.is_rotation else options.sigma_mm
-        if it.sigma * scale > check:
-            yield Doubt(
-                f"{it.words[0].upper()}{it.words[1:]} is known to {figure(it.sigma * scale)} "
-                f"{unit} only (doubt begins at {check:g}). Add touches tilted by 30 to 45 degrees "
-                "about other axes.",
-                it.sigma * scale > bad,
-            )
 
 
 def _praise(fit: PivotFit, touches: Touches) -> str:

@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.calibration import Calibration
 from visioncal.errors import DataError
+from visioncal.estimator.closure import Noise
 from visioncal.files import did_you_mean, some_of
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -14,6 +16,8 @@ from visioncal.types import FloatArray, Mask
 
 # No arm reaches this far [m], and no joint of one turns this far [rad].
 _FAR_M, _WIDE_RAD = 20.0, 4 * np.pi
+# And none stays so near to its base's origin [m], nor repeats a pose to so many digits.
+_NEAR_M, _COPIED = 0.02, 1e-9
 # Poses and the model's, of one row: farther apart the model is of another arm or of another frame.
 _SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
 
@@ -26,7 +30,8 @@ class TouchRows:
         source: What they were read from, for messages and for the record.
         labels: (n,) the rows' view numbers, as text.
         places: (n,) where each stands: `touches.csv, line 3`.
-        base_from_flange: (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose.
+        base_from_flange: (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose,
+            and in the rotation where there are positions alone.
         joints_rad: (n, j) joint angles [rad], NaN in a row without; None where there are none.
         kinds: (n,) what was touched; empty where the row does not say.
         points: (n,) which point was touched; empty likewise.
@@ -43,12 +48,13 @@ class TouchRows:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def of_kinds(self, allowed: Sequence[str], default: str) -> "TouchRows":
+    def of_kinds(self, allowed: Sequence[str], default: str = "", hint: str = "") -> "TouchRows":
         """Returns the rows with every kind filled in.
 
         Args:
             allowed: The kinds that make sense here.
-            default: What a row without a kind is.
+            default: What a row without a kind is; empty where it has to say.
+            hint: What to do where a row is of another kind that resembles none of these.
 
         Raises:
             DataError: A row is of another kind.
@@ -56,11 +62,14 @@ class TouchRows:
         kinds = tuple(it.strip().lower() or default for it in self.kinds)
         wrong = [at for at, it in enumerate(kinds) if it not in allowed]
         if wrong:
+            seen = kinds[wrong[0]]
+            needed = f"{some_of(allowed)} or nothing, for {default}," if default else "one of "
+            needed += "" if default else some_of(allowed)
             raise DataError(
-                f"{self.places[wrong[0]]}: kind is {self.kinds[wrong[0]]!r}; "
-                f"{some_of(allowed)} or nothing, for {default}, is needed.",
+                f"{self.places[wrong[0]]}: "
+                f"{f'kind is {seen!r}' if seen else 'there is no kind'}; {needed} is needed.",
                 culprits=[self.places[at] for at in wrong],
-                next_step=did_you_mean(kinds[wrong[0]], allowed),
+                next_step=did_you_mean(seen, allowed) or hint,
             )
         return replace(self, kinds=kinds)
 
@@ -115,7 +124,7 @@ def flange_poses(rows: TouchRows, robot: Robot | None, *, calibrated: bool = Fal
         DataError: A row has no pose, joints do not fit the model, or the numbers are in other units
             than metres and radians.
     """
-    _check_lengths(rows)
+    check_lengths(rows)
     reported = np.isfinite(rows.base_from_flange).all(axis=(1, 2))
     modelled, poses = _modelled(rows, robot, needed=not reported.all())
     without = np.flatnonzero(~reported & ~modelled)
@@ -130,16 +139,57 @@ def flange_poses(rows: TouchRows, robot: Robot | None, *, calibrated: bool = Fal
     return np.where(first[:, None, None], poses, rows.base_from_flange)
 
 
-def _check_lengths(rows: TouchRows) -> None:
+def check_lengths(rows: TouchRows) -> None:
+    """Refuses positions that no arm reaches: millimetres read as metres, or the other way round.
+
+    Raises:
+        DataError: Naming the farthest row.
+    """
     away = np.linalg.norm(rows.base_from_flange[:, :3, 3], axis=1)
     far = np.flatnonzero(away > _FAR_M)
     if len(far):
         raise DataError(
-            f"{rows.places[far[0]]}: the flange is {away[far[0]]:.4g} m from the base, and no arm "
-            f"reaches {_FAR_M:g} m: these look like millimetres.",
+            f"{rows.places[far[0]]}: its position is {away[far[0]]:.4g} m from the base, and no "
+            f"arm reaches {_FAR_M:g} m: these look like millimetres.",
             culprits=[rows.places[it] for it in far],
             next_step="Say --robot-unit mm, or write metres.",
         )
+    farthest = float(np.max(away, initial=0.0, where=np.isfinite(away)))
+    if 0.0 < farthest < _NEAR_M:
+        raise DataError(
+            f"{rows.source}: all positions are within {1e3 * farthest:.2g} mm of the base's "
+            "origin, where no arm works: these look like metres read as millimetres.",
+            culprits=[rows.source],
+            next_step="Say --robot-unit m, or write millimetres.",
+        )
+
+
+def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
+    """Refuses a pose (n, 4, 4) that is there twice: a copy of a row says nothing new.
+
+    Raises:
+        DataError: Naming both rows.
+    """
+    numbers = np.nan_to_num(poses.reshape(len(poses), -1))
+    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
+    first, second = np.nonzero(np.triu(apart < _COPIED, 1))
+    if len(first):
+        names = [places[first[0]], places[second[0]]]
+        raise DataError(
+            f"{names[0]} and {names[1]} have the very same pose: one is a copy, and would count as "
+            "a touch of its own.",
+            culprits=names,
+            next_step="Leave one of them out, or touch again and write down where the robot is.",
+        )
+
+
+def robot_noise(calibration: Calibration | None) -> Noise:
+    """Errors of the flange from stop to stop, as calibrated; zero where nothing is known."""
+    found = {} if calibration is None else calibration.noise
+    return Noise(
+        float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
+        1e-3 * found.get("robot_translation_mm", 0.0),
+    )
 
 
 def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Mask, FloatArray]:

@@ -1,9 +1,15 @@
 """Whether a tool's or a fixture's frame can be trusted, in plain sentences."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from visioncal.calibration import Verdict, VerdictStatus
+from visioncal.estimator.observability import Direction
+from visioncal.figures import figure
+from visioncal.files import some_of
+from visioncal.types import Mask
 
 
 @dataclass(frozen=True)
@@ -21,3 +27,93 @@ def verdict_of(doubts: Sequence[Doubt], praise: str) -> Verdict:
     status: VerdictStatus = "bad" if any(it.is_fatal for it in doubts) else "check"
     ordered = sorted(doubts, key=lambda it: not it.is_fatal)
     return Verdict(status, tuple(it.sentence for it in ordered))
+
+
+def weak_directions(
+    worst: Sequence[Direction],
+    sigma_mm: tuple[float, float],
+    sigma_deg: tuple[float, float],
+    advice: str,
+) -> Iterator[Doubt]:
+    """Doubts the directions that are known worst.
+
+    Args:
+        worst: These directions.
+        sigma_mm: (check, bad) limits of an offset's sigma [mm].
+        sigma_deg: The same of a rotation's [deg].
+        advice: What to do about it, as a sentence.
+    """
+    for it in worst:
+        scale, unit = (np.rad2deg(1.0), "deg") if it.is_rotation else (1e3, "mm")
+        check, bad = sigma_deg if it.is_rotation else sigma_mm
+        if it.sigma * scale > check:
+            yield Doubt(
+                f"{it.words[0].upper()}{it.words[1:]} is known to {figure(it.sigma * scale)} "
+                f"{unit} only (doubt begins at {check:g}). {advice}",
+                it.sigma * scale > bad,
+            )
+
+
+def disputed(
+    names: Sequence[str], reasons: Sequence[str], agrees: Mask, doubtful: Mask, again: str
+) -> Iterator[Doubt]:
+    """Doubts for what was left out, and for what stayed although it contradicts.
+
+    Args:
+        names: (n,) what messages call the touches, points or images.
+        reasons: (n,) what is wrong with each.
+        agrees: (n,) mask of those that were used.
+        doubtful: (n,) mask of those of which some are wrong, while nothing tells which.
+        again: What to do about the latter, as a sentence.
+    """
+    for at in np.flatnonzero(~agrees).tolist():
+        end = "" if reasons[at].endswith("?") else "."
+        yield Doubt(f"{names[at]} was left out: {reasons[at]}{end}")
+    if doubtful.any():
+        some = some_of([names[at] for at in np.flatnonzero(doubtful).tolist()])
+        yield Doubt(
+            f"{some} contradict each other, and nothing tells which is wrong: all are used. {again}"
+        )
+
+
+def noisy(
+    noise_mm: float,
+    limits_mm: tuple[float, float],
+    cause: str,
+    *,
+    explained: bool,
+    things: str = "touches",
+) -> Iterator[Doubt]:
+    """Doubts for touches that agree badly, or worse than they are stated to.
+
+    Args:
+        noise_mm: Noise of a touch per axis [mm].
+        limits_mm: (check, bad) limits of it [mm].
+        cause: What may have caused it or what to do, as a sentence.
+        explained: Whether what is stated of a touch explains it.
+        things: What agrees or does not, in words.
+    """
+    check, bad = limits_mm
+    if noise_mm > check:
+        yield Doubt(
+            f"The {things} agree to {figure(noise_mm)} mm only (per axis; doubt begins at "
+            f"{check:g}). {cause}",
+            noise_mm > bad,
+        )
+    elif not explained:
+        yield Doubt(
+            f"The {things} scatter by more than they are stated to, without one that stands out: "
+            f"{figure(noise_mm)} mm per axis. Repeat them, or state the noise as it is."
+        )
+
+
+def off_words(residual_m: float, surprise: float, limit: float) -> str:
+    """Says how far off something is that does not agree: `2.1 mm off, 5 times what ... allow`."""
+    off = f"{figure(1e3 * residual_m)} mm off"
+    over = float(np.sqrt(surprise / limit))
+    return f"{off}, {figure(over)} times what the others allow" if over > 1.0 else off
+
+
+def placed_name(name: str, place: str) -> str:
+    """Names a row so that it is found: `Touch 3 (touches.csv, line 5)`."""
+    return f"{name} ({place})" if place else name

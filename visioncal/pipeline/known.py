@@ -10,6 +10,7 @@ import numpy as np
 from visioncal.calibration import CameraResult, Rms, Verdict
 from visioncal.estimator.appearance import Free
 from visioncal.estimator.arm import ArmErrors, link_basis, pose_basis
+from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
 from visioncal.robot import Robot
@@ -18,6 +19,7 @@ from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.judge import Findings
+from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.validate import HeldOut
@@ -47,7 +49,10 @@ class Known:
         candidates: The views that could be in the fit, if they agree.
         agreed: Which of them do.
         free: Lens and board as all views see them together; None without corners.
-        arm: Errors that follow the arm's posture, where they are significant.
+        level: How far to go: `auto`, `hand-eye`, `offsets` or `kinematics`.
+        arm: Errors that follow the arm's posture, where they are likely.
+        kinematics: Which of them the views tell; None where that was not asked or cannot be.
+        arm_model: The arm with these errors; None where it stays nominal.
         hand_eye: Both unknown edges.
         diagnosis: What the residuals show beyond noise.
         held_out: Residuals of used views, left out of the fit.
@@ -73,7 +78,10 @@ class Known:
     candidates: tuple[int, ...] = ()
     agreed: Agreed | None = None
     free: Free | None = None
+    level: str = "auto"
     arm: ArmErrors | None = None
+    kinematics: Kinematics | None = None
+    arm_model: ArmModel | None = None
     hand_eye: HandEyeResult | None = None
     diagnosis: Diagnosis | None = None
     held_out: HeldOut | None = None
@@ -136,16 +144,8 @@ class Known:
     @property
     def lost_views(self) -> tuple[str, ...]:
         """The rejected views and those held back, grouped by their reason, in words."""
-        views = defaultdict(list)
-        for view, reason in self.reasons.items():
-            views[reason].append(view)
-        for view in self.held_back - self.reasons.keys():
-            views[HELD_BACK].append(view)
-        grouped = sorted(views.items(), key=lambda item: -len(item[1]))
-        return tuple(
-            f"view{'s' if len(it) > 1 else ''} {', '.join(map(str, it))}: {reason}"
-            for reason, it in grouped
-        )
+        held = dict.fromkeys(sorted(self.held_back - self.reasons.keys()), HELD_BACK)
+        return by_reason({**self.reasons, **held})
 
     @property
     def held_back(self) -> frozenset[int]:
@@ -155,7 +155,7 @@ class Known:
     def closure(self, views: Sequence[int]) -> Closure:
         """The chain's known parts for some views, each with its first or chosen pose."""
         mount, poses = self.session.mount, [self.poses[view] for view in views]
-        robot = np.array([self.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
+        robot = self.flange_poses(views)
         data = Closure(
             mount,
             robot_part(robot, mount),
@@ -169,8 +169,35 @@ class Known:
                 shared=None if self.free is None else self.free.shared(np.array(shift)),
             )
         if self.arm is not None and self.arm.is_estimated and poses:
-            data = data.with_more(replace(self.arm, basis=self.arm_basis(views)).shared())
+            errors = replace(self.arm, basis=self.arm_basis(views))
+            data = data.with_more(errors.shared(self.arm_values))
         return data
+
+    def flange_poses(self, views: Sequence[int]) -> FloatArray:
+        """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""
+        if self.arm_model is None or self.joints_rad is None:
+            return np.array([self.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
+        return self.arm_model.robot.base_from_flange(self.joints(views))
+
+    def joints(self, views: Sequence[int]) -> FloatArray:
+        """(m, n) joint angles of some views, where all have them [rad]."""
+        joints = {} if self.joints_rad is None else self.joints_rad
+        count = 0 if self.robot is None else self.robot.joint_count
+        return np.array([joints[view] for view in views]).reshape(len(views), count)
+
+    def with_arm_errors(self) -> Self:
+        """Takes the errors of the arm's model for those that are estimated."""
+        if self.arm_model is None or self.kinematics is None:
+            return self
+        first = next(iter(self.kinematics.errors.values()))
+        gain = sum(it.gain for it in self.kinematics.errors.values())
+        errors = ArmErrors(self.arm_basis(self.used), first.sigma, gain, of_links=True)
+        return replace(self, arm=errors)
+
+    @property
+    def arm_values(self) -> FloatArray | None:
+        """(p,) present values of the arm's errors; None for the nominal arm's."""
+        return None if self.arm_model is None else self.arm_model.values
 
     @property
     def estimated_looks(self) -> int:
@@ -183,6 +210,8 @@ class Known:
 
     def arm_basis(self, views: Sequence[int]) -> FloatArray:
         """How errors of the arm move each view's flange: of its links where these are known."""
+        if self.arm_model is not None:
+            return self.arm_model.basis(self.joints(views))
         if self.joints_rad is not None and self.robot is not None:
             return link_basis(self.robot, np.array([self.joints_rad[view] for view in views]))
         return pose_basis(np.array([self.base_from_flange[view] for view in views]))
@@ -233,6 +262,18 @@ class Known:
         if self.hand_eye is None:
             raise RuntimeError("a stage that needs the hand-eye result comes before it")
         return self.hand_eye
+
+
+def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
+    """Groups views by why they cannot be used, in words: the commonest reason first."""
+    views = defaultdict(list)
+    for view, reason in reasons.items():
+        views[reason].append(view)
+    grouped = sorted(views.items(), key=lambda item: -len(item[1]))
+    return tuple(
+        f"view{'s' if len(it) > 1 else ''} {', '.join(map(str, it))}: {reason}"
+        for reason, it in grouped
+    )
 
 
 def rms_of(away_m: FloatArray, away_rad: FloatArray, rms_px: FloatArray) -> Rms:

@@ -13,6 +13,7 @@ from visioncal.estimator.appearance import BOARD_NAMES, Free
 from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
+from visioncal.pipeline.arm import kinematics_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -20,9 +21,10 @@ from visioncal.pipeline.views import view_evidence
 from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES
+from visioncal.stages.kinematics import ASKED
 from visioncal.types import Progress, SolverName
 
-_LEVELS = ("auto", "hand-eye")
+_LEVELS = (*ASKED, "hand-eye")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,8 @@ def calibrate(
     Args:
         session: A session, or the path of its folder or recording.
         solver: `joint` for the fit of both edges, or the name of a closed form.
-        level: How far to go: `auto` for all that the data allows, or `hand-eye`.
+        level: How far to go: `auto` for all that the data allows, `hand-eye` with the nominal arm,
+            `offsets` of its joints, or its `kinematics`.
         progress: Told of long work.
 
     Returns:
@@ -77,7 +80,7 @@ def run(
     if level not in _LEVELS:
         raise DataError(f"level {level!r} is not one of {', '.join(_LEVELS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    known = Known(loaded, solver, progress)
+    known = Known(loaded, solver, progress, level=level)
     seen: Known | None = None
     for at, stage in enumerate(STAGES):
         if progress is not None:
@@ -90,7 +93,7 @@ def run(
             raise _with_hint(error.with_culprits(more), seen) from error
         if stage.name == "pnp":
             seen = known
-    return Run(_calibration(_with_reading(known, seen)), view_evidence(known))
+    return Run(result_of(_with_reading(known, seen)), view_evidence(known))
 
 
 def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
@@ -113,7 +116,12 @@ def _with_reading(known: Known, seen: Known | None) -> Known:
     return replace(known, verdict=replace(known.verdict, reasons=(hint, *known.verdict.reasons)))
 
 
-def _calibration(known: Known) -> Calibration:
+def result_of(known: Known) -> Calibration:
+    """Puts together what is known when all stages have run.
+
+    Raises:
+        RuntimeError: One has not.
+    """
     held, findings, verdict = known.held_out, known.findings, known.verdict
     if held is None or findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
@@ -161,6 +169,9 @@ def _further(known: Known) -> dict[str, dict[str, Any]]:
             "likelihood_ratio": known.arm.gain,
             "estimated": known.arm.is_estimated,
         }
+    kinematics = kinematics_document(known)
+    if kinematics is not None:
+        documents["kinematics"] = kinematics
     if known.diagnosis is not None:
         documents["uncertainty"] = _uncertainty(known, known.diagnosis)
     return documents

@@ -12,8 +12,10 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimator.arm import ArmErrors
+from visioncal.estimator.armmodel import BLOCKS, ArmModel
 from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
+from visioncal.pipeline.arm import workspace_mm
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
@@ -25,6 +27,7 @@ from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
+from visioncal.stages.kinematics import check_asked, choose_level, findings
 from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses, usable_joints
@@ -32,8 +35,10 @@ from visioncal.stages.validate import validate
 from visioncal.targets import corner_positions
 from visioncal.types import Rejection
 
-# Views move in and out of the fit at most so often; they settle after one or two.
+# Views move in and out of the fit at most so often; they settle after one or two, as does the
+# linearisation of the arm's errors, to a step far below any arm's repeatability.
 _ROUNDS = 4
+_ARM_AT_REST_RAD = 1e-7
 
 
 @dataclass(frozen=True)
@@ -206,10 +211,41 @@ def _arm(known: Known) -> Arm:
     )
 
 
+def _kinematics(known: Known) -> Known:
+    """Chooses which errors of the arm are told, and takes them up as unknowns."""
+    robot, agreed = known.robot, known.agreed
+    can = robot is not None and known.joints_rad is not None and known.solver == "joint"
+    check_asked(known.level, can=can)
+    if not can or known.level == "hand-eye" or robot is None or agreed is None:
+        return known
+    stated = replace(known, arm=None)
+    first = np.unique(known.stops, return_index=True)[1]
+    q = known.joints(known.used)
+    model = ArmModel.of(robot, q, stated.flange_poses(known.used))
+    bases = {name: model.columns(name, q[first]) for name in BLOCKS}
+    data = stated.closure(known.used).merged(known.stops)
+    found = choose_level(data, agreed.edges, bases, known.level)
+    known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
+    if not found.errors:
+        return known
+    return replace(known, arm_model=model.erring(found.errors))
+
+
 def _hand_eye(known: Known) -> Known:
-    data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
-    result = solve_hand_eye(data, known.solver, arm, known.estimated_looks)
-    return replace(known, hand_eye=result)
+    """Solves for both edges, with the arm's errors linearised anew until they stay."""
+    for _ in range(_ROUNDS):
+        known = known.with_arm_errors()
+        data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
+        result = solve_hand_eye(data, known.solver, arm, known.estimated_looks)
+        known = replace(known, hand_eye=result)
+        model = known.arm_model
+        if model is None:
+            break
+        step = result.edges.shared[len(result.edges.shared) - len(model.values) :]
+        if np.abs(step).max() < _ARM_AT_REST_RAD:
+            break
+        known = replace(known, arm_model=model.moved(step))
+    return known
 
 
 def _arm_by_stop(known: Known) -> ArmErrors | None:
@@ -223,7 +259,14 @@ def _diagnose(known: Known) -> Known:
     data, result = known.closure(known.used).merged(known.stops), known.solved
     target = known.session.target
     middle = np.zeros(3) if target is None else corner_positions(target).mean(axis=0)
-    diagnosis = diagnose(data, result, known.free, _arm_by_stop(known), middle)
+    diagnosis = diagnose(
+        data,
+        result,
+        known.free,
+        _arm_by_stop(known),
+        middle,
+        calibrated=known.arm_model is not None,
+    )
     spread = diagnosis.inflation * result.covariance
     worst = directions(spread, result.edges, data.mount)
     wider = replace(result, covariance=spread, worst=worst)
@@ -236,6 +279,11 @@ def _validate(known: Known) -> Known:
     seen = known.seen(known.used)
     held_out = validate(data, known.stops, result, known.solver, seen, known.free)
     return replace(known, held_out=held_out)
+
+
+def _workspace_mm(known: Known) -> float | None:
+    model = known.arm_model
+    return None if model is None else float(np.median(workspace_mm(known, model)))
 
 
 def _judge(known: Known) -> Known:
@@ -260,6 +308,7 @@ def _judge(known: Known) -> Known:
         diagnosis=diagnosis,
         warnings=known.warnings,
         notes=known.notes,
+        workspace_mm=_workspace_mm(known),
     )
     return replace(known, findings=findings, verdict=judge(findings))
 
@@ -273,6 +322,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("look", _look),
     Stage("agree", _agree),
     Stage("refine", _refine),
+    Stage("kinematics", _kinematics),
     Stage("hand-eye", _hand_eye),
     Stage("diagnose", _diagnose),
     Stage("validate", _validate),

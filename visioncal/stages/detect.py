@@ -14,7 +14,7 @@ from visioncal.finders import NotFound, find_target, fitting_layouts
 from visioncal.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions
-from visioncal.types import Corners, IntArray, Progress, Rejection, Target
+from visioncal.types import Corners, Image, IntArray, Progress, Rejection, Target
 
 # Images looked at to tell which layout was printed.
 _LAYOUT_SAMPLE = 3
@@ -55,7 +55,11 @@ class _Look:
 
 
 def detect(
-    session: Session, options: DetectOptions | None = None, progress: Progress | None = None
+    session: Session,
+    options: DetectOptions | None = None,
+    progress: Progress | None = None,
+    *,
+    among: Sequence[View] | None = None,
 ) -> Detections:
     """Finds the session's target in all its images.
 
@@ -63,6 +67,7 @@ def detect(
         session: A session with a target; its views without images are passed over.
         options: What a view needs.
         progress: Told after each image.
+        among: Those of its views to look at; all where None.
 
     Returns:
         The corners and the rejected views.
@@ -75,7 +80,7 @@ def detect(
     target = session.target
     if target is None:
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
-    views = [view for view in session.views if view.image]
+    views = [view for view in (session.views if among is None else among) if view.image]
     looks: list[_Look] = []
     with (
         _single_threaded_opencv(),
@@ -106,12 +111,18 @@ def _single_threaded_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _look(session: Session, view: View, target: Target, options: DetectOptions) -> _Look:
+def image_of(session: Session, view: View) -> Image | Rejection:
+    """Reads a view's (h, w) grey image; or says why there is none."""
     if not session.images.exists(view.image):
-        return _Look(Rejection(view.number, f"{view.image} is missing"), None)
+        return Rejection(view.number, f"{view.image} is missing")
     image = decode_image(session.images.read(view.image))
-    if isinstance(image, str):
-        return _Look(Rejection(view.number, f"{view.image} is {image}"), None)
+    return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
+
+
+def _look(session: Session, view: View, target: Target, options: DetectOptions) -> _Look:
+    image = image_of(session, view)
+    if isinstance(image, Rejection):
+        return _Look(image, None)
     resolution = (image.shape[1], image.shape[0])
     seen = find_target(image, target)
     if isinstance(seen, NotFound):

@@ -54,6 +54,8 @@ def diagnose(
     free: Free | None,
     arm: ArmErrors | None,
     middle: FloatArray,
+    *,
+    calibrated: bool = False,
 ) -> Diagnosis:
     """Looks for what noise does not explain, and splits the uncertainty by its sources.
 
@@ -63,6 +65,7 @@ def diagnose(
         free: Lens and board, where there are corners.
         arm: Errors that follow the arm's posture, at the same views.
         middle: (3,) of the target, in its frame [m].
+        calibrated: Whether the arm's errors are part of the answer, and no reason for doubt.
     """
     edges, noise = result.edges, result.noise
     with one_blas_thread():
@@ -93,7 +96,7 @@ def diagnose(
         _spectrum(inflation * result.covariance[:12, :12]),
         inflation,
         arm,
-        tuple(_warnings(alike, moved, arm)),
+        tuple(_warnings(alike, moved, arm, calibrated=calibrated)),
     )
 
 
@@ -134,8 +137,10 @@ def _spectrum(spread: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(values, 0.0)))
 
 
-def _warnings(alike: Neighbours, moved: Drift | None, arm: ArmErrors | None) -> Iterator[str]:
-    if arm is not None and arm.is_significant:
+def _warnings(
+    alike: Neighbours, moved: Drift | None, arm: ArmErrors | None, *, calibrated: bool
+) -> Iterator[str]:
+    if arm is not None and arm.is_significant and not calibrated:
         size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
         told = (
             "they were estimated along"

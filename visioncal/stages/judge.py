@@ -71,6 +71,8 @@ class Findings:
         diagnosis: What the residuals show beyond noise, and where the uncertainty comes from.
         warnings: What earlier stages had to say.
         notes: What of it is no reason for doubt.
+        workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
+            the median; None for a nominal arm [mm].
     """
 
     views: Sequence[ViewResult]
@@ -86,6 +88,7 @@ class Findings:
     diagnosis: Diagnosis
     warnings: Sequence[str]
     notes: Sequence[str] = ()
+    workspace_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,7 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
         *_outlier_doubts(findings, options),
         *_holdout_doubts(findings, options),
         # Views that disagree wildly have no sigma worth a word about the motion.
-        *([] if any(it.is_fatal for it in scatter) else _sigma_doubts(findings, options)),
-        *_budget_doubts(findings, options),
+        *([] if any(it.is_fatal for it in scatter) else _worth_doubts(findings, options)),
         *_view_doubts(findings, options),
         *_pixel_doubts(findings, options),
         *([] if scatter else _robot_doubts(findings, options)),
@@ -247,6 +249,26 @@ def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
             f"The views that the session holds back are missed by {figure(holdout.mm)} mm and "
             f"{figure(holdout.deg)} deg, {ratio:.0f} times worse than views left out in turn. They "
             "lie where the result does not hold, or their poses or images are wrong."
+        )
+
+
+def _worth_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+    """Judges the answer where it counts.
+
+    Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
+    the first and the last link, which its poses make up for.
+    """
+    if findings.workspace_mm is None:
+        yield from _sigma_doubts(findings, options)
+        yield from _budget_doubts(findings, options)
+    elif findings.workspace_mm > options.sigma_mm[0]:
+        yield _Doubt(
+            "All over the workspace the calibrated arm places its tool to "
+            f"{figure(findings.workspace_mm)} mm (sigma, in the median; doubt begins at "
+            f"{options.sigma_mm[0]:g}). The board's size counts most, as no view of it can tell an "
+            "arm and a board that are both too large: measure its squares, and state "
+            "square_sigma_m; then add views all over the workspace.",
+            findings.workspace_mm > options.sigma_mm[1],
         )
 
 

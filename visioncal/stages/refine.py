@@ -189,7 +189,8 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
     """Sets the board's scale free where the robot measures another than is stated."""
     problem, state = answer.problem, answer.state
     measured = measured_scale(problem, arm, state)
-    if not measured.is_another:
+    # An arm whose links may all be too long is hard to tell from a board that is too large.
+    if not (measured.is_another if arm.errors is None else measured.contradicts):
         return answer
     if measured.contradicts:
         problem = problem.without_prior(problem.scale)

@@ -1,0 +1,85 @@
+"""Runs a command inside the tests' own process, and writes the tables that it reads."""
+
+import csv
+import io
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.cli.app import main
+from visioncal.types import FloatArray
+
+QUATERNIONS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a command ended, and what it said."""
+
+    status: int
+    out: str
+    err: str
+
+
+def visioncal(*arguments: object) -> Done:
+    out, err, status = io.StringIO(), io.StringIO(), 0
+    words = ["visioncal", *map(str, arguments)]
+    with patch.object(sys, "argv", words), redirect_stdout(out), redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+    return Done(status, out.getvalue(), err.getvalue())
+
+
+def write_poses(
+    path: Path,
+    poses: FloatArray,
+    columns: dict[str, Sequence[object]] | None = None,
+    names: Sequence[str] = QUATERNIONS,
+) -> Path:
+    """Writes (n, 4, 4) poses as a table of touches, with other columns before them.
+
+    Digits are those of a controller's: 0.1 um, and 1e-9 of a quaternion.
+    """
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    rows = [
+        [*(f"{it:.7f}" for it in pose[:3, 3]), *(f"{it:.9f}" for it in turn)]
+        for pose, turn in zip(poses, turns, strict=True)
+    ]
+    return write_table(path, names, rows, columns)
+
+
+def write_table(
+    path: Path,
+    names: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    columns: dict[str, Sequence[object]] | None = None,
+) -> Path:
+    more = columns or {}
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*more, *names])
+        for at, row in enumerate(rows):
+            writer.writerow([*(it[at] for it in more.values()), *row])
+    return path
+
+
+def turned_poses(
+    rng: np.random.Generator, tips: FloatArray, tip: FloatArray, above: FloatArray
+) -> FloatArray:
+    """Flange poses (n, 4, 4) that hold a tool's tip (3,) at (n, 3) points, tilted each its way.
+
+    The flanges are above, by the z axis of a (3, 3) rotation, and point down.
+    """
+    lean = Rotation.from_rotvec(0.3 * rng.normal(size=(len(tips), 3)))
+    turns = Rotation.from_matrix(above) * lean * Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    poses = np.tile(np.eye(4), (len(tips), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns.as_matrix(), tips - turns.apply(tip)
+    return poses

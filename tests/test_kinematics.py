@@ -1,0 +1,160 @@
+"""The arm's own errors: which of them are told, and what the calibrated arm is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cells import calibrated, known_of
+
+import visioncal
+from visioncal.errors import DataError
+from visioncal.estimator.workspace import observability, pose_slopes, postures, workspace_sigmas
+from visioncal.pipeline.result import result_of
+from visioncal.simulation import CellOptions, fine_camera, forward, simulate
+from visioncal.transforms import exp, invert, log
+
+GOOD = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=30)
+WRONG_LINKS = replace(GOOD, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def target_in_camera(mount, x, z, flange):
+    """(m, 4, 4) where the camera has the target."""
+    return invert(flange @ x) @ z if mount == "eye-in-hand" else invert(x) @ flange @ z
+
+
+def error_m(cell, known, robot):
+    """Root mean square error of the target's place in the camera, all over the workspace [m]."""
+    q = postures(robot)
+    mount, edges = cell.options.mount, known.solved.edges
+    true = target_in_camera(mount, *cell.transforms.values(), forward(cell.true_arm, q))
+    ours = target_in_camera(mount, edges.x, edges.z, robot.base_from_flange(q))
+    # What counts is where a tool ends up, seen from the target.
+    away = (invert(true) - invert(ours))[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_an_arm_off_by_a_millimetre_is_calibrated_all_over_its_workspace(mount):
+    shares = []
+    for seed in range(4):
+        cell = simulate(replace(WRONG_LINKS, mount=mount, seed=seed))
+        known, nominal = calibrated(cell), calibrated(cell, joints=False)
+        assert known.kinematics.level == "geometry"
+        assert nominal.arm_model is None
+        assert known.verdict.status in ("good", "check")
+        after = error_m(cell, known, known.arm_model.robot)
+        shares.append(after / error_m(cell, nominal, known.robot))
+    # Thirty views leave 5 % of what a fit of the edges alone leaves; four worlds scatter by half.
+    assert np.median(shares) < 0.08
+
+
+def test_offsets_alone_are_told_from_wrong_links():
+    cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
+    known = calibrated(cell)
+    assert known.kinematics.level == "offsets"
+    by_name = {it.name: it for it in known.kinematics.levels}
+    assert by_name["offsets"].left_out.mm < 0.3 * by_name["nominal"].left_out.mm
+    assert by_name["offsets"].left_out.mm < 1.05 * by_name["geometry"].left_out.mm
+    # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
+    found = known.arm_model.robot.chain.functions[1:5, 0]
+    true = (cell.true_arm.offset - cell.arm.offset)[1:5]
+    assert found == pytest.approx(true, abs=3e-4)
+
+
+def test_an_eccentric_gear_is_told():
+    cell = simulate(replace(WRONG_LINKS, seed=2, views=40))
+    # The encoders of joints 2 and 3 tell what their axes do but for a wave of 1 mrad.
+    reported = cell.joints.copy()
+    reported[:, 1:3] -= 1e-3 * np.sin(cell.joints[:, 1:3])
+    robot = known_of(cell).robot
+    wavy = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
+    known = calibrated(wavy)
+    assert known.kinematics.level == "eccentricity"
+    # Told to a few tenths of a milliradian beside errors of all links.
+    assert known.arm_model.robot.chain.functions[1:3, 2] == pytest.approx(1e-3, abs=5e-4)
+
+
+def test_a_right_arm_stays_nominal():
+    known = calibrated(simulate(replace(GOOD, seed=3)))
+    assert known.kinematics.level == "nominal"
+    assert known.arm_model is None
+    assert [it.name for it in known.kinematics.levels] == ["nominal"]
+
+
+def test_without_joints_no_level_can_be_asked_for():
+    cell = simulate(replace(WRONG_LINKS, views=12))
+    assert calibrated(cell, joints=False).kinematics is None
+    with pytest.raises(DataError, match="needs the joint angles of every view"):
+        calibrated(cell, joints=False, level="kinematics")
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_predictions_move_as_their_derivatives_say(mount):
+    known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
+    model, edges, q = known.arm_model, known.solved.edges, known.joints(known.used)[:3]
+    size, step = 12 + len(model.values), 1e-6
+    middle = target_in_camera(mount, edges.x, edges.z, model.robot.base_from_flange(q))
+    slopes = pose_slopes(model, edges, mount, q)
+    for at in range(size):
+        change = np.zeros(size)
+        change[at] = step
+        ends = [
+            log(
+                invert(middle)
+                @ target_in_camera(
+                    mount,
+                    edges.x @ exp(it[:6]),
+                    edges.z @ exp(it[6:12]),
+                    model.moved(it[12:]).robot.base_from_flange(q),
+                )
+            )
+            for it in (change, -change)
+        ]
+        # Steps are composed with values of some mrad, whose product is left out.
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slopes[:, :, at], abs=5e-3)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_thirty_values_of_a_six_axis_arm_are_told_by_one_board(mount):
+    """Everett and Hsu (1988): 4 a revolute joint and 6 for the frames: 24 + 6."""
+    known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=5)))
+    model, edges = known.arm_model, known.solved.edges
+    units = np.concatenate([np.full(12, 1e-3), np.full(len(model.values), 1e-3)])
+    seen = observability(model, edges, mount, known.joints(known.used), units)
+    assert (seen.columns, seen.rank, seen.told) == (48, 30, 30)
+    assert 1.0 < seen.condition < 1e4
+
+
+def test_the_workspace_sigma_holds_the_error():
+    """The board is exact here and counts as known to 0.1 %: the error stays well inside."""
+    cell = simulate(replace(WRONG_LINKS, seed=6))
+    known = calibrated(cell)
+    model, size = known.arm_model, len(known.arm_model.values)
+    rows = np.concatenate([np.arange(12), np.arange(-size, 0)])
+    spread = known.solved.covariance[np.ix_(rows, rows)]
+    edges = known.solved.edges
+    sigmas = workspace_sigmas(model, edges, "eye-in-hand", spread, np.zeros(3))
+    assert error_m(cell, known, model.robot) < 2.0 * float(np.sqrt(np.mean(sigmas**2)))
+
+
+def test_the_result_holds_the_calibrated_arm(tmp_path):
+    cell = simulate(replace(WRONG_LINKS, seed=7))
+    known = calibrated(cell)
+    file = tmp_path / "calibration.json"
+    result_of(known).save(file)
+    result = visioncal.Calibration.load(file)
+    found = result.stages["kinematics"]
+    q = postures(known.robot)[:5]
+    calibrated_poses = known.arm_model.robot.base_from_flange(q)
+    # RigidTransform makes rotations orthonormal anew, to the last digits.
+    assert result.base_from_flange(q).as_matrix() == pytest.approx(calibrated_poses, abs=1e-14)
+    assert found["level"] == "geometry"
+    assert found["levels"][0]["level"] == "nominal"
+    changes = {(it["joint"], it["name"]): it["change"] for it in found["parameters"]}
+    # A UR's second and third axes are parallel, and so get Hayati's beta.
+    assert ("shoulder_lift_joint", "beta_rad") in changes
+    assert 1e-5 < max(map(abs, changes.values())) < 0.02
+    assert found["observability"]["identifiable"] == 30
+    # The nominal model stays what it was.
+    assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))

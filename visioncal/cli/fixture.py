@@ -1,0 +1,157 @@
+"""`visioncal fixture`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from visioncal.calibration import Calibration
+from visioncal.cli.convert_options import (
+    JointColumns,
+    JointUnit,
+    RobotColumns,
+    RobotForm,
+    RobotInverse,
+    RobotModel,
+    RobotUnit,
+)
+from visioncal.cli.framing import (
+    CalibrationOption,
+    ForceOption,
+    JsonOption,
+    NameOption,
+    OutOption,
+    Place,
+    TouchNoise,
+    metres,
+    named_robot,
+    tell,
+    touch_wishes,
+)
+from visioncal.cli.seeing import (
+    PointOption,
+    frame_by_images,
+    image_session,
+    refuse_given,
+    touch_options,
+)
+from visioncal.errors import DataError
+from visioncal.formats.touches import read_nominal, read_touches
+from visioncal.frames.fixture import touched_fixture
+from visioncal.frames.measured import NO_TOOL, Tool
+from visioncal.frames.naming import transform_name
+from visioncal.stored import load_placed
+
+
+def fixture_command(
+    touches: Annotated[
+        Path,
+        typer.Argument(
+            help="A table with a row a touch: the columns of views.csv, and kind (origin, x or xy) "
+            "or, with --cad, point. Or a session whose images show a target on the fixture."
+        ),
+    ],
+    calibration: CalibrationOption = None,
+    out: OutOption = None,
+    name: NameOption = None,
+    cad: Annotated[
+        Path | None,
+        typer.Option(
+            "--cad", help="A table of the drawing: point, x_mm, y_mm, z_mm (or x_m ...), sigma_mm."
+        ),
+    ] = None,
+    cad_unit: Annotated[
+        str | None, typer.Option("--cad-unit", help="What x, y, z in it are in: mm, m, inch.")
+    ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            "--tool",
+            help="What touched: a tool of the calibration, a file of frames (frames.json, or "
+            "frames.json:gripper), or none, where the poses are of the tip itself.",
+        ),
+    ] = None,
+    point: PointOption = None,
+    touch_noise: TouchNoise = None,
+    robot_columns: RobotColumns = None,
+    robot_form: RobotForm = None,
+    robot_unit: RobotUnit = None,
+    robot_inverse: RobotInverse = None,
+    joint_columns: JointColumns = None,
+    joint_unit: JointUnit = "rad",
+    robot_model: RobotModel = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Find a fixture in the base, from touches of its features or of a drawing's points.
+
+    A touch of kind origin is at the fixture's origin; of kind x, on its positive x axis; of kind
+    xy, in its xy plane on the side of positive y: one of each at least. With --cad, three points or
+    more that the drawing has, by their names. In images a target on the fixture gives its frame, or
+    with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
+    the reason given.
+    """
+    place = Place.of(transform_name("fixture", name), calibration, out, force=force)
+    drawing = None if cad is None else read_nominal(cad, cad_unit)
+    for_touches = touch_options(
+        robot_columns,
+        robot_form,
+        robot_unit,
+        robot_inverse,
+        joint_columns,
+        robot_model,
+        touch_noise,
+    )
+    session = image_session(touches, {"--tool": tool, **for_touches})
+    if session is not None:
+        frame = frame_by_images(session, place, "fixture", point, drawing, quiet=as_json)
+        tell(place, frame, place.keep(frame), as_json=as_json)
+        return
+    refuse_given({"--point-mm": point}, "touches say where the fixture's origin is")
+    touched_with = _tool(tool, place.calibration)
+    wishes = touch_wishes(
+        robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
+    )
+    frame = touched_fixture(
+        read_touches(touches, wishes, positions=touched_with is None),
+        touched_with,
+        drawing,
+        place.calibration,
+        named_robot(robot_model),
+        touch_noise_m=metres(touch_noise, "--touch-noise-mm"),
+    )
+    tell(place, frame, place.keep(frame), as_json=as_json)
+
+
+def _tool(said: str | None, calibration: Calibration | None) -> Tool | None:
+    """Finds the tool that the points were touched with.
+
+    Args:
+        said: A name, a file, both with a colon between, or `none`; None for the only one.
+        calibration: What is known of the cell.
+
+    Returns:
+        The tool; None where the poses are of the tip itself.
+
+    Raises:
+        DataError: There is no such tool, or none that could be meant.
+    """
+    if said == "none":
+        return None
+    known = {} if calibration is None else calibration.frames
+    if said is None and calibration is None:
+        raise DataError("The tool that touched the points is not said.", next_step=NO_TOOL)
+    if said is None or said in known or f"flange_from_{said}" in known:
+        return Tool.among(known, "The calibration", said)
+    path, _, name = said.rpartition(":")
+    if Path(said).exists():
+        return Tool.among(load_placed(Path(said)).frames, said, None)
+    if path and Path(path).exists():
+        return Tool.among(load_placed(Path(path)).frames, path, name)
+    if known:
+        return Tool.among(known, "The calibration", said)
+    raise DataError(
+        f"--tool {said}: there is no such file, nor a calibration (-c) that has such a tool.",
+        culprits=[said],
+        next_step=NO_TOOL,
+    )

@@ -1,0 +1,318 @@
+"""`visioncal locate`."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from visioncal.calibration import Calibration
+from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.numbers import numbers_in
+from visioncal.cli.planes import FORMS, plane_of
+from visioncal.cli.seeing import refuse_given
+from visioncal.cli.stdout import write_stdout
+from visioncal.errors import DataError
+from visioncal.figures import figure
+from visioncal.files import some_of
+from visioncal.finders.imaging import read_image
+from visioncal.formats.boards import described_target
+from visioncal.frames.chain import Eye
+from visioncal.frames.locate import locate, locate_target
+from visioncal.frames.located import Located
+from visioncal.frames.look import check_size
+from visioncal.frames.picks import locate_views
+from visioncal.frames.sighting import check_mount, pose_of
+from visioncal.pipeline.known import by_reason
+from visioncal.session import Session, View
+from visioncal.stored import load_calibration
+from visioncal.targets import target_from_document
+from visioncal.types import FloatArray, Target
+
+_POSE = "x,y,z,qx,qy,qz,qw"
+# Rounding to four digits leaves a unit quaternion's norm within this of 1.
+_NORM_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """One place, what it is of in words, and what it is of in JSON."""
+
+    words: str
+    document: Mapping[str, Any]
+    located: Located
+
+
+def locate_command(
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A session, or one image (png, jpg, tif); none where pixels are all there is."
+        ),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "-c", "--calibration", help="The camera's: an output folder of calibrate, or its .rrd."
+        ),
+    ] = None,
+    pixel: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="U,V",
+            help="A feature, in the image as it was taken; several may be given.",
+        ),
+    ] = None,
+    plane: Annotated[str | None, typer.Option(help=f"What the features lie in: {FORMS}.")] = None,
+    plane_sigma: Annotated[
+        float | None,
+        typer.Option("--plane-sigma-mm", help="How well the plane's height is known."),
+    ] = None,
+    point: Annotated[
+        str | None,
+        typer.Option(
+            "--point-mm", metavar="X,Y,Z", help="A point of the target, instead of its origin."
+        ),
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            help="What to look for, instead of the session's own: a name in targets/, a .toml, or "
+            "in one word as marker_DICT_4X4_50_10_48mm."
+        ),
+    ] = None,
+    view: Annotated[
+        int | None,
+        typer.Option(help="Which of the session's views; else all that show the target."),
+    ] = None,
+    pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar=_POSE.upper(),
+            help="Where the flange stood at an image, in metres: for a camera on the flange.",
+        ),
+    ] = None,
+    sigma_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Noise of a feature's coordinate; else that of the calibration's corners."
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the places as JSON.")] = False,
+) -> None:
+    """Tell where something that an image shows lies in the robot's base, and how surely.
+
+    It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
+    reason given.
+    """
+    known = _calibration(calibration)
+    session = _session(source)
+    if session is not None:
+        refuse_given({"--pose": pose}, "the session has the poses of its views")
+    else:
+        refuse_given({"--view": view}, "only a session has views")
+    flange = None if pose is None else _flange(pose)
+    if pixel:
+        refuse_given({"--point-mm": point, "--target": target}, "a pixel is placed by its plane")
+        if session is not None:
+            flange = _flange_of(session, _chosen(session, view), known)
+        elif source is not None:
+            check_size(Eye.of(known), read_image(source), source.name)
+        found = _by_plane(known, pixel, plane, plane_sigma or 0.0, flange, sigma_px)
+    else:
+        refuse_given({"--plane": plane, "--plane-sigma-mm": plane_sigma}, "it is for --pixel")
+        origin_m = 1e-3 * np.array(numbers_in(point or "0,0,0", "--point-mm", "x,y,z"))
+        wanted = None if target is None else _target(target)
+        if session is not None:
+            shown = _chosen(session, view)
+            session = session if wanted is None else replace(session, target=wanted)
+            found = _by_views(session, shown, known, origin_m, sigma_px, quiet=as_json)
+        else:
+            found = _by_image(source, known, wanted, origin_m, flange, sigma_px)
+    _tell(found, as_json=as_json)
+
+
+def _calibration(path: Path | None) -> Calibration:
+    if path is None:
+        raise DataError(
+            "locate: the camera's calibration (-c) is needed.",
+            culprits=["-c"],
+            next_step="Name the output folder of visioncal calibrate.",
+        )
+    return load_calibration(path)
+
+
+def _session(source: Path | None) -> Session | None:
+    """The session; None where the source is none."""
+    if source is None or not (source.is_dir() or source.suffix.lower() == ".rrd"):
+        return None
+    return Session.load(source)
+
+
+def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
+    """The views that are meant."""
+    chosen = tuple(it for it in session.views if view in (None, it.number))
+    if not chosen:
+        numbers = some_of([str(it.number) for it in session.views], 20)
+        raise DataError(
+            f"--view {view}: session {session.name!r} has no such view; it has {numbers}.",
+            culprits=["--view"],
+            next_step="The numbers are those of the column view.",
+        )
+    return chosen
+
+
+def _flange(words: str) -> FloatArray:
+    """Reads a pose of the robot, (4, 4) `base_from_flange`."""
+    values = numbers_in(words, "--pose", _POSE)
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1.0) > _NORM_TOLERANCE:
+        raise DataError(
+            f"--pose: the quaternion's norm is {norm:.6g}, but must be 1 to within "
+            f"{_NORM_TOLERANCE:g}.",
+            culprits=["--pose"],
+            next_step=f"Give {_POSE}: metres, and a unit quaternion.",
+        )
+    turn = Rotation.from_quat(values[3:])
+    return np.asarray(RigidTransform.from_components(values[:3], turn).as_matrix())
+
+
+def _flange_of(
+    session: Session, views: Sequence[View], calibration: Calibration
+) -> FloatArray | None:
+    """Where the flange was at the one view that is meant; a camera that stands still needs none."""
+    check_mount(session, calibration)
+    if calibration.mount == "eye-to-hand":
+        return None
+    if len(views) > 1:
+        raise DataError(
+            f"session {session.name!r} has {len(views)} views, and a camera on the flange "
+            "stands elsewhere in each: --view is needed.",
+            culprits=["--view"],
+            next_step="Say which of them the pixel is of.",
+        )
+    (view,) = views
+    flange = pose_of(session, view, calibration)
+    if flange is None:
+        raise DataError(
+            f"view {view.number} of session {session.name!r} has no pose of the robot.",
+            culprits=[f"view {view.number}"],
+            next_step="Fill in x_m to qw, or joint angles and [robot] model.",
+        )
+    return flange
+
+
+def _by_plane(
+    calibration: Calibration,
+    pixels: Sequence[str],
+    plane: str | None,
+    sigma_mm: float,
+    flange: FloatArray | None,
+    sigma_px: float | None,
+) -> tuple[_Found, ...]:
+    if plane is None:
+        raise DataError(
+            "One image tells no depth: the plane (--plane) that the feature lies in is needed.",
+            culprits=["--plane"],
+            next_step=f"It is {FORMS}.",
+        )
+    px = np.array([numbers_in(it, "--pixel", "u,v") for it in pixels])
+    declared, told = plane_of(plane, sigma_mm, calibration)
+    places = locate(calibration, px, declared, flange, sigma_px=sigma_px)
+    return tuple(
+        _Found(
+            f"pixel ({u:g}, {v:g})",
+            {"pixel": [u, v]},
+            replace(it, warnings=(*it.warnings, told)) if told else it,
+        )
+        for (u, v), it in zip(px.tolist(), places, strict=True)
+    )
+
+
+def _by_views(
+    session: Session,
+    views: Sequence[View],
+    calibration: Calibration,
+    point_m: FloatArray,
+    sigma_px: float | None,
+    *,
+    quiet: bool,
+) -> tuple[_Found, ...]:
+    with shown_progress(quiet=quiet) as told:
+        picks = locate_views(
+            session, calibration, point_m, among=views, sigma_px=sigma_px, progress=told
+        )
+    for told_of in (*by_reason(picks.lost), *picks.warnings):
+        messages().print(escape(told_of))
+    return tuple(
+        _Found(f"view {view}", {"view": view}, located) for view, located in picks.found.items()
+    )
+
+
+def _by_image(
+    source: Path | None,
+    calibration: Calibration,
+    target: Target | None,
+    point_m: FloatArray,
+    flange: FloatArray | None,
+    sigma_px: float | None,
+) -> tuple[_Found, ...]:
+    if source is None:
+        raise DataError(
+            "locate: there is nothing to look for: a session, an image or a pixel is needed.",
+            next_step="Name a session or an image; or give --pixel U,V and --plane.",
+        )
+    if target is None:
+        raise DataError(
+            f"{source} is one image, which does not say what to look for: --target is needed.",
+            culprits=["--target"],
+            next_step="Name the target; or give --pixel U,V and --plane.",
+        )
+    image, name = read_image(source), source.name
+    located = locate_target(
+        calibration, image, target, flange, point_m, sigma_px=sigma_px, label=name
+    )
+    return (_Found(name, {"image": name}, located),)
+
+
+def _target(words: str) -> Target:
+    return target_from_document(described_target(words), Path(words).stem)
+
+
+def _tell(found: Sequence[_Found], *, as_json: bool) -> None:
+    if as_json:
+        write_stdout(json.dumps([_document(it) for it in found], indent=2) + "\n")
+        return
+    for it in found:
+        write_stdout(f"{it.words}: {_line(it.located)}\n")
+        for warning in it.located.warnings:
+            told = warning if warning.startswith(it.words) else f"{it.words}: {warning}"
+            messages().print(f"[bold yellow]warning:[/] {escape(told)}")
+
+
+def _line(located: Located) -> str:
+    place = ", ".join(f"{it:.2f}" for it in 1e3 * located.p_base)
+    sigmas = ", ".join(figure(float(it)) for it in located.sigma_mm)
+    largest_mm = figure(located.budget_mm[located.largest])
+    return (
+        f"({place}) mm, sigma ({sigmas}) mm, 95 % within {figure(located.radius95_mm)} mm; "
+        f"largest source: {located.largest}, {largest_mm} mm"
+    )
+
+
+def _document(it: _Found) -> dict[str, Any]:
+    found = it.located
+    return {
+        **it.document,
+        "p_base_m": found.p_base.tolist(),
+        "covariance": found.covariance.tolist(),
+        "sigma_mm": found.sigma_mm.tolist(),
+        "radius95_mm": found.radius95_mm,
+        "budget_mm": dict(found.budget_mm),
+        "warnings": list(found.warnings),
+    }

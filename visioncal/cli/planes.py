@@ -1,0 +1,70 @@
+"""The plane that features lie in, as an option says it."""
+
+import numpy as np
+
+from visioncal.calibration import Calibration
+from visioncal.cli.numbers import numbers_in
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean, some_of
+from visioncal.frames.plane import Plane
+
+FORMS = (
+    "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "
+    "may point down: a board's points into it), or nx,ny,nz,d (a normal, and its product with any "
+    "of the plane's points in mm)"
+)
+_LEAD = "base_from_"
+
+
+def plane_of(words: str, sigma_mm: float, calibration: Calibration) -> tuple[Plane, str]:
+    """Reads a plane.
+
+    Args:
+        words: As in `FORMS`; of a frame's name, `base_from_` may be left out.
+        sigma_mm: How well its height is known [mm].
+        calibration: Whose frames can be named.
+
+    Returns:
+        The plane, and what to know of its frame before it is trusted; empty where nothing is.
+
+    Raises:
+        DataError: It is none of these, or there is no such frame.
+    """
+    frame, _, height = words.rpartition(":") if ":" in words else (words, "", "z=0")
+    if words.startswith("z="):
+        return Plane.horizontal(_height_m(words), 1e-3 * sigma_mm), ""
+    if "," in words:
+        nx, ny, nz, product = numbers_in(words, "--plane", "nx,ny,nz,d")
+        normal = np.array([nx, ny, nz])
+        foot = 1e-3 * product * normal / max(float(normal @ normal), 1e-300)
+        return Plane.through(normal, foot, 1e-3 * sigma_mm), ""
+    return _of_frame(frame, _height_m(height), sigma_mm, calibration)
+
+
+def _of_frame(
+    words: str, z_m: float, sigma_mm: float, calibration: Calibration
+) -> tuple[Plane, str]:
+    planes = [it for it in calibration.placed if it.startswith(_LEAD) and it != f"{_LEAD}cam"]
+    name = words if words.startswith(_LEAD) else f"{_LEAD}{words}"
+    if name not in planes:
+        there = some_of(planes) if planes else "none yet; visioncal fixture places them"
+        raise DataError(
+            f"--plane is {words[:80]!r}, and no frame in the base is called that; there are: "
+            f"{there}.",
+            culprits=["--plane"],
+            next_step=did_you_mean(name, planes) or f"A plane is {FORMS}.",
+        )
+    told = ""
+    if name in calibration.frames and calibration.frames[name].verdict.status == "bad":
+        told = f"The verdict of {name} is bad: {calibration.frames[name].verdict.reasons[0]}"
+    return Plane.of_frame(calibration.placed[name], z_m, 1e-3 * sigma_mm), told
+
+
+def _height_m(words: str) -> float:
+    if not words.startswith("z="):
+        raise DataError(
+            f"--plane ends in {words[:80]!r}; z=5, a height in mm, is needed there.",
+            culprits=["--plane"],
+            next_step=f"A plane is {FORMS}.",
+        )
+    return 1e-3 * numbers_in(words.removeprefix("z="), "--plane z", "z")[0]

@@ -1,0 +1,144 @@
+"""What `tcp` and `fixture` do with a session of images: a target on the tool or on the fixture."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import numpy as np
+import typer
+
+from visioncal.calibration import Calibration, Frame
+from visioncal.cli.console import shown_progress
+from visioncal.cli.framing import Place
+from visioncal.cli.numbers import numbers_in
+from visioncal.errors import DataError
+from visioncal.files import some_of
+from visioncal.frames.marked import marked_fixture
+from visioncal.frames.naming import FrameKind
+from visioncal.frames.nominal import NominalPoints
+from visioncal.frames.seen_frame import seen_frame
+from visioncal.session import Session
+
+PointOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--point-mm",
+        metavar="X,Y,Z",
+        help="Of images: the frame's origin in the target's frame, such as the tool's tip.",
+    ),
+]
+
+
+def image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:
+    """Loads a session whose images are to place something.
+
+    Args:
+        source: What the user named.
+        for_touches: The options that only touches have a use for, by their names; None for those
+            that were not given.
+
+    Returns:
+        The session; None where the source has touches, as a table or as a session without images.
+
+    Raises:
+        DataError: The session has both, cannot be read, or options do not fit.
+    """
+    if not source.is_dir() and source.suffix.lower() != ".rrd":
+        return None
+    session = Session.load(source)
+    shown = [it.number for it in session.views if it.image]
+    if not shown:
+        return None
+    touched = [it.number for it in session.views if it.text.keys() & {"kind", "point"}]
+    if touched:
+        raise DataError(
+            f"session {session.name!r} has images (view {shown[0]}) and touches (kind or point in "
+            f"view {touched[0]}): a frame is placed by one of them.",
+            culprits=[f"view {it}" for it in touched],
+            next_step="Put the touches into a table or a session of their own, without images.",
+        )
+    refuse_given(for_touches, f"session {session.name!r} has images, and this is for touches")
+    return session
+
+
+def touch_options(
+    columns: str | None,
+    form: str | None,
+    unit: str | None,
+    inverse: bool | None,
+    joint_columns: str | None,
+    model: str | None,
+    noise_mm: float | None,
+) -> dict[str, object]:
+    """Names the options that only touches have a use for."""
+    return {
+        "--robot-columns": columns,
+        "--robot-form": form,
+        "--robot-unit": unit,
+        "--robot-inverse": inverse,
+        "--joint-columns": joint_columns,
+        "--robot-model": model,
+        "--touch-noise-mm": noise_mm,
+    }
+
+
+def refuse_given(options: Mapping[str, object], why: str) -> None:
+    """Refuses options that have no use here.
+
+    Args:
+        options: By their names; None for those that were not given.
+        why: They have none, in words.
+
+    Raises:
+        DataError: One is given.
+    """
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise DataError(f"{some_of(given)}: {why}.", culprits=given, next_step="Leave it out.")
+
+
+def camera_of(place: Place, session: Session) -> Calibration:
+    """The calibration of the camera that took the images.
+
+    Raises:
+        DataError: None was named.
+    """
+    if place.calibration is None:
+        raise DataError(
+            f"session {session.name!r} has images, and the camera's calibration (-c) is needed to "
+            "place what they show.",
+            culprits=["-c"],
+            next_step="Name the output folder of visioncal calibrate.",
+        )
+    return place.calibration
+
+
+def frame_by_images(
+    session: Session,
+    place: Place,
+    kind: FrameKind,
+    point_mm: str | None,
+    drawing: NominalPoints | None = None,
+    *,
+    quiet: bool,
+) -> Frame:
+    """Places a tool or a fixture by a session's images.
+
+    Args:
+        session: The images.
+        place: Where the frame goes, and what is known.
+        kind: What it is.
+        point_mm: Its origin in the target's frame, as the user wrote it.
+        drawing: Where markers on a fixture are; None where the session's target is all.
+        quiet: Whether progress is not to be shown.
+
+    Raises:
+        DataError: The images do not show what is needed, or options contradict each other.
+    """
+    calibration = camera_of(place, session)
+    if drawing is not None:
+        refuse_given({"--point-mm": point_mm}, "beside --cad the drawing's origin is the frame's")
+        return marked_fixture(session, calibration, drawing)
+    point = numbers_in(point_mm or "0,0,0", "--point-mm", "x,y,z")
+    with shown_progress(quiet=quiet) as told:
+        return seen_frame(session, calibration, kind, 1e-3 * np.array(point), progress=told)

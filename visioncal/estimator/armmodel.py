@@ -1,0 +1,110 @@
+"""An arm whose errors are being estimated: its model, and how its flange moves with them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.estimator.arm import LEVER_M, ArmErrors
+from visioncal.robot import Robot
+from visioncal.transforms import adjoint, invert, log, mean_transform
+from visioncal.types import FloatArray
+
+BLOCKS = ("offsets", "links", "eccentricity")
+# Columns of a joint's function (see `Robot.function_jacobian`).
+_OFFSET, _SINE, _COSINE = 0, 2, 3
+# One unit of a column turns a link by a radian, or shifts it by as much as that is at the lever.
+_LINK_UNITS = np.repeat([1.0, LEVER_M], 3)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmModel:
+    """A robot's nominal model and the present values of its errors.
+
+    Attributes:
+        nominal: The model as stated.
+        flange_from_reported: (4, 4) the frame of the reported poses in the model's flange.
+        weights: The blocks by name with the size of their errors, as a share of the first's:
+            `offsets` of the joints, `links` (each by six, behind its joint), `eccentricity` (sine
+            and cosine of each joint).
+        values: (p,) present values [rad], block after block; all are of the first block's size.
+    """
+
+    nominal: Robot
+    flange_from_reported: FloatArray
+    weights: Mapping[str, float]
+    values: FloatArray
+
+    @classmethod
+    def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
+        """The nominal arm with what is mounted on its flange, without any errors.
+
+        Args:
+            nominal: The model.
+            q: (m, n) joint angles [rad].
+            reported: (m, 4, 4) what the controller reported for them.
+        """
+        tool = mean_transform(invert(nominal.base_from_flange(q)) @ reported)
+        return cls(nominal, tool, {}, np.zeros(0))
+
+    def erring(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
+        """Returns the arm with the errors of some blocks to be estimated."""
+        sizes = sum(it.basis.shape[2] for it in errors.values())
+        first = next(iter(errors.values())).sigma
+        weights = {name: it.sigma / first for name, it in errors.items()}
+        return replace(self, weights=weights, values=np.zeros(sizes))
+
+    def moved(self, step: FloatArray) -> "ArmModel":
+        """Returns the arm after a (p,) step of its values."""
+        return replace(self, values=self.values + step)
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The arm with its errors, up to the frame of the reported poses."""
+        count, at = self.nominal.joint_count, 0
+        placements, functions = np.zeros((count + 1, 6)), np.zeros((count, 4))
+        for name, weight in self.weights.items():
+            size = _size(name, count)
+            block = weight * self.values[at : at + size]
+            at += size
+            if name == "links":
+                placements[1:] += block.reshape(-1, 6) * _LINK_UNITS
+            elif name == "offsets":
+                functions[:, _OFFSET] += block
+            else:
+                functions[:, [_SINE, _COSINE]] += block.reshape(2, -1).T
+        mounted = np.zeros((count + 1, 6))
+        mounted[-1] = log(self.flange_from_reported)
+        return self.nominal.corrected(placements, functions).corrected(mounted)
+
+    def columns(self, name: str, q: FloatArray) -> FloatArray:
+        """How the reported frame moves with a block's errors.
+
+        Args:
+            name: The block.
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, 6, p) right perturbations for a unit of each column.
+        """
+        if name == "links":
+            moved = self.robot.placement_jacobian(q)[:, :, 6:]
+            units = np.tile(_LINK_UNITS, self.nominal.joint_count)
+            # The last link's own twist acts on the flange, before what is mounted on it.
+            moved[:, :, -6:] = adjoint(invert(self.flange_from_reported))
+            return np.asarray(moved * units)
+        count = self.nominal.joint_count
+        functions = self.robot.function_jacobian(q).reshape(len(q), 6, count, 4)
+        chosen = [_OFFSET] if name == "offsets" else [_SINE, _COSINE]
+        return np.concatenate([functions[..., it] for it in chosen], axis=2)
+
+    def basis(self, q: FloatArray) -> FloatArray:
+        """How the reported frame (m, 6, p) moves with all values."""
+        return np.concatenate(
+            [weight * self.columns(name, q) for name, weight in self.weights.items()], axis=2
+        )
+
+
+def _size(name: str, joints: int) -> int:
+    return {"links": 6, "offsets": 1, "eccentricity": 2}[name] * joints

@@ -1,0 +1,86 @@
+"""An arm's own errors as unknowns of the chain: offsets of its joints, its links, its gears.
+
+Every effect is a set of columns: how the flange moves with it at each stop. All columns are
+carried, however redundant, as random effects of one size a block, which restricted likelihood
+estimates: what the data cannot tell stays where it was stated, and what they can is told at its
+bound (Harville 1977, section 4, for the linear mixed model).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from visioncal.estimator.arm import ArmErrors, find_arm_errors
+from visioncal.estimator.closure import (
+    Closure,
+    ClosureFit,
+    Edges,
+    fit_closure,
+    left_out_residuals,
+    residual_blocks,
+)
+from visioncal.types import FloatArray
+
+# What is free at each level: blocks by name.
+LEVELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "offsets": ("offsets",),
+        "geometry": ("links",),
+        "eccentricity": ("links", "eccentricity"),
+    }
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelFit:
+    """The chain with the arm's errors of one level free.
+
+    Attributes:
+        errors: The errors by block; empty for the arm as stated.
+        fit: Edges and noise.
+        gain: Twice the gain in log-likelihood over the arm as stated.
+        inside: (m, 6) residuals of the fit (rotation [rad], translation [m]).
+        left_out: (m, 6) the same of each stop from a fit without it, to first order.
+    """
+
+    errors: Mapping[str, ArmErrors]
+    fit: ClosureFit
+    gain: float
+    inside: FloatArray
+    left_out: FloatArray
+
+    @property
+    def size(self) -> int:
+        """How many columns are carried."""
+        return sum(it.basis.shape[2] for it in self.errors.values())
+
+
+def fit_level(
+    data: Closure, edges: Edges, bases: Mapping[str, FloatArray], blocks: Sequence[str]
+) -> LevelFit | None:
+    """Fits the chain with some blocks of the arm's errors free.
+
+    Args:
+        data: The views, one a stop, without errors of the arm.
+        edges: Where to start.
+        bases: (m, 6, p) columns of each block by its name.
+        blocks: Those to free, in the order in which they are looked for.
+
+    Returns:
+        The fit; None where a block explains no more than chance.
+    """
+    fit, gain = fit_closure(data, Edges(edges.x, edges.z, data.unchanged)), 0.0
+    errors: dict[str, ArmErrors] = {}
+    for name in blocks:
+        found = find_arm_errors(data, fit.edges, bases[name], of_links=True)
+        if found is None or not found.is_significant:
+            return None
+        errors[name], gain = found, gain + found.gain
+        data = data.with_more(found.shared())
+        more = np.zeros(bases[name].shape[2])
+        start = replace(fit.edges, shared=np.concatenate([fit.edges.shared, more]))
+        fit = fit_closure(data, start)
+    inside = residual_blocks(data, fit.edges, fit.noise)[0]
+    return LevelFit(errors, fit, gain, inside, left_out_residuals(data, fit.edges, fit.noise))

@@ -1,0 +1,119 @@
+"""Which errors of the arm the data tell: none, offsets of the joints, links, eccentric gears."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.calibration import Rms
+from visioncal.errors import DataError
+from visioncal.estimator.arm import SIGNIFICANT, ArmErrors
+from visioncal.estimator.closure import Closure, Edges
+from visioncal.estimator.kinematics import LEVELS, LevelFit, fit_level
+from visioncal.estimator.linalg import one_blas_thread
+from visioncal.types import FloatArray
+
+NOMINAL = "nominal"
+# What may be asked for: the quick one after a lost encoder, or all that the data tell.
+ASKED: Mapping[str, tuple[str, ...]] = {
+    "offsets": ("offsets",),
+    "kinematics": ("geometry", "eccentricity"),
+    "auto": tuple(LEVELS),
+}
+
+
+@dataclass(frozen=True)
+class Level:
+    """What a level of the arm's model makes of the views.
+
+    Attributes:
+        name: `nominal`, or a name among `LEVELS`.
+        unknowns: How many columns it carries.
+        inside: Residuals of the target's pose in the fit.
+        left_out: Residuals of stops that are left out in turn.
+        likelihood_ratio: Twice the gain in log-likelihood over the nominal arm.
+    """
+
+    name: str
+    unknowns: int
+    inside: Rms
+    left_out: Rms
+    likelihood_ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """The level of the arm's model that the views speak for.
+
+    Attributes:
+        level: Its name; `nominal` where none explains more than chance.
+        levels: All that were tried, the nominal arm first.
+        errors: Its errors by block.
+    """
+
+    level: str
+    levels: tuple[Level, ...]
+    errors: Mapping[str, ArmErrors]
+
+
+def choose_level(
+    data: Closure, edges: Edges, bases: Mapping[str, FloatArray], asked: str
+) -> Kinematics:
+    """Chooses how much of the arm to free.
+
+    A level is taken where it is likelier than all others by more than chance, with the price of its
+    unknowns in the likelihood, and predicts stops that are left out better than the nominal arm.
+
+    Args:
+        data: The views, one a stop, without errors of the arm.
+        edges: The answer with the nominal arm.
+        bases: (m, 6, p) how each stop's flange moves with the errors of each block.
+        asked: A key of `ASKED`.
+    """
+    with one_blas_thread():
+        fits = {NOMINAL: fit_level(data, edges, bases, ())}
+        fits |= {it: fit_level(data, edges, bases, LEVELS[it]) for it in ASKED[asked]}
+    found = {name: fit for name, fit in fits.items() if fit is not None}
+    levels = tuple(_level(name, fit) for name, fit in found.items())
+    best = NOMINAL
+    for level in levels:
+        before = next(it for it in levels if it.name == best)
+        better = level.left_out.mm < levels[0].left_out.mm
+        if better and level.likelihood_ratio - before.likelihood_ratio > SIGNIFICANT:
+            best = level.name
+    return Kinematics(best, levels, found[best].errors)
+
+
+def _level(name: str, fit: LevelFit) -> Level:
+    return Level(name, fit.size, _rms(fit.inside), _rms(fit.left_out), fit.gain)
+
+
+def _rms(residuals: FloatArray) -> Rms:
+    square = np.mean(residuals.reshape(-1, 2, 3) ** 2, axis=0).sum(axis=1)
+    return Rms(mm=1e3 * float(np.sqrt(square[1])), deg=float(np.rad2deg(np.sqrt(square[0]))))
+
+
+def check_asked(asked: str, *, can: bool) -> None:
+    """Refuses a level that the session cannot give.
+
+    Raises:
+        DataError: There are no joint angles that belong to a known model.
+    """
+    if asked in ("offsets", "kinematics") and not can:
+        raise DataError(
+            f"level {asked!r} needs the joint angles of every view and a model of the robot that "
+            "they belong to.",
+            culprits=["level"],
+            next_step="Record q1_rad ..., and name [robot] model in session.toml.",
+        )
+
+
+def findings(kinematics: Kinematics) -> Iterator[str]:
+    """Says what was found, for the verdict."""
+    nominal = kinematics.levels[0]
+    chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
+    if chosen is not nominal:
+        yield (
+            f"The arm was calibrated along ({chosen.name}): stops left out are predicted to "
+            f"{chosen.left_out.mm:.2g} mm, with the nominal arm to {nominal.left_out.mm:.2g} mm."
+        )
