@@ -262,12 +262,15 @@ def _worth_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
         yield from _sigma_doubts(findings, options)
         yield from _budget_doubts(findings, options)
     elif findings.workspace_mm > options.sigma_mm[0]:
+        board = (
+            "The board's size counts in it, as no view can tell an arm and a board that are both "
+            "too large: measure its squares, and state square_sigma_m. "
+        )
         yield _Doubt(
             "All over the workspace the calibrated arm places its tool to "
             f"{figure(findings.workspace_mm)} mm (sigma, in the median; doubt begins at "
-            f"{options.sigma_mm[0]:g}). The board's size counts most, as no view of it can tell an "
-            "arm and a board that are both too large: measure its squares, and state "
-            "square_sigma_m; then add views all over the workspace.",
+            f"{options.sigma_mm[0]:g}). {'' if findings.pixel_px is None else board}Add views in "
+            "which the arm stands otherwise, all over the workspace.",
             findings.workspace_mm > options.sigma_mm[1],
         )
 
