@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, known_of
+from scipy.spatial.transform import Rotation
 
 import visioncal
 from visioncal.errors import DataError
 from visioncal.estimator.workspace import observability, pose_slopes, postures, workspace_sigmas
+from visioncal.frames.tcp import touched_tool
+from visioncal.frames.touches import TouchRows
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, fine_camera, forward, simulate
-from visioncal.transforms import exp, invert, log
+from visioncal.simulation.arms import inverse
+from visioncal.transforms import compose, exp, invert, log
 
 GOOD = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=30)
 WRONG_LINKS = replace(GOOD, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
@@ -158,3 +162,34 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     assert found["observability"]["identifiable"] == 30
     # The nominal model stays what it was.
     assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))
+
+
+def test_touches_close_on_the_calibrated_arm():
+    cell = simulate(replace(WRONG_LINKS, seed=5, views=40))
+    result = result_of(calibrated(cell))
+    rng, tip, point = np.random.default_rng(0), np.array([0.034, 0.001, 0.16]), [0.45, 0.1, 0.1]
+    turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (12, 3))).as_matrix()
+    turns = forward(cell.true_arm, cell.joints[:1])[0, :3, :3] @ turns
+    poses = compose(turns, np.array(point) - turns @ tip)
+    reach = inverse(cell.true_arm, poses, np.tile(cell.joints[0], (12, 1)))
+    q, names = reach.joints[reach.solved], tuple(map(str, range(int(reach.solved.sum()))))
+    nothing = ("",) * len(q)
+    rows = TouchRows("t", names, names, result.robot.base_from_flange(q), q, nothing, nothing)
+    with_arm, without = touched_tool(rows, result), touched_tool(rows)
+    assert with_arm.verdict.status == "good"
+    # Exact touches: what is left is what the calibration leaves of the arm's errors nearby.
+    assert with_arm.rms_mm < 0.15 * without.rms_mm
+    # Controllers' poses are the nominal arm's.
+    told = touched_tool(replace(rows, joints_rad=None), result)
+    assert any("without joint angles" in it for it in told.verdict.reasons)
+
+
+def test_a_level_that_explains_too_little_is_told():
+    cell = simulate(replace(WRONG_LINKS, seed=1))
+    known = calibrated(cell, level="offsets")
+    assert known.kinematics.level == "offsets"
+    assert any("speak for more than the arm's offsets" in it for it in known.verdict.reasons)
+    assert known.verdict.status != "good"
+    right = calibrated(simulate(replace(GOOD, seed=3)), level="kinematics")
+    assert right.kinematics.level == "nominal"
+    assert any("The arm stays as stated" in it for it in right.verdict.reasons)

@@ -246,6 +246,7 @@ def test_degrees_for_radians_are_refused(tmp_path):
     path = write_table(tmp_path / "touches.csv", ("x", "y", "z", "rx", "ry", "rz"), rows)
     done = visioncal("tcp", path)
     refused(done, "too large for radians", "rotation-vector-deg")
+    refused(visioncal("tcp", path, "--robot-form", "ur"), "too large for radians")
     tool = found(visioncal("tcp", path, "--robot-form", "rotation-vector-deg", "--json"))
     assert off_mm(tool) < NEAR_MM
 
@@ -358,6 +359,12 @@ def test_a_tool_joins_its_calibration(out, tmp_path):
     refused(tcp(tmp_path, touches, "-c", out, "--name", "gripper"), "already has")
     again = tcp(tmp_path, touches, "-c", out, "--name", "gripper", "--force")
     assert "it replaces the one of" in again.err
+    # A fixture of the same name would hang the frame in two places.
+    taken = visioncal("fixture", tmp_path / "touches.csv", "-c", out, "--name", "gripper")
+    refused(taken, "'gripper' is taken: flange_from_gripper is there already")
+    whole = (out / "calibration.json").read_bytes()
+    refused(tcp(tmp_path, touches, "-o", out / "calibration.json"), "is a calibration", "-c")
+    assert (out / "calibration.json").read_bytes() == whole
     elsewhere = tmp_path / "frames.json"
     assert tcp(tmp_path, touches, "-c", out, "-o", elsewhere).status == 0
     assert list(Calibration.load(out).frames) == ["flange_from_gripper"]

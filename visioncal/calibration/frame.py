@@ -136,6 +136,8 @@ def read_frames(document: Mapping[str, Any]) -> dict[str, Frame]:
 
 
 def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
+    if "transforms" in document:
+        raise ValueError("it is a calibration, whose folder is named with -c")
     if document["schema"] != _SCHEMA:
         raise ValueError(f"schema is {document['schema']!r}, this version reads {_SCHEMA}")
     return read_frames(document["frames"])

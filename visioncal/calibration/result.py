@@ -114,6 +114,11 @@ class Calibration:
             )
         return RigidTransform.from_matrix(arm.base_from_flange(np.atleast_2d(q)))
 
+    @property
+    def arm_is_calibrated(self) -> bool:
+        """Whether the transforms go with a calibrated arm, and not with the controller's."""
+        return "robot" in self.stages.get("kinematics", {})
+
     @cached_property
     def calibrated_robot(self) -> Robot | None:
         """The arm as it was calibrated, or else its nominal model, where there is one."""

@@ -28,7 +28,7 @@ def calibrate_command(
     level: Annotated[
         str,
         typer.Option(
-            help="How far to go: auto, hand-eye (nominal arm), offsets (of its joints), kinematics."
+            help="The arm: auto, hand-eye (none comes out), offsets (of its joints), kinematics."
         ),
     ] = "auto",
     as_json: Annotated[

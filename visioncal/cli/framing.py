@@ -16,6 +16,7 @@ from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.formats import PoseWishes, Wishes
 from visioncal.joining import rewrite
+from visioncal.outputs import RECORDING
 from visioncal.robot import Robot, load_robot
 from visioncal.stored import load_calibration
 from visioncal.transforms import pose_difference
@@ -75,6 +76,7 @@ class Place:
         calibration = None if known is None else load_calibration(known)
         folder = None if known is None or out is not None else _folder(known)
         place = cls(name, calibration, folder, out)
+        place._check_names()
         if not force and (there := place._there()) is not None:
             raise DataError(
                 f"{there} already has {name}, and nothing is overwritten.",
@@ -83,19 +85,31 @@ class Place:
             )
         return place
 
+    def _frames(self) -> dict[str, Frame]:
+        """The frames that are there already."""
+        if self.file is not None:
+            return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
+        return {} if self.calibration is None else dict(self.calibration.frames)
+
     def _there(self) -> Path | None:
         """The place that has a frame of this name already."""
-        if self.file is not None:
-            there = self.file.exists() and self.name in FrameFile.load(self.file).frames
-            return self.file if there else None
-        taken = self.calibration is not None and self.name in self.calibration.frames
-        return self.folder if taken else None
+        return (self.file or self.folder) if self.name in self._frames() else None
+
+    def _check_names(self) -> None:
+        """Refuses a name that another frame has: one frame cannot hang in two places."""
+        child = self.name.partition("_from_")[2]
+        for other in self._frames():
+            if other != self.name and other.partition("_from_")[2] == child:
+                raise DataError(
+                    f"{child!r} is taken: {other} is there already.",
+                    culprits=[other],
+                    next_step="Give this one another name with --name.",
+                )
 
     def keep(self, frame: Frame) -> tuple[Path, ...]:
         """Writes the frame where it goes; nowhere if nothing was named."""
         if self.file is not None:
-            frames = dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
-            FrameFile(frames | {self.name: frame}).save(self.file)
+            FrameFile(self._frames() | {self.name: frame}).save(self.file)
             return (self.file,)
         if self.folder is None or self.calibration is None:
             return ()
@@ -178,6 +192,12 @@ def tell(place: Place, frame: Frame, files: tuple[Path, ...], *, as_json: bool) 
     _tell_before(place, frame)
     for file in files:
         console.print(escape(f"wrote {file}"))
+    if place.folder is not None and place.folder / RECORDING not in files:
+        console.print(
+            escape(
+                f"{place.folder / RECORDING} was not renewed: it is missing or of another result"
+            )
+        )
     if not files:
         console.print("nothing was written: -c joins it to a calibration, -o puts it into a file")
 

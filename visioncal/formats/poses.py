@@ -206,14 +206,15 @@ def check_radians(
     """
     there, rotation = poses.there, poses.reading.rotation
     radians = rotation == "rotation-vector" or rotation.endswith("-rad")
-    if wishes.form is not None or not radians or not there.any():
+    if not radians or not there.any():
         return
     largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
     if largest[row] > _MOST_RAD:
         raise DataError(
             f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
-            "too large for radians, and the source does not say what it is.",
+            "too large for radians"
+            + ("." if wishes.form else ", and the source does not say what it is."),
             culprits=[poses.places[row]],
             next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
             "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."

@@ -54,9 +54,7 @@ def touched_fixture(
             "Leave --cad away, where the fixture's origin, x axis and xy plane were touched.",
         )
         _check_named(rows)
-    known = None if calibration is None else calibration.robot
-    arm = robot if robot is not None else known
-    measured = touched_points(rows, tool, robot_noise(calibration), arm)
+    measured = touched_points(rows, tool, robot_noise(calibration), robot, calibration)
     setting = Setting(
         touch_noise_m, tuple(_doubts(tool)), _details(tool), options or FixtureOptions()
     )

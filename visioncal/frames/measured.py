@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.calibration import Edge, Frame, Verdict
+from visioncal.calibration import Calibration, Edge, Frame, Verdict
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
 from visioncal.files import did_you_mean, some_of
@@ -125,7 +125,11 @@ class MeasuredPoints:
 
 
 def touched_points(
-    rows: TouchRows, tool: Tool | None, noise: Noise, robot: Robot | None
+    rows: TouchRows,
+    tool: Tool | None,
+    noise: Noise,
+    robot: Robot | None = None,
+    calibration: Calibration | None = None,
 ) -> MeasuredPoints:
     """Finds where the tip was.
 
@@ -133,7 +137,9 @@ def touched_points(
         rows: The touches.
         tool: On the flange; None where the poses are of the tip itself.
         noise: Errors of the flange, per axis.
-        robot: A model for joint angles; without a tool there is no use for one.
+        robot: A model for joint angles, where the calibration has none; without a tool there is no
+            use for one.
+        calibration: What is known of the same robot.
 
     Raises:
         DataError: A row has no pose, or the same one as another.
@@ -142,7 +148,7 @@ def touched_points(
         poses, away = _tip_poses(rows), np.zeros(3)
         spread, axis = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0])
     else:
-        poses, away = flange_poses(rows, robot), tool.edge.matrix[:3, 3]
+        poses, away = flange_poses(rows, robot, calibration), tool.edge.matrix[:3, 3]
         turn = tool.edge.matrix[:3, :3]
         spread = turn @ tool.edge.covariance[3:, 3:] @ turn.T
         # A tool whose rotation was not measured points more or less along the flange's z.

@@ -13,7 +13,7 @@ from visioncal.pipeline.known import HELD_BACK, by_reason
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.stages.detect import detect, image_of
-from visioncal.stages.reported import reported_poses
+from visioncal.stages.reported import Reported, reported_poses
 from visioncal.types import FloatArray, Progress, Rejection, Target
 
 # A stated lens that differs by more of its focal length is another camera's: an estimate is
@@ -131,8 +131,7 @@ def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArra
     Raises:
         DataError: The joints are not those of the model.
     """
-    alone = replace(session, views=(view,))
-    return reported_poses(alone, _robot(session, calibration)).base_from_flange.get(view.number)
+    return _flange(session, calibration, (view,)).base_from_flange.get(view.number)
 
 
 def check_mount(session: Session, calibration: Calibration) -> None:
@@ -153,14 +152,21 @@ def check_mount(session: Session, calibration: Calibration) -> None:
 def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
     """What is odd about the session itself, or beside the calibration."""
     known, stated = calibration.camera, session.camera
+    told = session.warnings
+    if calibration.arm_is_calibrated and any(it.joints_rad is None for it in session.views):
+        told = (
+            *told,
+            "The calibration is of a calibrated arm, but views come without joint angles: their "
+            "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too.",
+        )
     if known is None or stated is None:
-        return session.warnings
+        return told
     off = stated.matrix - known.camera.matrix
     if np.abs(off).max() <= _OTHER_LENS * known.camera.matrix[0]:
-        return session.warnings
+        return told
     fx, cx, of_fx, of_cx = (it.matrix[at] for it in (stated, known.camera) for at in (0, 2))
     return (
-        *session.warnings,
+        *told,
         f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
         f"calibrated to {of_fx:.0f} and {of_cx:.0f}: is it the same camera? The calibrated lens "
         "was used.",
@@ -199,12 +205,24 @@ def _poses(
     """The robot's poses by view, and why views without one or without an image are of no use."""
     lost = {it.number: "it has no image" for it in asked if not it.image}
     if needs_robot(Eye.of(calibration), parent):
-        alone = replace(session, views=asked)
-        reported = reported_poses(alone, _robot(session, calibration))
+        reported = _flange(session, calibration, asked)
         lost = {it.view: it.reason for it in reported.rejections} | lost
         return reported.base_from_flange, lost
     there = {it.number: pose for it in asked if (pose := it.base_from_flange()) is not None}
     return {view: np.asarray(it.as_matrix()) for view, it in there.items()}, lost
+
+
+def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...]) -> Reported:
+    """The robot's side of some views, through the calibrated arm where there is one."""
+    reported = reported_poses(replace(session, views=asked), _robot(session, calibration))
+    arm, poses = calibration.calibrated_robot, dict(reported.base_from_flange)
+    if arm is None or not calibration.arm_is_calibrated:
+        return reported
+    for view in asked:
+        joints = view.joints_rad
+        if joints is not None and len(joints) == arm.joint_count:
+            poses[view.number] = arm.base_from_flange(joints[None])[0]
+    return replace(reported, base_from_flange=poses)
 
 
 def _robot(session: Session, calibration: Calibration) -> Robot | None:

@@ -13,7 +13,14 @@ from visioncal.estimator.pivot import PivotFit, fit_pivot
 from visioncal.estimator.readings import readings_that_close
 from visioncal.estimator.touching import Touches, TouchKind
 from visioncal.figures import figure
-from visioncal.frames.touches import TouchRows, flange_poses, numbered, refuse_copies, robot_noise
+from visioncal.frames.touches import (
+    TouchRows,
+    flange_poses,
+    nominal_poses,
+    numbered,
+    refuse_copies,
+    robot_noise,
+)
 from visioncal.frames.verdicts import (
     Doubt,
     disputed,
@@ -73,8 +80,7 @@ def touched_tool(
         DegenerateError: They leave a direction of the tool open.
     """
     rows = rows.of_kinds(TOUCH_KINDS, "point")
-    known = None if calibration is None else calibration.robot
-    poses = flange_poses(rows, robot if robot is not None else known)
+    poses = flange_poses(rows, robot, calibration)
     refuse_copies(poses, rows.places)
     touches = _touches(rows, poses)
     try:
@@ -82,6 +88,7 @@ def touched_tool(
     except (DataError, DegenerateError) as error:
         raise _with_reading(error, touches) from error
     doubts = list(_doubts(fit, touches, rows.places, options or TcpOptions()))
+    doubts += nominal_poses(rows, calibration)
     return Frame(
         Edge(fit.flange_from_tool, fit.covariance),
         fit.oriented,

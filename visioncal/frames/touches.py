@@ -1,6 +1,6 @@
 """Touches: where the flange stood when a point of the tool met a point of the cell."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
 from visioncal.files import did_you_mean, some_of
+from visioncal.frames.verdicts import Doubt
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.transforms import invert, rotation_angle
@@ -108,14 +109,18 @@ def touches_of(session: Session) -> TouchRows:
     )
 
 
-def flange_poses(rows: TouchRows, robot: Robot | None, *, calibrated: bool = False) -> FloatArray:
+def flange_poses(
+    rows: TouchRows, robot: Robot | None, calibration: Calibration | None = None
+) -> FloatArray:
     """Collects where the flange was.
+
+    Joint angles come first where the arm was calibrated: what the controller reports is the nominal
+    arm's.
 
     Args:
         rows: The touches.
-        robot: The arm's model, where one is known.
-        calibrated: Whether the model is better than what the controller reports: then joints come
-            first.
+        robot: The arm's model, where the calibration has none.
+        calibration: What is known of the same robot.
 
     Returns:
         (n, 4, 4) `base_from_flange` [m].
@@ -125,6 +130,9 @@ def flange_poses(rows: TouchRows, robot: Robot | None, *, calibrated: bool = Fal
             than metres and radians.
     """
     check_lengths(rows)
+    calibrated = calibration is not None and calibration.arm_is_calibrated
+    if calibration is not None and (calibrated or robot is None):
+        robot = calibration.calibrated_robot
     reported = np.isfinite(rows.base_from_flange).all(axis=(1, 2))
     modelled, poses = _modelled(rows, robot, needed=not reported.all())
     without = np.flatnonzero(~reported & ~modelled)
@@ -137,6 +145,18 @@ def flange_poses(rows: TouchRows, robot: Robot | None, *, calibrated: bool = Fal
         )
     first = modelled if calibrated else modelled & ~reported
     return np.where(first[:, None, None], poses, rows.base_from_flange)
+
+
+def nominal_poses(rows: TouchRows, calibration: Calibration | None) -> Iterator[Doubt]:
+    """Says where a calibrated arm's touches come with the nominal arm's poses."""
+    if calibration is None or not calibration.arm_is_calibrated:
+        return
+    joints = rows.joints_rad
+    if joints is None or not np.isfinite(joints).all():
+        yield Doubt(
+            "The calibration is of a calibrated arm, but touches come without joint angles: their "
+            "poses are the nominal arm's, off by as much as its errors. Write down q1_rad ... too."
+        )
 
 
 def check_lengths(rows: TouchRows) -> None:

@@ -52,8 +52,8 @@ def calibrate(
     Args:
         session: A session, or the path of its folder or recording.
         solver: `joint` for the fit of both edges, or the name of a closed form.
-        level: How far to go: `auto` for all that the data allows, `hand-eye` with the nominal arm,
-            `offsets` of its joints, or its `kinematics`.
+        level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
+            arm, `offsets` of its joints, or its `kinematics`.
         progress: Told of long work.
 
     Returns:

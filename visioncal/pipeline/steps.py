@@ -27,7 +27,7 @@ from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
-from visioncal.stages.kinematics import check_asked, choose_level, findings
+from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
 from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses, usable_joints
@@ -226,6 +226,7 @@ def _kinematics(known: Known) -> Known:
     data = stated.closure(known.used).merged(known.stops)
     found = choose_level(data, agreed.edges, bases, known.level)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
+    known = known.noting((), doubts(found))
     if not found.errors:
         return known
     return replace(known, arm_model=model.erring(found.errors))

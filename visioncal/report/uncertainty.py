@@ -14,7 +14,8 @@ _REMEDIES = {
     "poses": "more poses would lower it",
     "intrinsics": "views with the board near the image's edges would lower it",
     "board": "squares measured over the whole board would lower it",
-    "arm": "more views would hardly lower it, a kinematic calibration of the arm would",
+    "arm": "what of it looks the same in all views stays, and a calibrated arm's poses make up "
+    "for it",
     "held_values": "stating lens and board better, or letting them move, would lower it",
     "misfit": "a cell that has warmed up and settled would lower it",
 }

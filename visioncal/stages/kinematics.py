@@ -1,6 +1,6 @@
 """Which errors of the arm the data tell: none, offsets of the joints, links, eccentric gears."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,11 +49,13 @@ class Kinematics:
         level: Its name; `nominal` where none explains more than chance.
         levels: All that were tried, the nominal arm first.
         errors: Its errors by block.
+        was_asked: Whether the user named the level.
     """
 
     level: str
     levels: tuple[Level, ...]
     errors: Mapping[str, ArmErrors]
+    was_asked: bool
 
 
 def choose_level(
@@ -72,16 +74,21 @@ def choose_level(
     """
     with one_blas_thread():
         fits = {NOMINAL: fit_level(data, edges, bases, ())}
-        fits |= {it: fit_level(data, edges, bases, LEVELS[it]) for it in ASKED[asked]}
+        fits |= {it: fit_level(data, edges, bases, blocks) for it, blocks in LEVELS.items()}
     found = {name: fit for name, fit in fits.items() if fit is not None}
     levels = tuple(_level(name, fit) for name, fit in found.items())
-    best = NOMINAL
-    for level in levels:
-        before = next(it for it in levels if it.name == best)
+    best = _best([it for it in levels if it.name in (NOMINAL, *ASKED[asked])])
+    return Kinematics(best.name, levels, found[best.name].errors, asked != "auto")
+
+
+def _best(levels: Sequence[Level]) -> Level:
+    """The likeliest level that predicts better than the first one, by more than chance each."""
+    best = levels[0]
+    for level in levels[1:]:
         better = level.left_out.mm < levels[0].left_out.mm
-        if better and level.likelihood_ratio - before.likelihood_ratio > SIGNIFICANT:
-            best = level.name
-    return Kinematics(best, levels, found[best].errors)
+        if better and level.likelihood_ratio - best.likelihood_ratio > SIGNIFICANT:
+            best = level
+    return best
 
 
 def _level(name: str, fit: LevelFit) -> Level:
@@ -108,12 +115,31 @@ def check_asked(asked: str, *, can: bool) -> None:
         )
 
 
+def doubts(kinematics: Kinematics) -> Iterator[str]:
+    """Says where another level explains the views far better than the one that was asked for."""
+    best = _best(kinematics.levels)
+    chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
+    if best.name != chosen.name:
+        yield (
+            f"The views speak for more than the arm's {chosen.name}: with its {best.name} stops "
+            f"left out are predicted to {best.left_out.mm:.2g} mm instead of "
+            f"{chosen.left_out.mm:.2g} mm. Leave --level out."
+        )
+
+
 def findings(kinematics: Kinematics) -> Iterator[str]:
     """Says what was found, for the verdict."""
+    if kinematics.level == NOMINAL and kinematics.was_asked:
+        yield (
+            "The arm stays as stated: what was asked to be found of it explains the views no "
+            "better than chance, or there are too few stops to tell."
+        )
     nominal = kinematics.levels[0]
     chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
     if chosen is not nominal:
         yield (
             f"The arm was calibrated along ({chosen.name}): stops left out are predicted to "
-            f"{chosen.left_out.mm:.2g} mm, with the nominal arm to {nominal.left_out.mm:.2g} mm."
+            f"{chosen.left_out.mm:.2g} mm, with the nominal arm to {nominal.left_out.mm:.2g} mm. "
+            "The transforms go with this arm: take its poses (calibration.base_from_flange), not "
+            "the controller's."
         )
