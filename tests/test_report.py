@@ -120,7 +120,7 @@ def test_sources_of_uncertainty_are_told_with_their_shares(sample: Sample) -> No
     assert "0.50 m from the camera" in words
     assert "in the frame of the flange with a sigma of 1.2 mm" in words
     assert "right to within 0.16 mm" in words
-    assert "94 % of the variance, comes from the arm; what of it looks the same in all views stays" in words
+    assert "94 % of the variance, comes from the arm; what of it looks the same in all" in words
     # The bars, the largest first.
     labels = ["errors of the arm's links", "the robot, from stop to stop", "total"]
     assert sorted(labels, key=words.index) == labels
