@@ -22,7 +22,7 @@ SOURCES = {
     "intrinsics": "what is open about the lens",
     "board": "what is open about the board",
     "arm": "errors of the arm's links",
-    "held_values": "values that are held and that the views would move",
+    "held_values": "values that are held",
     "misfit": "neighbouring stops that err alike",
 }
 

@@ -81,7 +81,7 @@ def _text(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
-        return f"{value:.6g}"
+        return f"{value:.4g}"
     if isinstance(value, str):
         return value
     if isinstance(value, Sequence) and all(isinstance(it, int | float | str) for it in value):
