@@ -299,8 +299,8 @@ class MeasuredScale:
 
     @property
     def is_another(self) -> bool:
-        """Whether it differs from the stated one by more than its own uncertainty explains."""
-        return abs(self.scale) > _CONTRADICTION * self.sigma
+        """Whether it differs from the stated one by more than chance."""
+        return (self.scale / self.sigma) ** 2 > chance_limit(1)
 
     @property
     def contradicts(self) -> bool:
