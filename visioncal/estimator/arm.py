@@ -9,7 +9,7 @@ covariance is the price of an uncalibrated arm.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,10 +26,12 @@ from visioncal.estimator.closure import (
 from visioncal.estimator.linalg import covariance
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import FloatArray
 
 # Arms are off by some 0.5 mm for each mrad.
 LEVER_M = 0.5
+# One unit of a twist turns by a radian, or shifts by as much as that is at the lever.
+TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 # Twice the gain in log-likelihood that noise gives in one session of ten thousand, and in one of
 # twenty: chi-square of one degree of freedom.
 SIGNIFICANT, _LIKELY = 15.1, 3.84
@@ -68,10 +70,6 @@ class ArmErrors:
         """Whether they are unknowns of the fit; others only count in the covariance."""
         return self.of_links and self.is_significant
 
-    def of(self, rows: IntArray) -> "ArmErrors":
-        """Returns the errors of some views."""
-        return replace(self, basis=self.basis[rows])
-
     def shared(self, values: FloatArray | None = None) -> Shared:
         """Puts the effects as unknowns of the chain, at their (p,) present values."""
         size = self.basis.shape[2]
@@ -94,7 +92,7 @@ def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
     """
     links = np.array([robot.link_frames(row)[:-1] for row in joints_rad])
     flange_from_base = invert(robot.base_from_flange(joints_rad))
-    twists = adjoint(flange_from_base[:, None] @ links) * _units()
+    twists = adjoint(flange_from_base[:, None] @ links) * TWIST_UNITS
     return np.concatenate(list(np.moveaxis(twists, 1, 0)), axis=2)
 
 
@@ -110,17 +108,13 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
     Returns:
         (m, 6, 48) in the units of `link_basis`.
     """
-    of_base = adjoint(invert(base_from_flange)) * _units()
-    of_flange = np.broadcast_to(np.eye(6) * _units(), of_base.shape)
+    of_base = adjoint(invert(base_from_flange)) * TWIST_UNITS
+    of_flange = np.broadcast_to(np.eye(6) * TWIST_UNITS, of_base.shape)
     position, axis = base_from_flange[:, :3, 3] / _REACH_M, base_from_flange[:, :3, 2]
     changing = [
         of_base * factor[:, None, None] for factor in np.concatenate([position, axis], axis=1).T
     ]
     return np.concatenate([of_flange, of_base, *changing], axis=2)
-
-
-def _units() -> FloatArray:
-    return np.repeat([1.0, LEVER_M], 3)
 
 
 def find_arm_errors(

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.estimator.arm import LEVER_M, ArmErrors
+from visioncal.estimator.arm import TWIST_UNITS, ArmErrors
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert, log, mean_transform
 from visioncal.types import FloatArray
@@ -14,8 +14,6 @@ from visioncal.types import FloatArray
 BLOCKS = ("offsets", "links", "eccentricity")
 # Columns of a joint's function (see `Robot.function_jacobian`).
 _OFFSET, _SINE, _COSINE = 0, 2, 3
-# One unit of a column turns a link by a radian, or shifts it by as much as that is at the lever.
-_LINK_UNITS = np.repeat([1.0, LEVER_M], 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +67,7 @@ class ArmModel:
             block = weight * self.values[at : at + size]
             at += size
             if name == "links":
-                placements[1:] += block.reshape(-1, 6) * _LINK_UNITS
+                placements[1:] += block.reshape(-1, 6) * TWIST_UNITS
             elif name == "offsets":
                 functions[:, _OFFSET] += block
             else:
@@ -90,7 +88,7 @@ class ArmModel:
         """
         if name == "links":
             moved = self.robot.placement_jacobian(q)[:, :, 6:]
-            units = np.tile(_LINK_UNITS, self.nominal.joint_count)
+            units = np.tile(TWIST_UNITS, self.nominal.joint_count)
             # The last link's own twist acts on the flange, before what is mounted on it.
             moved[:, :, -6:] = adjoint(invert(self.flange_from_reported))
             return np.asarray(moved * units)

@@ -74,19 +74,6 @@ class TouchRows:
             )
         return replace(self, kinds=kinds)
 
-    def rows(self, chosen: Mask) -> "TouchRows":
-        """Returns the rows of an (n,) mask."""
-        at = np.flatnonzero(chosen)
-        return TouchRows(
-            self.source,
-            tuple(self.labels[it] for it in at),
-            tuple(self.places[it] for it in at),
-            self.base_from_flange[chosen],
-            None if self.joints_rad is None else self.joints_rad[chosen],
-            tuple(self.kinds[it] for it in at),
-            tuple(self.points[it] for it in at),
-        )
-
 
 def touches_of(session: Session) -> TouchRows:
     """Takes the rows of a session's views.csv for touches."""
