@@ -2,7 +2,9 @@
 
 Unknown are both edges, the flange's error at every view (with its variance as a prior), and the
 lens where the session does not state it; the board is as stated. Derivatives are central
-differences of the simulation's projection, which shares nothing with the application's.
+differences of the simulation's projection, which shares nothing with the application's. Where the
+arm is unknown too, its parameters are those of the simulation, with the variances they were drawn
+from (van Trees 1968, section 2.4).
 """
 
 from collections.abc import Callable, Sequence
@@ -10,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.simulation import Cell
-from visioncal.simulation.boards import Sheet, corners_m
+from visioncal.simulation import Cell, forward
+from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import project
-from visioncal.transforms import exp, invert
-from visioncal.types import FloatArray
+from visioncal.transforms import adjoint, exp, invert, log
+from visioncal.types import FloatArray, IntArray
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
 _STEP = 1e-5
@@ -65,3 +67,81 @@ def _pixels(cell: Cell, view: int, change: FloatArray) -> FloatArray:
     stated = Sheet(cell.options.target, 1.0, 0.0)
     points = corners_m(stated)[cell.corners[view].ids]
     return project(camera, points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]).ravel()
+
+
+def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
+    """Least root mean square error of what the arm carries, seen from what stands still [m].
+
+    That is the camera's place seen from the target, or the target's middle seen from the camera.
+
+    Lens and board are as stated; both edges, all parameters of the arm and the flange's error at
+    every view are unknown.
+
+    Args:
+        cell: The cell.
+        q: (k, n) postures at which the error counts, as the encoders have them [rad].
+    """
+    sigmas = _arm_sigmas(cell)
+    size = 12 + len(sigmas)
+    information = np.zeros((size, size))
+    information[12:, 12:] = np.diag(sigmas**-2.0)
+    slack = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3) ** 2
+    for view, pose in enumerate(cell.cam_from_target):
+        seen = cell.corners[view].ids
+        by_pose = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
+        camera = np.linalg.inv(by_pose.T @ by_pose) * cell.options.pixel_sigma_px**2
+        by_flange = _pose_slopes(cell, cell.joints[view], slack=True)[:, -6:]
+        spread = camera + by_flange @ np.diag(slack) @ by_flange.T
+        slopes = _pose_slopes(cell, cell.joints[view])
+        information += slopes.T @ np.linalg.solve(spread, slopes)
+    scale = 1.0 / np.sqrt(np.diag(information))
+    spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheet)
+    turn = np.concatenate([np.cross(np.eye(3), at), np.eye(3)], axis=1)
+    slopes = [turn @ _carried(cell, it) @ _pose_slopes(cell, it) for it in q]
+    return float(np.sqrt(np.mean([np.trace(it @ spread @ it.T) for it in slopes])))
+
+
+def _carried(cell: Cell, q: FloatArray) -> FloatArray:
+    """(6, 6) from motions of the target seen from the camera to those of what the arm carries."""
+    if cell.options.mount == "eye-to-hand":
+        return np.eye(6)
+    return adjoint(_pose(cell, q, np.zeros(12 + 5 * cell.arm.a.size)))
+
+
+def _arm_sigmas(cell: Cell) -> FloatArray:
+    """Standard deviations (5 n,) of a, d, alpha, beta and the joints' offsets."""
+    options, count = cell.options, cell.arm.a.size
+    offset = np.hypot(options.dh_sigma_rad, options.offset_sigma_rad)
+    each = [options.dh_sigma_m] * 2 + [options.dh_sigma_rad] * 2 + [offset]
+    return np.repeat(each, count)
+
+
+def _pose_slopes(cell: Cell, q: FloatArray, *, slack: bool = False) -> FloatArray:
+    """How `cam_from_target` (6) moves with x, z and the arm, and with the flange's error."""
+    size = 12 + 5 * cell.arm.a.size + (6 if slack else 0)
+    middle = invert(_pose(cell, q, np.zeros(size)))
+    return _slopes(lambda it: log(middle @ _pose(cell, q, it)), size)
+
+
+def _pose(cell: Cell, q: FloatArray, change: FloatArray) -> FloatArray:
+    arm, count = cell.true_arm, cell.arm.a.size
+    a, d, alpha, beta, offset = change[12 : 12 + 5 * count].reshape(5, count)
+    moved = replace(
+        arm,
+        a=arm.a + a,
+        d=arm.d + d,
+        alpha=arm.alpha + alpha,
+        beta=arm.beta + beta,
+        offset=arm.offset + offset,
+    )
+    slack = change[12 + 5 * count :]
+    flange = forward(moved, q[None])[0] @ exp(slack if len(slack) else np.zeros(6))
+    x, z = cell.transforms.values()
+    robot = flange if cell.options.mount == "eye-in-hand" else invert(flange)
+    return invert(robot @ x @ exp(change[:6])) @ z @ exp(change[6:12])
+
+
+def _seen(cell: Cell, pose: FloatArray, ids: IntArray) -> FloatArray:
+    points = corners_m(Sheet(cell.options.target, 1.0, 0.0))[ids]
+    return project(cell.options.camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()

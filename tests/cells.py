@@ -15,7 +15,7 @@ from visioncal.transforms import invert, log
 def session_of(cell: Cell) -> Session:
     """The session of a cell as it stands in memory, its images not rendered."""
     options = cell.options
-    camera = options.camera
+    camera = cell.stated_camera
     table = {"resolution": list(camera.resolution), "model": camera.model}
     if options.state_intrinsics:
         table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}

@@ -96,6 +96,36 @@ def test_noisy_chain_closes_on_the_truth_only():
     assert np.linalg.norm(report[:, :3, 3], axis=1).min() > 1e-5
 
 
+def worn_joints(seed):
+    return CellOptions(views=1, seed=seed, eccentricity_sigma_rad=1e-3, ripple_sigma_rad=1e-4)
+
+
+def test_worn_joints_turn_beyond_their_encoders_by_waves_of_the_stated_size():
+    waves = [
+        forward(simulate(worn_joints(seed)).true_arm, np.zeros((1, 6)))[0] for seed in range(2)
+    ]
+    assert not np.allclose(waves[0], waves[1], atol=1e-6)
+    arms = [simulate(worn_joints(seed)).true_arm for seed in range(60)]
+    sizes = np.std([it.waves for it in arms], axis=(0, 2))
+    # 360 draws each: a standard deviation is told to 4 %; three of these.
+    np.testing.assert_allclose(sizes, [1e-3, 1e-3, 1e-4, 1e-4], rtol=0.12)
+    # A whole turn brings the disc's error back, not the encoder's offset.
+    q = np.full((1, 6), 0.4)
+    np.testing.assert_allclose(
+        forward(arms[0], q), forward(arms[0], q + 2 * np.pi), atol=1e-9
+    )  # Rounding of the ripple's phase, some hundred times the angle's.
+
+
+def test_mistaken_intrinsics_are_off_by_what_was_asked_for():
+    for camera in (wide_camera(), fine_camera(), fisheye_camera()):
+        cell = simulate(CellOptions(views=1, camera=camera, lens_mismatch_px=0.3))
+        px = np.random.default_rng(5).uniform(0.0, 1.0, (500, 2)) * np.array(camera.resolution)
+        away = project(cell.stated_camera, rays(camera, px)) - px
+        # 500 random pixels against the grid that the size is set on: the edge counts most, a
+        # fisheye's above all.
+        assert np.sqrt(np.mean(np.sum(away**2, axis=1))) == pytest.approx(0.3, rel=0.25)
+
+
 def test_stretched_ur_arm_is_where_its_data_sheet_puts_it():
     # With all joints at zero the arm lies along -x and the flange looks along -y.
     flange = forward(ur_arm("ur10e"), np.zeros((1, 6)))[0]

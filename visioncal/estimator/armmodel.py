@@ -11,9 +11,9 @@ from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert, log, mean_transform
 from visioncal.types import FloatArray
 
-BLOCKS = ("offsets", "links", "eccentricity")
-# Columns of a joint's function (see `Robot.function_jacobian`).
-_OFFSET, _SINE, _COSINE = 0, 2, 3
+# Columns of a joint's function (see `Robot.function_jacobian`) that a block changes.
+_FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
+BLOCKS = ("links", *_FUNCTIONS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,8 @@ class ArmModel:
         nominal: The model as stated.
         flange_from_reported: (4, 4) the frame of the reported poses in the model's flange.
         weights: The blocks by name with the size of their errors, as a share of the first's:
-            `offsets` of the joints, `links` (each by six, behind its joint), `eccentricity` (sine
-            and cosine of each joint).
+            `offsets` of the joints, `links` (each by six, behind its joint), `ratios` of the gears,
+            `eccentricity` (sine and cosine of each joint).
         values: (p,) present values [rad], block after block; all are of the first block's size.
     """
 
@@ -68,10 +68,8 @@ class ArmModel:
             at += size
             if name == "links":
                 placements[1:] += block.reshape(-1, 6) * TWIST_UNITS
-            elif name == "offsets":
-                functions[:, _OFFSET] += block
             else:
-                functions[:, [_SINE, _COSINE]] += block.reshape(2, -1).T
+                functions[:, _FUNCTIONS[name]] += block.reshape(-1, count).T
         mounted = np.zeros((count + 1, 6))
         mounted[-1] = log(self.flange_from_reported)
         return self.nominal.corrected(placements, functions).corrected(mounted)
@@ -94,8 +92,7 @@ class ArmModel:
             return np.asarray(moved * units)
         count = self.nominal.joint_count
         functions = self.robot.function_jacobian(q).reshape(len(q), 6, count, 4)
-        chosen = [_OFFSET] if name == "offsets" else [_SINE, _COSINE]
-        return np.concatenate([functions[..., it] for it in chosen], axis=2)
+        return np.concatenate([functions[..., it] for it in _FUNCTIONS[name]], axis=2)
 
     def basis(self, q: FloatArray) -> FloatArray:
         """How the reported frame (m, 6, p) moves with all values."""
@@ -105,4 +102,4 @@ class ArmModel:
 
 
 def _size(name: str, joints: int) -> int:
-    return {"links": 6, "offsets": 1, "eccentricity": 2}[name] * joints
+    return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

@@ -28,7 +28,7 @@ LEVELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "offsets": ("offsets",),
         "geometry": ("links",),
-        "eccentricity": ("links", "eccentricity"),
+        "eccentricity": ("links", "eccentricity", "ratios"),
     }
 )
 
@@ -66,21 +66,26 @@ def fit_level(
         data: The views, one a stop, without errors of the arm.
         edges: Where to start.
         bases: (m, 6, p) columns of each block by its name.
-        blocks: Those to free, in the order in which they are looked for.
+        blocks: Those to free, in the order in which they are looked for; behind the first, those
+            that explain no more than chance stay out.
 
     Returns:
-        The fit; None where a block explains no more than chance.
+        The fit; None where there is nothing to free beyond chance, or no more than the first block.
     """
     fit, gain = fit_closure(data, Edges(edges.x, edges.z, data.unchanged)), 0.0
     errors: dict[str, ArmErrors] = {}
     for name in blocks:
         found = find_arm_errors(data, fit.edges, bases[name], of_links=True)
         if found is None or not found.is_significant:
-            return None
+            if not errors:
+                return None
+            continue
         errors[name], gain = found, gain + found.gain
         data = data.with_more(found.shared())
         more = np.zeros(bases[name].shape[2])
         start = replace(fit.edges, shared=np.concatenate([fit.edges.shared, more]))
         fit = fit_closure(data, start)
+    if len(errors) < min(len(blocks), 2):
+        return None
     inside = residual_blocks(data, fit.edges, fit.noise)[0]
     return LevelFit(errors, fit, gain, inside, left_out_residuals(data, fit.edges, fit.noise))

@@ -13,6 +13,8 @@ from visioncal.errors import DataError
 from visioncal.types import FloatArray
 
 _HALF_TURN = np.pi
+# A strain-wave gear of ratio 100 ripples twice a turn of its wave generator.
+_TEETH = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,8 @@ class Arm:
         alpha: (n,) twists about x [rad].
         beta: (n,) Hayati's twists about y [rad].
         offset: (n,) joint angles at which the encoders read zero [rad].
+        waves: (4, n) what each joint turns beyond its encoder: sine and cosine of its angle, from
+            an eccentric disc, and of the gear's ripple [rad].
     """
 
     name: str
@@ -38,6 +42,7 @@ class Arm:
     alpha: FloatArray
     beta: FloatArray
     offset: FloatArray
+    waves: FloatArray
 
 
 @dataclass(frozen=True)
@@ -48,11 +53,15 @@ class ArmErrors:
         length_m: Of every a and d [m].
         angle_rad: Of every alpha, beta and joint offset [rad].
         offset_rad: Of the joint offsets, on top of `angle_rad` [rad].
+        eccentricity_rad: Of the sine and the cosine of one turn of each joint [rad].
+        ripple_rad: The same for the gear's ripple [rad].
     """
 
     length_m: float
     angle_rad: float
     offset_rad: float
+    eccentricity_rad: float = 0.0
+    ripple_rad: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +113,7 @@ def ur_arm(name: str) -> Arm:
         alpha=np.array([quarter, 0.0, 0.0, quarter, -quarter, 0.0]),
         beta=np.zeros(6),
         offset=np.zeros(6),
+        waves=np.zeros((4, 6)),
     )
 
 
@@ -112,7 +122,8 @@ def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
 
     The same generator state gives the same directions of error whatever their size.
     """
-    draws = rng.standard_normal((6, arm.a.size))
+    draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
+    sizes = np.repeat([errors.eccentricity_rad, errors.ripple_rad], 2)
     return replace(
         arm,
         a=arm.a + errors.length_m * draws[0],
@@ -120,6 +131,7 @@ def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
         alpha=arm.alpha + errors.angle_rad * draws[2],
         beta=arm.beta + errors.angle_rad * draws[3],
         offset=arm.offset + errors.angle_rad * draws[4] + errors.offset_rad * draws[5],
+        waves=arm.waves + sizes[:, None] * waves,
     )
 
 
@@ -189,7 +201,11 @@ def inverse(arm: Arm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
 
 def _link(arm: Arm, i: int, angle: FloatArray) -> FloatArray:
     """(m, 4, 4) `link_from_next` of joint i."""
-    cos_q, sin_q = np.cos(angle + arm.offset[i]), np.sin(angle + arm.offset[i])
+    phases = np.array(
+        [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
+    )
+    turned = angle + arm.offset[i] + arm.waves[:, i] @ phases
+    cos_q, sin_q = np.cos(turned), np.sin(turned)
     cos_a, sin_a = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
     matrices = np.zeros((angle.size, 4, 4))
     matrices[:, 0, 0], matrices[:, 0, 1] = cos_q, -sin_q * cos_a

@@ -19,11 +19,11 @@ from visioncal.simulation.arms import (
     ur_arm,
 )
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
-from visioncal.simulation.optics import project, sees
+from visioncal.simulation.optics import mistaken, project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
 from visioncal.transforms import compose, exp, invert
-from visioncal.types import Corners, FloatArray
+from visioncal.types import Camera, Corners, FloatArray
 
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
 _LEAST_DEXTERITY = 0.04
@@ -43,6 +43,7 @@ class Stream(IntEnum):
     IMAGES = 6
     BACKDROP = 7
     PAIRS = 8
+    LENS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,7 @@ class Cell:
         arm: The nominal arm.
         true_arm: The arm as it was built.
         sheet: The board as it was printed.
+        stated_camera: The intrinsics as the session states them.
         transforms: True edges, each (4, 4): `flange_from_cam` and `base_from_target`
             (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand).
         joints: (m, n) joint angles as reported [rad].
@@ -69,6 +71,7 @@ class Cell:
     arm: Arm
     true_arm: Arm
     sheet: Sheet
+    stated_camera: Camera
     transforms: Mapping[str, FloatArray]
     joints: FloatArray
     base_from_flange: FloatArray
@@ -93,7 +96,13 @@ def simulate(options: CellOptions) -> Cell:
             arm cannot reach enough poses from which the board is in the image.
     """
     arm = ur_arm(options.robot)
-    errors = ArmErrors(options.dh_sigma_m, options.dh_sigma_rad, options.offset_sigma_rad)
+    errors = ArmErrors(
+        options.dh_sigma_m,
+        options.dh_sigma_rad,
+        options.offset_sigma_rad,
+        options.eccentricity_sigma_rad,
+        options.ripple_sigma_rad,
+    )
     true_arm = disturb(arm, errors, stream(options, Stream.ARM))
     sheet = Sheet(options.target, options.board_scale, options.board_bow_m)
     transforms = _mountings(options, arm, sheet)
@@ -109,6 +118,9 @@ def simulate(options: CellOptions) -> Cell:
         arm=arm,
         true_arm=true_arm,
         sheet=sheet,
+        stated_camera=mistaken(
+            options.camera, options.lens_mismatch_px, stream(options, Stream.LENS)
+        ),
         transforms=transforms,
         joints=joints,
         base_from_flange=forward(arm, joints),
@@ -192,7 +204,10 @@ def _reachable_joints(
         views = draw_views(options, sheet, 4 * options.views, rng)
         if not len(views):
             continue
-        reach = inverse(arm, _flange(transforms, views), np.tile(home, (len(views), 1)))
+        starts = np.tile(home, (len(views), 1))
+        if options.branches:
+            starts = rng.uniform(-np.pi, np.pi, starts.shape)
+        reach = inverse(arm, _flange(transforms, views), starts)
         good = reach.solved & (reach.dexterity > _LEAST_DEXTERITY)
         good &= _lowest_m(arm, reach.joints) > floor
         kept.extend(reach.joints[good])

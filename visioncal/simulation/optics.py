@@ -4,6 +4,8 @@ Models: Brown (1971) with the rational radial term that OpenCV uses, and the equ
 polynomial of Kannala and Brandt (2006) in OpenCV's parametrisation. Pixel centres at integers.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -39,6 +41,36 @@ def fisheye_camera() -> Camera:
         matrix=np.array([563.0, 562.4, 642.2, 477.1]),
         distortion=np.array([-0.012, 0.004, -0.003, 0.0006]),
     )
+
+
+def mistaken(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
+    """A camera as a calibration that is a little off would state it.
+
+    Args:
+        camera: The true camera.
+        rms_px: By how much its pixels are elsewhere, as a root mean square over the image [px].
+        rng: Source of randomness.
+    """
+    if rms_px == 0.0:
+        return camera
+    # What moves pixels near the image's edge by about one each.
+    focal, count = float(camera.matrix[0]), len(camera.distortion)
+    draws = rng.standard_normal(4 + count)
+    matrix, bent = draws[:4], draws[4:] * (2.0 / focal)
+    middles = (np.arange(24) + 0.5) / 24
+    grid = np.meshgrid(*(middles * it - 0.5 for it in camera.resolution))
+    looks = rays(camera, np.stack(grid, axis=-1))
+
+    def off(share: float) -> Camera:
+        return replace(
+            camera,
+            matrix=camera.matrix + share * matrix,
+            distortion=camera.distortion + share * bent,
+        )
+
+    moved = project(off(1e-3), looks) - project(camera, looks)
+    unit = 1e3 * float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
+    return off(rms_px / unit)
 
 
 def project(camera: Camera, points_cam: FloatArray) -> FloatArray:

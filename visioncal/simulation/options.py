@@ -54,6 +54,8 @@ class CellOptions:
         roll_rad: Greatest turn about the optical axis, either way [rad].
         motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
             `translation` alone.
+        branches: Whether the arm takes its elbow, shoulder and wrist either way, from view to view;
+            else all postures are near one another, as an operator would teach them.
         cut_views: Share of the views in which the image's edge may cut a ChArUco board.
         pixel_sigma_px: Noise of the simulated detections `Cell.corners`, per axis [px].
         blur_px: Defocus of rendered images, as a Gaussian's sigma [px].
@@ -65,6 +67,11 @@ class CellOptions:
         dh_sigma_m: Departure of the real arm's lengths from the nominal ones [m].
         dh_sigma_rad: Departure of its angles, joint offsets included [rad].
         offset_sigma_rad: Departure of its joint offsets alone [rad].
+        eccentricity_sigma_rad: How far each joint turns with the sine and the cosine of its angle
+            beyond what its encoder says [rad].
+        ripple_sigma_rad: The same for the ripple of its gear, many times a turn [rad].
+        lens_mismatch_px: How far the stated intrinsics put pixels elsewhere, as a root mean square
+            over the image [px].
         wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
         board_scale: Printed size over stated size.
         board_bow_m: How far the board's corners are bent away from the camera [m].
@@ -82,6 +89,7 @@ class CellOptions:
     tilt_rad: tuple[float, float] = (0.1, 0.75)
     roll_rad: float = 1.3
     motion: Motion = "free"
+    branches: bool = False
     cut_views: float = 0.1
     pixel_sigma_px: float = 0.05
     blur_px: float = 0.7
@@ -93,6 +101,9 @@ class CellOptions:
     dh_sigma_m: float = 0.0
     dh_sigma_rad: float = 0.0
     offset_sigma_rad: float = 0.0
+    eccentricity_sigma_rad: float = 0.0
+    ripple_sigma_rad: float = 0.0
+    lens_mismatch_px: float = 0.0
     wrong_views: int = 0
     board_scale: float = 1.0
     board_bow_m: float = 0.0
@@ -127,6 +138,9 @@ def exact(options: CellOptions | None = None) -> CellOptions:
         dh_sigma_m=0.0,
         dh_sigma_rad=0.0,
         offset_sigma_rad=0.0,
+        eccentricity_sigma_rad=0.0,
+        ripple_sigma_rad=0.0,
+        lens_mismatch_px=0.0,
         wrong_views=0,
         board_scale=1.0,
         board_bow_m=0.0,

@@ -217,7 +217,7 @@ def _document(cell: Cell, name: str) -> dict[str, Any]:
 
 
 def _camera_table(cell: Cell) -> dict[str, Any]:
-    camera = cell.options.camera
+    camera = cell.stated_camera
     table: dict[str, Any] = {
         "name": "simulated",
         "resolution": list(camera.resolution),
