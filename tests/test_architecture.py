@@ -15,6 +15,7 @@ LAYERS = (
     ("version",),
     ("errors",),
     ("types",),
+    ("chance",),
     ("figures",),
     ("transforms",),
     ("files",),

@@ -9,11 +9,10 @@ from math import comb
 from typing import Generic
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.groups import GroupFit, GroupProblem, Groups, State, descended, fit_groups
-from visioncal.estimator.linalg import covariance, squared_lengths
+from visioncal.estimator.linalg import covariance, gram, squared_lengths
 from visioncal.types import FloatArray, IntArray, Mask
 
 # Noise leaves sound groups out in one set of a thousand.
@@ -112,7 +111,7 @@ def _limits(directions: IntArray, freedom: int, excluded: int) -> FloatArray:
     # Half of the false alarms go to the first group that is left out, a quarter to the second ...
     share = _FALSE_ALARM / 2.0**excluded / comb(len(directions), excluded)
     predicted = np.maximum(directions, 1)
-    limit = f_distribution.isf(share, predicted, max(freedom, 1))
+    limit = f_limit(share, predicted, max(freedom, 1))
     return np.where(directions > 0, limit, np.inf)
 
 
@@ -158,7 +157,7 @@ def _concentrated(
 
 def _distances(groups: Groups) -> FloatArray:
     """Squared distances (m,), comparable between groups of different size."""
-    typical = chi2.median(np.maximum(groups.observed.sum(axis=1), 1))
+    typical = chi2_limit(0.5, np.maximum(groups.observed.sum(axis=1), 1))
     return np.asarray(np.sum(groups.residuals**2, axis=1) / typical)
 
 
@@ -171,8 +170,8 @@ def _widened(problem: GroupProblem[State], core: Mask, state: State) -> GroupFit
     for _ in range(_ROUNDS):
         squares, directions = surprises(fit)
         there = np.maximum(directions, 1)
-        scale = max(float(np.median(squares / chi2.median(there))), 1.0)
-        agrees = (squares < chi2.ppf(0.999, there) * scale) | (directions < 1)
+        scale = max(float(np.median(squares / chi2_limit(0.5, there))), 1.0)
+        agrees = (squares < chi2_limit(0.001, there) * scale) | (directions < 1)
         if np.array_equal(agrees, fit.used) or agrees.sum() < core.sum():
             break
         fit = fit_groups(problem, agrees, fit.state)
@@ -236,7 +235,7 @@ def _left_without(fit: GroupFit[State], used: Mask) -> FloatArray:
     inside = fit.groups.subset(used)
     spread = inside.spread(fit.sigma)
     fitted = covariance(inside.information(fit.sigma))
-    pull = np.einsum("mij,mi->j", np.linalg.solve(spread, inside.jacobian), inside.residuals)
+    pull = gram(np.linalg.solve(spread, inside.jacobian), inside.residuals)
     residuals = inside.residuals - inside.jacobian @ (fitted @ pull)
     whole = np.einsum("mi,mi->", residuals, np.linalg.solve(spread, residuals[..., None])[..., 0])
     taken = inside.jacobian @ fitted @ np.swapaxes(inside.jacobian, 1, 2)
@@ -251,4 +250,4 @@ def _is_explained(fit: GroupFit[State], expected_sigma: float) -> bool:
         return True
     white = np.linalg.solve(inside.spread(expected_sigma), inside.residuals[..., None])[..., 0]
     misfit = float(np.sum(inside.residuals * white))
-    return misfit <= float(chi2.isf(_FALSE_ALARM, fit.freedom))
+    return misfit <= float(chi2_limit(_FALSE_ALARM, fit.freedom))

@@ -23,7 +23,7 @@ from visioncal.estimator.closure import (
     normal_equations,
     residual_blocks,
 )
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.linalg import covariance, gram
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
@@ -181,5 +181,5 @@ def misfit_covariance(data: Closure, edges: Edges, noise: Noise, errors: ArmErro
     moved = flange_to_residual(seen, edges) @ errors.basis
     weighted = np.linalg.solve(spread, moved)
     fitted = covariance(normal_equations(data, edges, noise)[0])
-    answer = errors.sigma * fitted @ np.einsum("mij,mik->jk", jacobian, weighted)
+    answer = fitted @ (errors.sigma * gram(jacobian, weighted))
     return np.asarray(answer @ answer.T)

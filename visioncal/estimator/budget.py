@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from visioncal.estimator.closure import Closure, Edges, Noise, closure_information, weighted_slopes
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.linalg import covariance, gram
 from visioncal.transforms import skew
 from visioncal.types import FloatArray, IntArray
 
@@ -34,10 +34,10 @@ def covariance_by_source(
     slopes, camera, robot = weighted_slopes(data, edges, noise)
     parts = {}
     if data.camera_covariance is None:
-        parts["poses"] = np.einsum("mij,mik,mkl->jl", slopes, robot, slopes)
+        parts["poses"] = gram(slopes, robot @ slopes)
     else:
-        parts["pixels"] = np.einsum("mij,mik,mkl->jl", slopes, camera, slopes)
-        parts["robot"] = np.einsum("mij,mik,mkl->jl", slopes, robot, slopes)
+        parts["pixels"] = gram(slopes, camera @ slopes)
+        parts["robot"] = gram(slopes, robot @ slopes)
     if data.shared is not None:
         owned = np.concatenate([*shared.values(), np.zeros(0, np.int64)])
         information = data.shared.information[np.ix_(owned, owned)]

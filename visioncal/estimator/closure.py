@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step
+from visioncal.estimator.linalg import covariance, damped_step, gram
 from visioncal.estimator.variance import (
     Components,
     Knowledge,
@@ -281,8 +281,8 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
     def linearise(at: Edges) -> Linearised[Edges]:
         residuals, jacobian = _residuals(data, at), closure_jacobian(data, at)
         weighted, known = weights @ jacobian, knowledge_of(data, at)
-        information = np.einsum("mij,mik->jk", jacobian, weighted) + known.information
-        gradient = np.einsum("mij,mi->j", weighted, residuals) + known.pull
+        information = gram(jacobian, weighted) + known.information
+        gradient = gram(weighted, residuals) + known.pull
         cost = np.einsum("mi,mij,mj->", residuals, weights, residuals)
         if data.shared is not None:
             cost += at.shared @ (data.shared.pull + known.pull[12:])
@@ -322,7 +322,7 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     information about directions that the motion leaves open.
     """
     slopes, camera, robot = weighted_slopes(data, edges, noise)
-    information = np.einsum("mij,mik,mkl->jl", slopes, camera + robot, slopes)
+    information = gram(slopes, (camera + robot) @ slopes)
     if data.shared is not None:
         information[12:, 12:] += data.shared.information
     return np.asarray(information)
@@ -350,8 +350,8 @@ def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatAr
     known = knowledge_of(data, edges)
     weighted = np.linalg.solve(spread, jacobian)
     return (
-        np.einsum("mij,mik->jk", jacobian, weighted) + known.information,
-        np.einsum("mij,mi->j", weighted, residuals) + known.pull,
+        gram(jacobian, weighted) + known.information,
+        gram(weighted, residuals) + known.pull,
     )
 
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.closure import (
     Closure,
@@ -107,12 +106,13 @@ def whole_units(data: Closure, stops: IntArray) -> IntArray:
         return stops
     away = log(invert(data.camera[first]) @ data.camera[second])
     if data.camera_covariance is None:
-        typical = np.median(np.sum(away.reshape(-1, 2, 3) ** 2, axis=2), axis=0) / chi2.median(3)
+        apart = np.median(np.sum(away.reshape(-1, 2, 3) ** 2, axis=2), axis=0)
+        typical = apart / chi2_limit(0.5, 3)
         spread = _UNEVEN**2 * np.diag(np.repeat(np.maximum(typical, LEAST_SIGMA**2), 3))[None]
     else:
         spread = data.camera_covariance[first] + data.camera_covariance[second]
     squared = np.einsum("pi,pi->p", away, np.linalg.solve(spread, away[:, :, None])[:, :, 0])
-    alike = squared < chi2.ppf(1.0 - _FALSE_ALARM / len(first), 6)
+    alike = squared < chi2_limit(_FALSE_ALARM / len(first), 6)
     pairs = (np.ones(alike.sum()), (first[alike], second[alike]))
     links = coo_array(pairs, shape=(len(data), len(data)))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
@@ -156,7 +156,7 @@ def _limit(data: Closure, agrees: Mask) -> float:
     in others, and nobody says how much.
     """
     freedom = max(3.0 * agrees.sum() - 6.0, 6.0)
-    limit = 6.0 * float(f_distribution.ppf(1.0 - _FALSE_ALARM / len(data), 6, freedom))
+    limit = 6.0 * float(f_limit(_FALSE_ALARM / len(data), 6, freedom))
     return limit if data.camera_covariance is not None else _UNEVEN**2 * limit
 
 
@@ -213,7 +213,7 @@ def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]
     The noise of the half that agrees best is less than that of all.
     """
     agrees, fit = core, fit_closure(data.subset(core), edges)
-    allowed, typical = chi2.ppf(0.999, 6), chi2.median(6)
+    allowed, typical = float(chi2_limit(0.001, 6)), float(chi2_limit(0.5, 6))
     for _ in range(_ROUNDS):
         surprise = surprises(data, agrees, fit)
         scale = max(float(np.median(surprise)) / typical, 1.0)

@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step, spectrum
+from visioncal.estimator.linalg import covariance, damped_step, gram, spectrum
 from visioncal.estimator.variance import (
     LEAST_SIGMA,
     Components,
@@ -91,12 +91,12 @@ class Groups:
     def information(self, sigma: float) -> FloatArray:
         """Fisher information (p, p) on the unknowns at a level of noise [m]."""
         weighted = np.linalg.solve(self.spread(sigma), self.jacobian)
-        return np.asarray(np.einsum("mij,mik->jk", self.jacobian, weighted))
+        return gram(self.jacobian, weighted)
 
     @property
     def freedom(self) -> int:
         """How many more residuals were observed than directions of the unknowns determined."""
-        values = spectrum(np.einsum("mij,mik->jk", self.jacobian, self.jacobian)).values
+        values = spectrum(gram(self.jacobian, self.jacobian)).values
         return int(self.observed.sum() - np.sum(values > _OPEN_RATIO * values[-1]))
 
 
@@ -238,8 +238,8 @@ def descended(
     def linearise(at: State) -> Linearised[State]:
         groups = problem.linearise(at)
         weighted = weights @ groups.jacobian
-        information = np.einsum("mij,mik->jk", groups.jacobian, weighted)
-        gradient = np.einsum("mij,mi->j", weighted, groups.residuals)
+        information = gram(groups.jacobian, weighted)
+        gradient = gram(weighted, groups.residuals)
         cost = np.einsum("mi,mij,mj->", groups.residuals, weights, groups.residuals)
         return Linearised(
             at,

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from visioncal.chance import chi2_limit
 from visioncal.estimator.appearance import (
     SCALE,
     Appearance,
@@ -346,7 +346,7 @@ def contradicted_lens(problem: Problem, state: State) -> bool:
 
 def chance_limit(freedom: int) -> float:
     """What a squared error may fall by chance when so many more values are free (chi-square)."""
-    return float(chi2.ppf(1.0 - _FALSE_ALARM, freedom))
+    return float(chi2_limit(_FALSE_ALARM, freedom))
 
 
 def gain(problem: Problem, arm: Arm, state: State, moving: IntArray) -> float:

@@ -4,11 +4,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
 from visioncal.types import FloatArray, IntArray
+
+_Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
 # Share of the noise's variance under which a fit has taken all of it.
 _VANISHED = 1e-6
@@ -67,6 +71,15 @@ def covariance(information: FloatArray) -> FloatArray:
     floor = np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
     inverse = (vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.asarray(inverse * outer)
+
+
+def gram(left: _Floats, right: _Floats) -> FloatArray:
+    """Sums `left_i^T right_i` over blocks: (m, d, p) and (m, d, q), or (m, d), to (p, q) or (p,).
+
+    One product of tall matrices, which is many times faster than `einsum` over the blocks.
+    """
+    rows = left.reshape(-1, left.shape[-1])
+    return np.asarray(rows.T @ right.reshape(len(rows), *right.shape[2:]))
 
 
 def damped_step(

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from visioncal.chance import chi2_limit
 from visioncal.estimator.closure import (
     Closure,
     Edges,
@@ -13,7 +13,7 @@ from visioncal.estimator.closure import (
     normal_equations,
     residual_blocks,
 )
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.linalg import covariance, gram
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
 
@@ -79,7 +79,7 @@ def neighbours(data: Closure, edges: Edges, noise: Noise) -> Neighbours:
         scatter += 2.0 * float(np.trace(likely @ likely))
     freedom = 2.0 * expected**2 / scatter
     factor = seen / expected
-    return Neighbours(factor, factor > float(chi2.ppf(1.0 - _FALSE_ALARM, freedom)) / freedom)
+    return Neighbours(factor, factor > float(chi2_limit(_FALSE_ALARM, freedom)) / freedom)
 
 
 def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
@@ -100,14 +100,14 @@ def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
     moving = flange_to_residual(seen, edges) @ (adjoint(invert(flange)) * time)
     both = np.concatenate([jacobian, moving], axis=2)
     weighted = np.linalg.solve(spread, both)
-    information = np.einsum("mij,mik->jk", both, weighted)
+    information = gram(both, weighted)
     known = normal_equations(data, edges, noise)[0]
     size = len(known)
     information[:size, :size] = known
-    gradient = np.einsum("mij,mi->j", weighted, residuals)
+    gradient = gram(weighted, residuals)
     gradient[:size] = 0.0
     step = -covariance(information) @ gradient
-    if -gradient @ step < chi2.ppf(1.0 - _FALSE_ALARM, 6):
+    if -gradient @ step < chi2_limit(_FALSE_ALARM, 6):
         return None
     base = step[size:]
     target = edges.z if data.mount == "eye-in-hand" else (flange @ edges.z).mean(axis=0)

@@ -12,8 +12,8 @@ from math import perm
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import f_limit
 from visioncal.estimator.placing import LEAST_NOISE_M
 from visioncal.estimator.procrustes import align, apply, misfit
 from visioncal.types import FloatArray, IntArray
@@ -116,13 +116,13 @@ def find_numbering(
     # What noise that is known beforehand leaves in any order counts as no difference.
     floor = freedom * max(noise_m, LEAST_NOISE_M) ** 2
     ratio = (squares + floor) / (squares.min() + floor)
-    as_good = ratio < f_distribution.isf(_AS_GOOD, freedom, freedom)
+    as_good = ratio < f_limit(_AS_GOOD, freedom, freedom)
     moves = (orders != stated).sum(axis=1)
     best = int(np.lexsort((squares, moves, ~as_good))[0])
     at = int(np.flatnonzero(moves == 0)[0])
     # Corrected for the number of orders among which the best one was chosen.
     tried = min(perm(len(nominal), count), _MOST_TRIED)
-    limit = f_distribution.isf(_FALSE_ALARM / tried, freedom, freedom)
+    limit = f_limit(_FALSE_ALARM / tried, freedom, freedom)
     return Numbering(
         orders[best].astype(np.int64),
         float(np.sqrt(squares[best] / count)),

@@ -8,8 +8,8 @@ its rotation. Touches that do not agree are left out (see `agreement`) and named
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import f_limit
 from visioncal.errors import DataError
 from visioncal.estimator.agreement import Agreement, agreeing_groups
 from visioncal.estimator.closure import Noise
@@ -218,5 +218,5 @@ def _surprise_at(problem: TouchProblem, fit: GroupFit[Placed], at: int, point: i
     rows = groups.observed[at]
     residual, slope = groups.residuals[at][rows], groups.jacobian[at][rows]
     spread = groups.spread(fit.sigma)[at][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
-    limit = f_distribution.isf(_FALSE_ALARM, len(residual), max(fit.freedom, 1))
+    limit = f_limit(_FALSE_ALARM, len(residual), max(fit.freedom, 1))
     return float(residual @ np.linalg.solve(spread, residual) / (len(residual) * limit))

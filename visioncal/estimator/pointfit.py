@@ -8,8 +8,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as t_distribution
 
+from visioncal.chance import t_chance
 from visioncal.errors import DataError
 from visioncal.estimator.agreement import Agreement, agreeing_groups
 from visioncal.estimator.groups import GroupFit, Groups, fit_groups, small_sets
@@ -213,7 +213,7 @@ def _as_scaled(scaled: Agreement[Placed], fit: GroupFit[Placed]) -> Agreement[Pl
 
 def _scale_of(fit: GroupFit[Placed]) -> Scale:
     value, sigma = fit.state.scale, float(np.sqrt(fit.covariance[6, 6]))
-    chance = 2.0 * float(t_distribution.sf(abs(value - 1.0) / sigma, max(fit.freedom, 1)))
+    chance = t_chance((value - 1.0) / sigma, max(fit.freedom, 1))
     return Scale(value, sigma, chance < _FALSE_ALARM)
 
 

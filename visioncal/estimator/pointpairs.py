@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import f_limit
 from visioncal.conventions import UNITS_M
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimator.numbering import Numbering
@@ -178,7 +178,7 @@ def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[f
     return (
         float(misfit(measured, nominal)) + floor,
         float(misfit(measured, mirrored(nominal))) + floor,
-        float(f_distribution.isf(_FALSE_ALARM, freedom, freedom)),
+        float(f_limit(_FALSE_ALARM, freedom, freedom)),
     )
 
 

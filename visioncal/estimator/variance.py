@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.linalg import covariance, gram
 from visioncal.types import FloatArray, Mask
 
 # Standard deviations stay within these, in units of the residuals [rad and m].
@@ -165,8 +165,8 @@ def _likelihood(
     total = components.total(sigmas)
     weights = np.linalg.inv(total)
     weighted = weights @ jacobian
-    spread = covariance(np.einsum("mij,mik->jk", jacobian, weighted) + known.information)
-    pull = np.einsum("mij,mi->j", weighted, residuals) + known.pull
+    spread = covariance(gram(jacobian, weighted) + known.information)
+    pull = gram(weighted, residuals) + known.pull
     best = spread @ pull
     left = residuals - jacobian @ best
     pulled = (weights @ left[:, :, None])[:, :, 0]

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.linalg import covariance, squared_lengths
 from visioncal.frames.sight import Place
 from visioncal.transforms import exp, invert, log
@@ -21,7 +20,7 @@ from visioncal.types import FloatArray, IntArray, Mask
 # A sound image is lost in one set of a thousand.
 _FALSE_ALARM = 1e-3
 # Poses farther apart than 95 % of what noise does are two, and worth telling apart.
-_ANOTHER = float(chi2.ppf(0.95, 6))
+_ANOTHER = float(chi2_limit(0.05, 6))
 # The mean settles to the rounding of metres in a few steps: the places are near each other.
 _STEPS, _SETTLED = 10, 1e-12
 
@@ -54,7 +53,7 @@ class Sights:
         The noise's levels are estimated, which gives it the tails of an F distribution.
         """
         tail = _FALSE_ALARM / len(self.views)
-        return 6.0 * float(f_distribution.ppf(1.0 - tail, 6, min(self.freedom, 1e6)))
+        return 6.0 * float(f_limit(tail, 6, min(self.freedom, 1e6)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
+from visioncal.chance import f_limit
 from visioncal.types import FloatArray
 
 # A direction with less than this share of the largest variance is exact: the normal of a declared
@@ -90,7 +90,7 @@ class Located:
 def _quantile95(count: float, freedom: float) -> float:
     """Of the mean of so many squared errors, in units of a variance with that much freedom."""
     # Beyond, F cannot be told from chi-square, and its series lose digits.
-    return float(f_distribution.ppf(0.95, count, min(freedom, 1e6)))
+    return float(f_limit(0.05, count, min(freedom, 1e6)))
 
 
 def _length_mm(spread: FloatArray) -> float:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from visioncal.chance import chi2_limit
 from visioncal.errors import DataError
 from visioncal.estimator.appearance import (
     BOARD_NAMES,
@@ -185,7 +185,7 @@ def _noise(
     noise_px: float, squares: float, freedom: int, label: str
 ) -> tuple[float, tuple[str, ...]]:
     """The noise to count with: what is known, or what the corners show where that is more."""
-    limit = noise_px**2 * float(chi2.ppf(1.0 - _FALSE_ALARM, freedom))
+    limit = noise_px**2 * float(chi2_limit(_FALSE_ALARM, freedom))
     shown = float(np.sqrt(squares / freedom))
     # Rounding of exact corners is no scatter.
     if squares <= limit or shown < 1e-6:

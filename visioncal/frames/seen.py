@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.stats import chi2
 
 from visioncal.calibration import Calibration, Edge
+from visioncal.chance import chi2_limit
 from visioncal.frames.agree import Agreement, Sights, agreeing
 from visioncal.frames.chain import Eye
 from visioncal.frames.look import SeenTarget, see
@@ -186,7 +186,7 @@ def doubts(
             f"The images disagree, by up to {_distance(found, worst)}, and with {count} of them "
             "nothing tells which are right: take more."
         )
-    elif found.variance * 6 * (inside - 1) > chi2.ppf(1.0 - _FALSE_ALARM, 6 * (inside - 1)):
+    elif found.variance * 6 * (inside - 1) > chi2_limit(_FALSE_ALARM, 6 * (inside - 1)):
         yield (
             f"The images scatter {np.sqrt(found.variance):.2g} times as much as the calibration's "
             "noise lets them; the sigmas are that much larger."

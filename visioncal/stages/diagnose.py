@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from visioncal.chance import chi2_limit
 from visioncal.estimator.appearance import Free
 from visioncal.estimator.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
 from visioncal.estimator.budget import covariance_by_source, point_covariance
@@ -127,7 +127,7 @@ def _radius95(spread: FloatArray) -> float:
     if not third > 0.0:
         return 0.0
     freedom = second**3 / third**2
-    quantile = (chi2.ppf(0.95, freedom) - freedom) * np.sqrt(second / freedom) + first
+    quantile = (chi2_limit(0.05, freedom) - freedom) * np.sqrt(second / freedom) + first
     return float(np.sqrt(max(quantile, 0.0)))
 
 
