@@ -20,7 +20,8 @@ class ViewEvidence:
         view: The view's number.
         corners: The corners that were found, if any.
         predicted_px: (n, 2) where the calibrated chain puts these corners [px].
-        base_from_flange: (4, 4) as the controller reported it.
+        base_from_flange: (4, 4) as the controller reported it, or as the calibrated arm has it
+            where there is one.
         cam_from_target: (4, 4) as this view alone shows it.
     """
 

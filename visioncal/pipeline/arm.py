@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.workspace import observability, workspace_sigmas
 from visioncal.pipeline.known import Known
+from visioncal.pipeline.unseen import unseen_views
 from visioncal.robot import Robot
 from visioncal.robot.conversion import convert_table, parallel_axes, table_of
 from visioncal.robot.tables import DHTable, table_from_document
@@ -33,6 +34,7 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
     return document | {
         "robot": dict(model.robot.document),
         "parameters": list(_parameters(model.nominal, model.robot)),
+        **unseen_views(known, found),
         **_worth(known, found, model),
     }
 

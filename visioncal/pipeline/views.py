@@ -81,9 +81,10 @@ def _corners(known: Known, view: int) -> int | None:
 def _evidence(known: Known, view: int) -> ViewEvidence:
     poses, edges = known.poses.get(view), known.solved.edges
     corners = known.corners.get(view) if poses is None else poses.corners
-    base_from_flange = known.base_from_flange.get(view)
+    reported = known.base_from_flange.get(view)
+    base_from_flange = None if reported is None else known.flange_poses([view])[0]
     predicted = cam_from_target = None
-    if poses is not None and base_from_flange is not None:
+    if poses is not None and reported is not None:
         data = known.closure([view]).under(edges.shared)
         cam_from_target = data.camera[0]
         # Of several poses that were never chosen from, the corners' numbering is not known.

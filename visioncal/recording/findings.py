@@ -121,15 +121,20 @@ class Findings:
             DataError: One of them is not what this version writes.
         """
         return cls(
-            _read(calibration, "board", _board),
-            _read(calibration, "arm_errors", _arm),
-            _read(calibration, "uncertainty", _uncertainty),
+            read_stage(calibration, "board", _board),
+            read_stage(calibration, "arm_errors", _arm),
+            read_stage(calibration, "uncertainty", _uncertainty),
         )
 
 
-def _read(
+def read_stage(
     calibration: Calibration, name: str, read: Callable[[Mapping[str, Any]], _T]
 ) -> _T | None:
+    """Reads what one further stage found; None where it did not run.
+
+    Raises:
+        DataError: It is not what this version writes.
+    """
     document = calibration.stages.get(name)
     if document is None:
         return None

@@ -18,7 +18,18 @@ def decimals_for(sigma: float) -> int:
 
 def matched(value: float, sigma: float) -> str:
     """Writes a value with the decimals that its standard deviation supports."""
-    return _without_negative_zero(f"{value:.{decimals_for(sigma)}f}")
+    return fixed(value, decimals_for(sigma))
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Writes a value with so many decimals."""
+    return _without_negative_zero(f"{value:.{decimals}f}")
+
+
+def signed(value: float, decimals: int) -> str:
+    """Writes a change with its sign; what rounds to nothing has none."""
+    text = f"{value:+.{decimals}f}"
+    return text if text.strip("+-0.") else "0"
 
 
 def significant(value: float | None, digits: int = 2) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from visioncal.calibration import Calibration, ViewResult
@@ -13,7 +14,8 @@ from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence, magnification
 from visioncal.files import write_atomically
 from visioncal.recording.findings import Findings
-from visioncal.report import advice, content, plots, sources, tools, uncertainty
+from visioncal.recording.kinematics import Kinematics
+from visioncal.report import advice, arm, armplots, content, plots, sources, tools, uncertainty
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
@@ -66,6 +68,7 @@ def render(
         versions=content.dependency_versions(),
         **_words(calibration),
         **_uncertainty(calibration, session),
+        **_arm(calibration, evidence),
         **_plots(calibration, session, evidence),
         **_pictures(calibration, session, evidence),
     )
@@ -106,6 +109,21 @@ def _uncertainty(calibration: Calibration, session: Session | None) -> dict[str,
         "budget_plot": "" if known is None else sources.budget(known),
         "spectrum_plot": "" if known is None else sources.directions(known),
         "board_plot": "" if not (board and target) else sources.board_shape(board, target),
+    }
+
+
+def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str, object]:
+    found = Kinematics.of(calibration)
+    workspace = None if found is None else found.workspace
+    used = {it.view for it in calibration.views if it.used}
+    poses = [it.base_from_flange for it in evidence if it.view in used]
+    stops_m = np.reshape([it[:3, 3] for it in poses if it is not None], (-1, 3))
+    return {
+        "arm_card": None if found is None else arm.arm_card(found),
+        "unseen_plot": "" if found is None else armplots.before_and_after(found),
+        "side_plot": "" if workspace is None else armplots.side_map(workspace, stops_m),
+        "top_plot": "" if workspace is None else armplots.top_map(workspace, stops_m),
+        "has_stops": len(stops_m) > 0,
     }
 
 

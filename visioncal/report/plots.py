@@ -48,7 +48,7 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
             _residual_panel(axes, calibration.views, value_of, rms, outlying)
             axes.set_ylabel(label)
         rows[-1].set_xlabel("view")
-        return svg.inline(figure, "residuals")
+        return svg.inline(figure, "residuals", "Bars: residuals of each view")
 
 
 def _residual_panel(
@@ -101,7 +101,7 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
             spine.set_visible(True)
         axes.set_xlabel("image x [px]")
         axes.set_ylabel("image y [px]")
-        return svg.inline(figure, "coverage")
+        return svg.inline(figure, "coverage", "Corners of all used views over the image")
 
 
 def corner_errors(evidence: ViewEvidence) -> FloatArray:
@@ -137,7 +137,7 @@ def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f}\N{DEGREE SIGN}")
         if len(axes.lines) > 1:
             axes.legend(loc="lower left", bbox_to_anchor=(-0.32, -0.08))
-        return svg.inline(figure, "directions")
+        return svg.inline(figure, "directions", "Where the camera looked from")
 
 
 def _tilt(cam_from_target: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -172,4 +172,4 @@ def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence])
         axes.set_xlim(-reach, reach)
         axes.set_xlabel("rotation from the mean orientation [deg]")
         axes.set_ylabel("flange axis")
-        return svg.inline(figure, "rotations")
+        return svg.inline(figure, "rotations", "Rotations of the flange in the used views")

@@ -43,7 +43,7 @@ def budget(found: Uncertainty) -> Markup:
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("sigma of the point's place [mm]")
-        return svg.inline(figure, "budget")
+        return svg.inline(figure, "budget", "Bars: standard deviation by source")
 
 
 def directions(found: Uncertainty) -> Markup:
@@ -70,7 +70,11 @@ def directions(found: Uncertainty) -> Markup:
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.spines["left"].set_visible(False)
         axes.set_xlabel("sigma / largest accepted")
-        return svg.inline(figure, "spectrum")
+        return svg.inline(
+            figure,
+            "spectrum",
+            "Sigmas of the directions, and the limit",
+        )
 
 
 def board_shape(board: Board, target: Target) -> Markup:
@@ -99,4 +103,4 @@ def board_shape(board: Board, target: Target) -> Markup:
         axes.grid(visible=False)
         axes.set_xlabel("target x [mm]")
         axes.set_ylabel("target y [mm]")
-        return svg.inline(figure, "board")
+        return svg.inline(figure, "board", "Depth of the board over its plane")

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
@@ -61,12 +61,13 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def inline(figure: Figure, name: str) -> Markup:
+def inline(figure: Figure, name: str, words: str) -> Markup:
     """Renders a figure as an `<svg>` element for an HTML page.
 
     Args:
         figure: What to draw.
         name: Unique within the page; it keeps the identifiers of its figures apart.
+        words: What it shows, for those who do not see it.
 
     Returns:
         The element, scaling with its container.
@@ -80,7 +81,8 @@ def inline(figure: Figure, name: str) -> Markup:
     text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     text = re.sub(r"<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*" height="[^"]*"', r'\1 role="img"', text, count=1)
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*" height="[^"]*"', r"\1", text, count=1)
+    text = text.replace("<svg", f'<svg role="img" aria-label="{escape(words)}"', 1)
     text = text.replace("'DejaVu Sans'", "inherit")
     for stand_in, variable in _THEME.items():
         text = text.replace(stand_in, variable)

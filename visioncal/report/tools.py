@@ -118,7 +118,7 @@ def _plot(name: str, frame: Frame) -> Markup:
         axes.set_ylabel("off by [mm]")
         if upright:
             axes.tick_params(axis="x", rotation=90)
-        return svg.inline(figure, f"frame-{name}")
+        return svg.inline(figure, f"frame-{name}", f"Bars: what each observation of {name} is off")
 
 
 def _colour(observation: Observation) -> str:

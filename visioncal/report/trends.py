@@ -87,7 +87,7 @@ def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -
             grid[1, joint].set_xlabel(f"q{joint + 1} [deg]")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper right", ncols=3)
-        return svg.inline(figure, "trends")
+        return svg.inline(figure, "trends", "Residuals of the used views over each joint's angle")
 
 
 def _cloud(axes: Axes, joint_deg: FloatArray, values: FloatArray, reach: float) -> None:

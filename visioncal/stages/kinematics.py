@@ -50,12 +50,14 @@ class Kinematics:
         levels: All that were tried, the nominal arm first.
         errors: Its errors by block.
         was_asked: Whether the user named the level.
+        fits: The fits of the nominal arm and of that level.
     """
 
     level: str
     levels: tuple[Level, ...]
     errors: Mapping[str, ArmErrors]
     was_asked: bool
+    fits: tuple[LevelFit, LevelFit]
 
 
 def choose_level(
@@ -78,7 +80,8 @@ def choose_level(
     found = {name: fit for name, fit in fits.items() if fit is not None}
     levels = tuple(_level(name, fit) for name, fit in found.items())
     best = _best([it for it in levels if it.name in (NOMINAL, *ASKED[asked])])
-    return Kinematics(best.name, levels, found[best.name].errors, asked != "auto")
+    chosen = found[best.name]
+    return Kinematics(best.name, levels, chosen.errors, asked != "auto", (found[NOMINAL], chosen))
 
 
 def _best(levels: Sequence[Level]) -> Level:
