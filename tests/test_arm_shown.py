@@ -1,19 +1,25 @@
-"""The calibrated arm in the report."""
+"""The calibrated arm in the report and in the recording."""
 
 import re
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from arms import NOT_TOLD, WORTH, calibrated, stays_stated, with_holdout
+from drawn import column
 from pages import Page, section
+from rerun.chunk import RrdReader
 from samples import Sample, made_up
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, to_document
 from visioncal.errors import DataError
+from visioncal.recording import armtext, notes, paths, read_calibration, write_recording
 from visioncal.recording.kinematics import Kinematics
+from visioncal.recording.workspace import ArmPicture
 from visioncal.report.arm import arm_card
 from visioncal.report.page import render
+from visioncal.viewer import blueprint
 
 
 @pytest.fixture(scope="module")
@@ -155,3 +161,80 @@ def test_five_stops_have_no_least_one(sample):
     assert found is not None
     card = arm_card(found)
     assert (len(card.most_worth), card.least_worth) == (5, ())
+
+
+def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):
+    calibration = with_arm(sample, with_holdout())
+    path = tmp_path / "recording.rrd"
+    layout = blueprint(sample.session, calibration)
+    write_recording(path, sample.session, calibration, sample.evidence, layout)
+    read = read_calibration(path)
+    assert read is not None
+    assert to_document(read) == to_document(calibration)
+    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
+    wanted = (paths.ARM_NOTE, paths.WORKSPACE, paths.NOMINAL_ARM, paths.UNSEEN_MM)
+    for entity in wanted:
+        assert any(it.startswith(entity) for it in entities), entity
+    assert "Arm" in [tab.name for tab in layout.root_container.contents]
+    stated = column(path, f"{paths.UNSEEN_MM}/as_stated", "Scalars:scalars")
+    held = column(path, f"{paths.UNSEEN_MM}/as_stated_held_back", "Scalars:scalars")
+    assert (set(stated), set(held)) == ({0, 1, 2, 4, 5}, {7, 8})
+    assert held[8] == pytest.approx([1.0])
+
+
+def test_places_of_the_workspace_are_coloured_by_their_sigma(sample, tmp_path):
+    path = tmp_path / "recording.rrd"
+    document = calibrated()
+    write_recording(path, sample.session, with_arm(sample, document), sample.evidence, None)
+    entity = f"{paths.WORKSPACE}/sigma_of_a_tool_s_place"
+    places = column(path, entity, "Points3D:positions")[0]
+    given = [[it["x_m"], it["y_m"], it["z_m"]] for it in document["workspace_map"]]
+    # Single precision of places within 2 m.
+    np.testing.assert_allclose(places, given, atol=1e-6)
+    shades = column(path, entity, "Points3D:colors")[0] >> 16 & 255
+    greens = shades[np.argsort([it["sigma_mm"] for it in document["workspace_map"]])]
+    # From violet to yellow: the greens of the worst are the brightest.
+    assert greens[-5:].min() > greens[:20].max()
+    assert column(path, f"{paths.WORKSPACE}/legend", "Points3D:labels")[0][0].endswith(" mm")
+
+
+def test_the_arm_is_drawn_as_calibrated_and_the_stated_one_off_it(sample, tmp_path):
+    path = tmp_path / "recording.rrd"
+    calibration = with_arm(sample, calibrated())
+    write_recording(path, sample.session, calibration, sample.evidence, None)
+    q = sample.session.views[4].joints_rad
+    ours = calibration.calibrated_robot.link_frames(q)[:, :3, 3]
+    stated = calibration.robot.link_frames(q)[:, :3, 3]
+    drawn = column(path, f"{paths.ROBOT}/links", "Capsules3D:translations")[4]
+    np.testing.assert_allclose(drawn, [np.zeros(3), *ours[:-1]], atol=1e-6)
+    picture = ArmPicture.of(sample.session, calibration, 1.0)
+    assert picture is not None
+    assert picture.factor > 1
+    entities = {str(it.entity_path) for it in RrdReader(path).stream()}
+    (entity,) = (it for it in entities if it.startswith(paths.NOMINAL_ARM))
+    factor = int(re.findall(r"(\d+)x", entity)[0])
+    (strip,) = column(path, entity, "LineStrips3D:strips")[4]
+    expected = [np.zeros(3), *(ours + factor * (stated - ours))]
+    # Single precision; the sample's flange is the robot's own.
+    np.testing.assert_allclose(strip, expected, atol=1e-5)
+
+
+def test_the_note_names_what_is_sure_and_what_is_not_told(sample):
+    found = Kinematics.of(with_arm(sample, calibrated()))
+    assert found is not None
+    text = armtext.markdown(found)
+    assert "| **geometry of the links** | 36 | 0.073 |" in text
+    assert "| shoulder pan joint | a | 0 | 1.20 | **+1.20** |" in text
+    assert "| elbow joint | d |" in text
+    assert "29 of 30 directions" in text
+    assert notes.plain(NOT_TOLD) in text
+    assert "- view 5: 31 %" in text
+    assert not re.findall(r"(?<!\\)_", text)
+
+
+def test_a_stated_arm_has_no_tab_but_a_word(sample):
+    calibration = with_arm(sample, stays_stated())
+    layout = blueprint(sample.session, calibration)
+    assert "Arm" not in [tab.name for tab in layout.root_container.contents]
+    assert "No level was taken" in notes.figures_markdown(calibration)
+    assert ArmPicture.of(sample.session, calibration, 1.0) is None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn import column
 from findings import healthy, sick, with_findings
 from rerun.chunk import RrdReader
 from samples import TARGET, Sample, made_up
@@ -27,18 +28,6 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     write_recording(path, sample.session, sample.calibration, sample.evidence, None)
     return path
-
-
-def column(path: Path, entity: str, component: str) -> dict[int, np.ndarray]:
-    """Reads one component of one entity by the place of the view; static ones have the place 0."""
-    found: dict[int, np.ndarray] = {}
-    for chunk in RrdReader(path).stream().filter(content=entity):
-        batch = chunk.to_record_batch()
-        if component in batch.schema.names:
-            keys = range(1) if chunk.is_static else batch.column(paths.TIMELINE).to_pylist()
-            values = map(np.array, batch.column(component).to_pylist())
-            found |= dict(zip(keys, values, strict=True))
-    return found
 
 
 def test_the_figures_tell_what_a_sick_cell_suffers_from(sample: Sample) -> None:

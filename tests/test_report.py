@@ -18,9 +18,9 @@ from visioncal.errors import DataError
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import Run, run
 from visioncal.recording import write_recording
+from visioncal.recording.numbers import matched, significant
 from visioncal.report import write_report
 from visioncal.report.advice import listed, next_steps, suspects
-from visioncal.report.numbers import matched, significant
 from visioncal.report.page import render
 from visioncal.report.thumbnails import thumbnail
 from visioncal.report.trends import twist_of

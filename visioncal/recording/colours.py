@@ -12,6 +12,19 @@ PREDICTED = (80, 160, 255)
 RESIDUAL = (255, 70, 60)
 UNCERTAINTY = (190, 120, 255)
 
+# The arm as it was before it was calibrated.
+STATED = (190, 140, 60)
+# From the least to the largest sigma, evenly spaced, all of them bright on dark ground.
+SCALE = (
+    (105, 65, 255),
+    (150, 75, 240),
+    (190, 75, 210),
+    (230, 85, 150),
+    (250, 125, 95),
+    (253, 180, 60),
+    (245, 245, 80),
+)
+
 # Lines and words of the charts that viewers should not look at first.
 GRID = (128, 134, 146)
 WORDS = (140, 146, 158)

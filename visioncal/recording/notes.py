@@ -9,6 +9,7 @@ import rerun as rr
 from visioncal.calibration import Calibration, Edge, Rms, ViewResult
 from visioncal.recording import colours, paths
 from visioncal.recording.findings import SOURCES, Arm, Board, Findings, Uncertainty
+from visioncal.recording.kinematics import Kinematics
 from visioncal.transforms import pose_difference
 
 HEADLINES = {"good": "Good", "check": "Check before use", "bad": "Bad: do not use"}
@@ -142,7 +143,9 @@ def figures_markdown(calibration: Calibration) -> str:
     for name, value in calibration.noise.items():
         low_high = " to ".join(f"{it:.2g}" for it in intervals.get(name, ()))
         lines.append(f"| {_noise_label(name)} | {value:.2g} | {low_high} |")
-    return "\n".join([*lines, *_findings_lines(found)])
+    kinematics = Kinematics.of(calibration)
+    level = [] if kinematics is None else ["", "# Level of the arm", "", plain(kinematics.reason)]
+    return "\n".join([*lines, *_findings_lines(found), *level])
 
 
 def _findings_lines(found: Findings) -> Iterator[str]:

@@ -41,6 +41,13 @@ DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
 RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 
+# The calibrated arm.
+WORKSPACE = "/arm/workspace"
+NOMINAL_ARM = "/arm/as_stated"
+UNSEEN_MM = "/arm/unseen/position_mm"
+UNSEEN_DEG = "/arm/unseen/orientation_deg"
+ARM_NOTE = "/notes/arm"
+
 # Plots and text.
 RESIDUALS = "/residuals"
 POSITION_MM = f"{RESIDUALS}/position_mm"
@@ -64,6 +71,11 @@ def entity_of(frame: str) -> str:
 def magnified_residuals(factor: int) -> str:
     """The entity of residuals that are drawn `factor` times longer than they are."""
     return f"{IMAGE}/residuals_magnified_{factor}x"
+
+
+def magnified_arm(factor: int) -> str:
+    """The entity of the arm as stated, drawn `factor` times farther off than it is."""
+    return f"{NOMINAL_ARM}/off_magnified_{factor}x"
 
 
 def over_joint(joint: int) -> str:

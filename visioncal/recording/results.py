@@ -20,7 +20,7 @@ from visioncal.calibration import Calibration, to_document
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import sha256
-from visioncal.recording import notes, overlays, paths, tools
+from visioncal.recording import armtext, notes, overlays, paths, tools
 from visioncal.recording.frames import Frame, append, read_payload, scan
 from visioncal.recording.messages import recording_id
 from visioncal.recording.reader import chunks, read_session
@@ -153,6 +153,7 @@ def _draw(
     if calibration is not None:
         notes.log_static(stream, calibration)
         tools.log_static(stream, calibration)
+        armtext.log_static(stream, calibration)
     results = {} if calibration is None else {it.view: it for it in calibration.views}
     ends = {} if calibration is None else notes.scales(calibration)
     for row, view in enumerate(session.views):

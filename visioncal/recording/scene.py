@@ -13,6 +13,7 @@ from visioncal.recording import board, colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.charts import Charts
 from visioncal.recording.uncertainty import Uncertainty
+from visioncal.recording.workspace import ArmPicture
 from visioncal.session import Session, View
 from visioncal.types import Camera, FloatArray
 
@@ -33,6 +34,7 @@ class Scene:
         size_m: Typical distance of the flange from the base [m].
         uncertainty: What is drawn of the result's uncertainty.
         charts: The charts over all views.
+        arm: What is drawn of a calibrated arm.
     """
 
     session: Session
@@ -41,6 +43,7 @@ class Scene:
     size_m: float
     uncertainty: Uncertainty | None
     charts: Charts | None
+    arm: ArmPicture | None
 
     @classmethod
     def of(
@@ -61,7 +64,7 @@ class Scene:
         distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
         size_m = float(np.median(distances)) if distances else 1.0
         if calibration is None:
-            return cls(session, None, poses, size_m, None, None)
+            return cls(session, None, poses, size_m, None, None, None)
         return cls(
             session,
             calibration,
@@ -69,6 +72,7 @@ class Scene:
             size_m,
             Uncertainty.of(calibration, evidence, size_m),
             Charts.of(session, calibration, evidence),
+            ArmPicture.of(session, calibration, size_m),
         )
 
     def log_static(self, stream: rr.RecordingStream) -> None:
@@ -103,6 +107,8 @@ class Scene:
             self.uncertainty.log_static(stream)
         if self.charts is not None:
             self.charts.log_static(stream)
+        if self.arm is not None:
+            self.arm.log_static(stream)
 
     def log_view(self, stream: rr.RecordingStream, view: View, seen: ViewEvidence) -> None:
         """Logs where everything is in one view, at the stream's current time."""
@@ -120,6 +126,8 @@ class Scene:
             self.uncertainty.log_view(stream, view.number)
         if self.charts is not None:
             self.charts.log_view(stream, view.number)
+        if self.arm is not None:
+            self.arm.log_view(stream, view.number)
 
     def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
         """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""
@@ -217,7 +225,7 @@ class Scene:
 
     def _log_arm(self, stream: rr.RecordingStream, view: View) -> None:
         """Draws the robot, or only a line to its flange where its joints are not known."""
-        robot = None if self.calibration is None else self.calibration.robot
+        robot = None if self.calibration is None else self.calibration.calibrated_robot
         q, base_from_flange = view.joints_rad, self.base_from_flange.get(view.number)
         if robot is not None and q is not None and len(q) == robot.joint_count:
             log_arm(stream, robot.link_frames(q))

@@ -55,7 +55,7 @@ class Uncertainty:
         edges = {name: it for name, it in calibration.placed.items() if it.covariance.any()}
         sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
-        factor = _round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
+        factor = round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
         return cls(edges, scatter_m, used, factor, size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
@@ -171,7 +171,7 @@ def _placed(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
     return np.asarray(invert(seen.base_from_flange) @ base_from_cam @ seen.cam_from_target)
 
 
-def _round_factor(wanted_m: float, size_m: float) -> int:
+def round_factor(wanted_m: float, size_m: float) -> int:
     """The largest of 1, 2, 5, 10, 20 ... by which a size stays under the wanted one."""
     if not size_m > 0.0:
         return 1

@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 
 from visioncal.estimator.arm import SIGNIFICANT
-from visioncal.recording.kinematics import NOMINAL, Kinematics, Level, Parameter, joint_words
-from visioncal.report.content import PLUS_MINUS, Fact
-from visioncal.report.numbers import decimals_for, fixed, signed, significant
+from visioncal.recording.armtext import ParameterRow, parameter_row
+from visioncal.recording.kinematics import NOMINAL, Kinematics, Level, joint_words
+from visioncal.recording.numbers import significant
+from visioncal.report.content import Fact
 
 _COLUMNS = 2
 _MOST_WORTH = 5
-# Without a sigma: about a hundredth of what an arm repeats to.
-_DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
 _CONVENTIONS = {
     "standard": "Denavit and Hartenberg's form, each joint's link behind it",
     "modified": "Craig's modified form, each joint's link before it",
@@ -37,19 +36,6 @@ class LevelRow:
     held_out_mm: str
     held_out_deg: str
     likelihood_ratio: str
-
-
-@dataclass(frozen=True)
-class ParameterRow:
-    """A number of the arm's model, as text; `sure` where its change is beyond chance."""
-
-    symbol: str
-    unit: str
-    nominal: str
-    identified: str
-    change: str
-    sigma: str
-    sure: bool
 
 
 @dataclass(frozen=True)
@@ -144,25 +130,11 @@ def _columns(
 ) -> tuple[tuple[tuple[str, tuple[ParameterRow, ...]], ...], ...]:
     """Joints with their parameters, half of them in each column."""
     joints = [
-        (joint_words(name), tuple(_parameter(it) for it in them))
+        (joint_words(name), tuple(parameter_row(it) for it in them))
         for name, them in found.grouped().items()
     ]
     height = max(-(-len(joints) // _COLUMNS), 1)
     return tuple(tuple(joints[start : start + height]) for start in range(0, len(joints), height))
-
-
-def _parameter(it: Parameter) -> ParameterRow:
-    decimals = decimals_for(it.sigma) if it.sigma else _DECIMALS.get(it.unit, 5)
-    return ParameterRow(
-        it.symbol,
-        it.unit,
-        # As stated, whatever is known of it now.
-        f"{it.nominal + 0.0:.7g}",
-        fixed(it.identified, decimals),
-        signed(it.change, decimals),
-        f"{PLUS_MINUS} {significant(it.sigma)}" if it.sigma else "",
-        it.is_sure,
-    )
 
 
 def _told(found: Kinematics) -> tuple[Fact, ...]:

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from visioncal.recording.kinematics import Kinematics, Unseen, WorkspaceMap
+from visioncal.recording.numbers import significant
 from visioncal.report import svg
-from visioncal.report.numbers import significant
 from visioncal.types import FloatArray
 
 _WIDE_IN, _MAP_IN = 9.2, 5.0

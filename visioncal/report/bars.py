@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from visioncal.recording.numbers import significant
 from visioncal.report import svg
-from visioncal.report.numbers import significant
 
 _ROOM = 1.25
 

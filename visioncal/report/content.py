@@ -10,8 +10,8 @@ import numpy as np
 from visioncal.calibration import Calibration, Edge, Rms, SolverResult, Verdict, ViewResult
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
+from visioncal.recording.numbers import decimals_for, matched, significant
 from visioncal.report.advice import Suspects, contradicts, outlying_views
-from visioncal.report.numbers import decimals_for, matched, significant
 from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray
 

@@ -6,8 +6,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from matplotlib.tri import Triangulation, UniformTriRefiner
 
 from visioncal.recording.findings import SOURCES, Board, Uncertainty
+from visioncal.recording.numbers import significant
 from visioncal.report import svg
-from visioncal.report.numbers import significant
 from visioncal.types import Target
 
 _WIDTH_IN = 5.0

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from visioncal.calibration import Calibration, Frame, Observation
+from visioncal.recording.numbers import significant
 from visioncal.recording.tools import details
 from visioncal.report import bars, svg
 from visioncal.report.bars import Bar
 from visioncal.report.content import EdgeCard, Fact, edge_card, headline, readable_time
-from visioncal.report.numbers import significant
 
 _WIDTH_IN, _HEIGHT_IN = 5.0, 1.7
 _COLUMNS = 3

@@ -2,8 +2,8 @@
 
 from visioncal.calibration import Calibration
 from visioncal.recording.findings import Arm, Board, Uncertainty
+from visioncal.recording.numbers import decimals_for, matched, significant
 from visioncal.report.content import PLUS_MINUS, Fact, answering_solver, frame_words
-from visioncal.report.numbers import decimals_for, matched, significant
 from visioncal.types import Target
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}

@@ -9,10 +9,14 @@ import rerun.blueprint as rrb
 from visioncal.calibration import Calibration
 from visioncal.recording import paths
 from visioncal.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
+from visioncal.recording.kinematics import Kinematics
 from visioncal.session import Session
+from visioncal.types import FloatArray
 
 # Distance of the eye from the cell's centre, in extents of all that the cell holds.
 _EYE_DISTANCE = 0.8
+# And in extents of the workspace, whose corners are empty.
+_MAP_DISTANCE = 0.55
 
 
 @dataclass(frozen=True)
@@ -28,8 +32,8 @@ class _Contents:
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
     """Lays out a recording of a session and its result.
 
-    The first tab shows the verdict, the cell and the image; others the residuals, what the views
-    cover, and the solvers.
+    The first tab shows the verdict, the cell and the image; others the calibrated arm, the
+    residuals, what the views cover, and the solvers.
 
     Args:
         session: The session; what it does not have gets no room.
@@ -46,8 +50,11 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         not all(view.used for view in results),
         calibration is not None and bool(calibration.frames),
     )
+    eye = _eye(session, calibration)
+    arm = None if calibration is None else Kinematics.of(calibration)
     tabs = rrb.Tabs(
-        _overview(contents, _eye(session, calibration)),
+        _overview(contents, eye),
+        *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
         _residuals(contents),
         _coverage(contents),
         rrb.Horizontal(
@@ -90,6 +97,48 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
     )
     right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
+    """What the calibrated arm is worth, how views left out speak for it, and its parameters."""
+    # The places are all around the base, farther out than the views.
+    wider = eye if found.workspace is None else _eye_on(found.workspace.places_m, _MAP_DISTANCE)
+    cell = rrb.Spatial3DView(
+        name="Sigma of a tool's place over the workspace",
+        origin="/",
+        contents=[
+            f"+ {paths.BASE}/**",
+            f"+ {paths.ROBOT}/**",
+            f"+ {paths.STOPS}/{paths.USED}",
+            f"+ {paths.WORKSPACE}/**",
+            f"+ {paths.NOMINAL_ARM}/**",
+        ],
+        eye_controls=wider,
+        spatial_information=rrb.SpatialInformation(
+            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        ),
+    )
+    note = rrb.TextDocumentView(name="The arm", origin=paths.ARM_NOTE)
+    if not found.left_out:
+        return rrb.Horizontal(cell, note, name="Arm", column_shares=[1.4, 1])
+    # What else there is to say stands in the note; a title has little room.
+    words = "orange: as stated, blue: calibrated"
+    unseen = rrb.Horizontal(
+        *(
+            rrb.TimeSeriesView(
+                name=name,
+                origin=entity,
+                contents=["$origin/**"],
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for name, entity in (
+                (f"Left out [mm], {words}", paths.UNSEEN_MM),
+                (f"Left out [deg], {words}", paths.UNSEEN_DEG),
+            )
+        )
+    )
+    left = rrb.Vertical(cell, unseen, row_shares=[2.4, 1])
+    return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
 
 
 def _verdict(contents: _Contents) -> rrb.Container | rrb.View:
@@ -161,15 +210,17 @@ def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D
         return None
     edges = {} if calibration is None else calibration.transforms
     fixed = [edge.translation for name, edge in edges.items() if name.startswith("base_from_")]
-    places = np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed])
+    return _eye_on(np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed]))
+
+
+def _eye_on(places: FloatArray, distance: float = _EYE_DISTANCE) -> rrb.EyeControls3D:
+    """Looks at (k, 3) places from where all of them fill the view [m]."""
     low, high = places.min(axis=0), places.max(axis=0)
     centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))
     forward = centre[:2] / max(float(np.linalg.norm(centre[:2])), 1e-9)
     # From the robot's right and its front, above the table.
     direction = np.array([forward[1] + 0.6 * forward[0], 0.6 * forward[1] - forward[0], 0.6])
-    return rrb.EyeControls3D(
-        position=centre + _EYE_DISTANCE * size_m * direction, look_target=centre
-    )
+    return rrb.EyeControls3D(position=centre + distance * size_m * direction, look_target=centre)
 
 
 def _cell_contents(contents: _Contents) -> list[str]:

@@ -1,4 +1,4 @@
-"""How the report writes numbers: as many digits as the uncertainty supports, never more."""
+"""How report and recording write numbers: with the digits that the uncertainty supports."""
 
 import math
 
