@@ -33,6 +33,7 @@ from visioncal.recording import (
     tools,
     write_recording,
 )
+from visioncal.recording.details import details
 from visioncal.recording.uncertainty import SIGMAS_95
 from visioncal.report.advice import next_steps
 from visioncal.report.page import render
@@ -242,3 +243,30 @@ def test_the_notes_tell_of_frames(sample):
     assert "- flange_from_tool: Check before use, see Tools and fixtures." in verdict
     assert "- base_from_fixture" not in verdict
     assert "| flange_from_tool | 33.80, 1.00, 176.80 | 0.000, 22.918, 5.730 |" in verdict
+
+
+def test_details_are_in_words_and_their_points_by_name():
+    found = details(
+        {
+            "noise_95_mm": [0.08, 0.134],
+            "worst": {"offset": "its offset along x", "offset_sigma_mm": 0.052},
+            "points_m": {"corner_m": [0.1, 0.2, 0.3]},
+            "seen_in": {"17": 4},
+            "scale": {"value": 1.0002, "sigma": 1e-4},
+            "coplanar": True,
+            "spare_points": ["C", "D"],
+            "bound": {"tip_mm": 0.052},
+        }
+    )
+    assert list(found) == [
+        ("noise, 95 %", "0.08 to 0.134", "mm"),
+        ("least known offset", "its offset along x", ""),
+        ("its sigma", "0.052", "mm"),
+        ("place of corner_m", "0.1, 0.2, 0.3", "m"),
+        ("images that show 17", "4", ""),
+        ("scale of the drawing", "1.0002", ""),
+        ("its sigma", "0.0001", ""),
+        ("all points in one plane", "yes", ""),
+        ("drawn points that were not measured", "C, D", ""),
+        ("bound: tip", "0.052", "mm"),
+    ]

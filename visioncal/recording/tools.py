@@ -1,15 +1,13 @@
 """Tools and fixtures, as text: their poses, whether to trust them, and why not."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import rerun as rr
 
 from visioncal.calibration import Calibration, Frame, Observation
 from visioncal.recording import paths
+from visioncal.recording.details import details
 from visioncal.recording.notes import HEADLINES, edge_line, plain
-
-_UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_percent": "%"}
 
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
@@ -57,33 +55,3 @@ def _observations(observations: Sequence[Observation]) -> Iterator[str]:
         used = "yes" if it.used else "**no**"
         yield f"| {plain(it.name)} | {plain(it.kind)} | {away} | {used} |"
     yield ""
-
-
-def details(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Writes the further figures of a method as (label, value, unit).
-
-    Matrices and lists of objects are left out: they are for programs, which find them on disk.
-    """
-    for name, value in document.items():
-        if isinstance(value, Mapping):
-            for label, text, unit in details(value):
-                yield f"{name.replace('_', ' ')}: {label}", text, unit
-            continue
-        suffix = next((it for it in _UNITS if name.endswith(it)), "")
-        text = _text(value)
-        if text:
-            label = name.removesuffix(suffix).replace("_", " ")
-            yield label, text, _UNITS.get(suffix, "")
-
-
-def _text(value: object) -> str:
-    """Writes a detail; empty for what is not for people."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int | float):
-        return f"{value:.4g}"
-    if isinstance(value, str):
-        return value
-    if isinstance(value, Sequence) and all(isinstance(it, int | float | str) for it in value):
-        return ", ".join(_text(it) for it in value)
-    return ""

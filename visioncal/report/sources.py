@@ -39,7 +39,7 @@ def budget(found: Uncertainty) -> Markup:
         axes.set_yticks(range(len(names)), [SOURCES.get(it, it) for it in names])
         axes.set_ylim(len(names) - 0.5, -0.5)
         # Room for the labels beside the longest bar.
-        axes.set_xlim(0.0, 1.4 * top)
+        axes.set_xlim(0.0, 1.55 * top)
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("sigma of the point's place [mm]")

@@ -1,0 +1,83 @@
+"""Further figures of a tool's or a fixture's method, in words."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+_UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_percent": "%"}
+# What keys mean, by their path; {} is the name of a point. Others are shown as they are written.
+_LABELS = {
+    "noise_95_mm": "noise, 95 %",
+    "turn_deg": "largest turn between touches",
+    "points_m": "place of {}",
+    "points_sigma_mm": "sigma of {}",
+    "worst.offset": "least known offset",
+    "worst.offset_sigma_mm": "its sigma",
+    "worst.rotation": "least known rotation",
+    "worst.rotation_sigma_deg": "its sigma",
+    "tool.name": "tool",
+    "tool.sigma_mm": "sigma of its tip",
+    "point_target_mm": "point on the target",
+    "rms_deg": "orientation residual, rms",
+    "scatter_over_expected": "scatter over what is expected",
+    "sigma_by_images_mm": "sigma, from image to image",
+    "sigma_in_common_mm": "sigma, the same in all images",
+    "camera_calibrated": "camera calibrated",
+    "dictionary": "marker dictionary",
+    "marker_mm": "side of a marker",
+    "seen_in": "images that show {}",
+    "scale.value": "scale of the drawing",
+    "scale.sigma": "its sigma",
+    "coplanar": "all points in one plane",
+    "equal_orders": "orders that fit equally well",
+    "spare_points": "drawn points that were not measured",
+}
+_RANGES = {"noise_95_mm"}
+# Ratios near one: what counts are their last digits.
+_RATIOS = {"scale.value"}
+
+
+def details(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Writes the further figures of a method as (label, value, unit).
+
+    Matrices and lists of objects are left out: they are for programs, which find them on disk.
+    """
+    yield from _details(document, "")
+
+
+def _details(document: Mapping[str, Any], parent: str) -> Iterator[tuple[str, str, str]]:
+    for name, value in document.items():
+        path = f"{parent}.{name}" if parent else name
+        if isinstance(value, Mapping):
+            yield from _details(value, path)
+            continue
+        text = f"{value:.6g}" if path in _RATIOS else _text(value, path in _RANGES)
+        if text:
+            # The keys of points are their names, and their unit is that of all of them.
+            suffix = _suffix(parent if parent in _LABELS else name)
+            yield _label(parent, name), text, _UNITS.get(suffix, "")
+
+
+def _suffix(key: str) -> str:
+    return next((it for it in _UNITS if key.endswith(it)), "")
+
+
+def _label(parent: str, name: str) -> str:
+    path = f"{parent}.{name}" if parent else name
+    if path in _LABELS:
+        return _LABELS[path]
+    if parent in _LABELS:
+        return _LABELS[parent].format(name)
+    return ": ".join(key.removesuffix(_suffix(key)).replace("_", " ") for key in path.split("."))
+
+
+def _text(value: object, is_range: bool = False) -> str:
+    """Writes a detail; empty for what is not for people."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | float):
+        return f"{value:.4g}"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Sequence) and all(isinstance(it, int | float | str) for it in value):
+        return (" to " if is_range else ", ").join(_text(it) for it in value)
+    return ""
