@@ -259,10 +259,10 @@ def test_details_are_in_words_and_their_points_by_name():
         }
     )
     assert list(found) == [
-        ("noise, 95 %", "0.08 to 0.134", "mm"),
+        ("noise, 95 %", "0.08 to 0.13", "mm"),
         ("least known offset", "its offset along x", ""),
         ("its sigma", "0.052", "mm"),
-        ("place of corner_m", "0.1, 0.2, 0.3", "m"),
+        ("corner_m, in the base", "0.1, 0.2, 0.3", "m"),
         ("images that show 17", "4", ""),
         ("scale of the drawing", "1.0002", ""),
         ("its sigma", "0.0001", ""),

@@ -8,8 +8,8 @@ _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_p
 _LABELS = {
     "noise_95_mm": "noise, 95 %",
     "turn_deg": "largest turn between touches",
-    "points_m": "place of {}",
-    "points_sigma_mm": "sigma of {}",
+    "points_m": "{}, in the base",
+    "points_sigma_mm": "{}, sigma",
     "worst.offset": "least known offset",
     "worst.offset_sigma_mm": "its sigma",
     "worst.rotation": "least known rotation",
@@ -50,7 +50,7 @@ def _details(document: Mapping[str, Any], parent: str) -> Iterator[tuple[str, st
         if isinstance(value, Mapping):
             yield from _details(value, path)
             continue
-        text = f"{value:.6g}" if path in _RATIOS else _text(value, path in _RANGES)
+        text = _text(value, _digits(path), " to " if path in _RANGES else ", ")
         if text:
             # The keys of points are their names, and their unit is that of all of them.
             suffix = _suffix(parent if parent in _LABELS else name)
@@ -70,14 +70,20 @@ def _label(parent: str, name: str) -> str:
     return ": ".join(key.removesuffix(_suffix(key)).replace("_", " ") for key in path.split("."))
 
 
-def _text(value: object, is_range: bool = False) -> str:
+def _digits(path: str) -> int:
+    if path in _RATIOS:
+        return 6
+    return 2 if path in _RANGES or "sigma" in path else 4
+
+
+def _text(value: object, digits: int, between: str) -> str:
     """Writes a detail; empty for what is not for people."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
-        return f"{value:.4g}"
+        return f"{value:.{digits}g}"
     if isinstance(value, str):
         return value
     if isinstance(value, Sequence) and all(isinstance(it, int | float | str) for it in value):
-        return (" to " if is_range else ", ").join(_text(it) for it in value)
+        return between.join(_text(it, digits, between) for it in value)
     return ""

@@ -140,7 +140,8 @@ def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str
 
 def _when_good(calibration: Calibration) -> Iterator[str]:
     wanted = next(iter(calibration.edges))
-    yield f"Use {wanted} as it stands in calibration.json, with its covariance."
+    arm = ", and the poses of the calibrated arm" if calibration.arm_is_calibrated else ""
+    yield f"Use {wanted} as it stands in calibration.json, with its covariance{arm}."
     yield (
         "Keep calibration.json: visioncal diff tells a later calibration's change from noise, and "
         "a moved camera from a moved board."

@@ -10,7 +10,8 @@ import numpy as np
 from visioncal.calibration import Calibration, Edge, Rms, SolverResult, Verdict, ViewResult
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
-from visioncal.recording.numbers import decimals_for, matched, significant
+from visioncal.recording.kinematics import Kinematics
+from visioncal.recording.numbers import decimals_for, fixed, matched, significant
 from visioncal.report.advice import Suspects, contradicts, outlying_views
 from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray
@@ -154,7 +155,7 @@ def _rotation_facts(edge: Edge) -> list[Fact]:
     rotvec_deg = ", ".join(
         matched(value, sigma_axis_deg) for value in rotation.as_rotvec(degrees=True)
     )
-    quaternion = ", ".join(f"{value:.{decimals}f}" for value in rotation.as_quat())
+    quaternion = ", ".join(fixed(value, decimals) for value in rotation.as_quat())
     return [
         Fact("rotation vector", f"[{rotvec_deg}]", "deg"),
         Fact("quaternion x, y, z, w", f"[{quaternion}]"),
@@ -242,6 +243,10 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     ]
     if calibration.rms.px is not None:
         facts.insert(3, Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
+    arm = Kinematics.of(calibration)
+    if arm is not None and arm.workspace_mm is not None:
+        sigma = f"{significant(arm.workspace_mm[0])} mm"
+        facts.insert(2, Fact("all over the workspace, sigma", sigma))
     return tuple(facts)
 
 
