@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arms import NOT_TOLD, WORTH, calibrated, stays_stated, with_holdout
+from arm_documents import NOT_TOLD, WORTH, calibrated, stays_stated, with_holdout
 from drawn import column
 from pages import Page, section
 from rerun.chunk import RrdReader

@@ -16,7 +16,7 @@ _CONVENTIONS = {
     "hayati": "Hayati's form, which has no leap where axes are parallel",
 }
 _INDICES = (
-    ("o1", "O1", "geometric mean of the singular values (Borm and Menq 1989)"),
+    ("o1", "O1", "geometric mean, over the root of the number of stops (Borm and Menq 1991)"),
     ("o2", "O2", "smallest over largest (Driels and Pathre 1990)"),
     ("o3", "O3", "smallest (Nahvi, Hollerbach and Hayward 1994)"),
     ("o4", "O4", "square of the smallest over the largest (Nahvi and Hollerbach 1996)"),
