@@ -87,11 +87,12 @@ def _dumbbells(axes: Axes, places: FloatArray, values: FloatArray) -> None:
 
 def _mark_rms(axes: Axes, values: FloatArray) -> None:
     """Writes the root mean squares of (m, 2) residuals beside the panel."""
-    for rms, colour in zip(np.sqrt(np.mean(values**2, axis=0)), (_BEFORE, _AFTER), strict=True):
+    # Apart from each other where both are alike.
+    marks = ((_BEFORE, "bottom"), (_AFTER, "top"))
+    for rms, (colour, side) in zip(np.sqrt(np.mean(values**2, axis=0)), marks, strict=True):
         axes.annotate(
             f"rms {significant(float(rms))}", (1.0, max(float(rms), _LEAST)), (6, 0), fontsize=8,
-            va="center", xycoords=("axes fraction", "data"), textcoords="offset points",
-            color=colour,
+            va=side, xycoords=("axes fraction", "data"), textcoords="offset points", color=colour,
         )  # fmt: skip
 
 
