@@ -31,6 +31,7 @@ LAYERS = (
     ("session",),
     ("evidence",),
     ("calibration",),
+    ("compensation",),
     ("compare",),
     ("recording",),
     ("simulation",),

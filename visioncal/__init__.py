@@ -17,6 +17,7 @@ from visioncal.version import __version__
 
 if TYPE_CHECKING:
     from visioncal.calibration import Calibration
+    from visioncal.compensation import Corrected, correct
     from visioncal.errors import (
         ConvergenceError,
         DataError,
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Calibration": "visioncal.calibration",
+    "Corrected": "visioncal.compensation",
+    "correct": "visioncal.compensation",
     "ConvergenceError": "visioncal.errors",
     "DataError": "visioncal.errors",
     "DegenerateError": "visioncal.errors",
@@ -56,6 +59,7 @@ _HOMES = {
 __all__ = [
     "Calibration",
     "ConvergenceError",
+    "Corrected",
     "DataError",
     "DegenerateError",
     "DriverError",
@@ -66,6 +70,7 @@ __all__ = [
     "VisioncalError",
     "__version__",
     "calibrate",
+    "correct",
     "locate",
     "locate_target",
     "locate_views",

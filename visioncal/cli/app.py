@@ -8,6 +8,7 @@ import typer
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.console import report_error
 from visioncal.cli.convert import convert_command
+from visioncal.cli.correct import correct_command
 from visioncal.cli.demo import demo_command
 from visioncal.cli.diff import diff_command
 from visioncal.cli.export import export_command
@@ -41,6 +42,7 @@ app.command("export")(export_command)
 app.command("tcp")(tcp_command)
 app.command("locate")(locate_command)
 app.command("fixture")(fixture_command)
+app.command("correct")(correct_command)
 app.command("review")(review_command)
 app.command("simulate")(simulate_command)
 app.add_typer(target_app, name="target")

@@ -16,6 +16,9 @@ FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")
 IDENTITY_FUNCTION = (0.0, 1.0, 0.0, 0.0)
 # Printed to three digits, a rotation is within this of one; beyond, the numbers are something else.
 _ROTATION_TOLERANCE = 1e-3
+# Steps that invert a joint's function, and what it may be off before the last of them: the square
+# of it is beyond rounding.
+_INVERSIONS, _INVERTED = 20, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,23 @@ class Chain:
     def effective(self, q: FloatArray) -> FloatArray:
         """Effective positions (m, n) of the joints where the encoders tell (m, n) `q`."""
         return np.asarray(np.einsum("mnk,nk->mn", self.function_basis(q), self.functions))
+
+    def encoded(self, positions: FloatArray) -> FloatArray:
+        """What encoders tell (m, n) where the joints' effective positions are (m, n): the inverse.
+
+        Newton's iteration; an eccentricity is some thousandths of the ratio: three steps do.
+        """
+        offset, ratio, sine, cosine = self.functions.T
+        q = (positions - offset) / ratio
+        if not self.functions[:, 2:].any():
+            return np.asarray(q)
+        for _ in range(_INVERSIONS):
+            sines, cosines = np.sin(q), np.cos(q)
+            off = offset + ratio * q + sine * sines + cosine * cosines - positions
+            q = q - off / (ratio + sine * cosines - cosine * sines)
+            if np.abs(off).max(initial=0.0) < _INVERTED:
+                break
+        return np.asarray(q)
 
     def slopes(self, q: FloatArray) -> FloatArray:
         """Derivatives (m, n) of the effective positions by (m, n) `q`."""

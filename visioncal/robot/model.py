@@ -93,6 +93,11 @@ class Robot:
         """(n,) upper limits [rad]; inf for a joint without limits."""
         return self.chain.upper
 
+    @property
+    def pinocchio_model(self) -> "pin.Model":
+        """Pinocchio's model, whose positions are the joints' effective ones; of this package."""
+        return self._model
+
     def base_from_flange(self, q: FloatArray) -> FloatArray:
         """Computes the forward kinematics.
 

@@ -1,0 +1,250 @@
+"""`visioncal correct`."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from visioncal.calibration import Calibration
+from visioncal.cli.console import messages
+from visioncal.cli.numbers import numbers_in
+from visioncal.cli.stdout import write_stdout
+from visioncal.compensation.arms import CalibratedArm, predicted_sigma_mm
+from visioncal.compensation.correct import WIDEST_RAD, Corrected, correct
+from visioncal.compensation.table import Targets, columns_to_send, read_targets, table_to_send
+from visioncal.errors import DataError
+from visioncal.figures import figure
+from visioncal.files import check_free, did_you_mean, some_of, write_atomically
+from visioncal.stored import load_calibration
+from visioncal.transforms import invert
+from visioncal.types import FloatArray, IntArray
+
+_SHOWN = 10
+_MOST_DEG = 720.0
+_TOOLS = "flange_from_"
+
+
+def correct_command(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TARGETS",
+            help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
+            "base_from_flange; q1_rad ... may say which posture is meant; others are kept.",
+        ),
+    ],
+    calibration: Annotated[
+        Path,
+        typer.Option(
+            "-c",
+            "--against",
+            "--calibration",
+            help="Of the calibrated arm: an output folder of calibrate, or its .rrd.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="The table to write; otherwise, or as -, stdout."),
+    ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            help="What the targets are of, and the corrected ones: a tool of the calibration, or "
+            "cam; else of the flange."
+        ),
+    ] = None,
+    seed_joints: Annotated[
+        str | None,
+        typer.Option(
+            metavar="Q1,Q2,...",
+            help="Joint angles near which the first target is reached [rad]; else the middle of "
+            "the joints' limits. Each further target is reached near to the one before.",
+        ),
+    ] = None,
+    widest_deg: Annotated[
+        float,
+        typer.Option(
+            "--widest-deg",
+            help="Warn where a joint turns farther than this from one target to the next.",
+        ),
+    ] = float(np.rad2deg(WIDEST_RAD)),
+    skip: Annotated[
+        bool,
+        typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the targets as JSON.")] = False,
+) -> None:
+    """Turn targets into those that make the real arm reach them through its nominal controller.
+
+    Exit status 2: nothing was written, for the reason given; targets out of reach are named.
+    """
+    known = load_calibration(calibration)
+    arm = CalibratedArm.of(known)
+    written_to = None if out is None or out == Path("-") else out
+    if written_to is not None:
+        check_free(written_to, force=force)
+    targets = read_targets(source, arm.real)
+    flange_from_tool = _tool(known, tool)
+    base_from_flange = targets.base_from_tool @ invert(flange_from_tool)
+    corrected = correct(
+        known,
+        base_from_flange,
+        _seeds(targets.q_seed, seed_joints),
+        widest_rad=np.deg2rad(_widest(widest_deg)),
+    )
+    lost = tuple(_unreachable(targets, corrected))
+    rows = np.flatnonzero(corrected.reached)
+    if lost and (not skip or not len(rows)):
+        raise _refusal(lost, len(targets))
+    sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3])
+    base_from_tool = corrected.base_from_flange @ flange_from_tool
+    columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
+    if written_to is not None:
+        write_atomically(written_to, table_to_send(targets, columns, rows))
+    if as_json:
+        write_stdout(json.dumps(_document(targets, columns, rows, lost), indent=2) + "\n")
+        return
+    if written_to is None:
+        write_stdout(table_to_send(targets, columns, rows))
+    warnings = [*_doubts(known), *_turns(arm, targets, corrected, widest_deg)]
+    _tell(columns, rows, lost, warnings)
+    if written_to is not None:
+        messages().print(escape(f"wrote {written_to}"))
+
+
+def _widest(degrees: float) -> float:
+    if not 0.0 < degrees <= _MOST_DEG:
+        raise DataError(
+            f"--widest-deg is {degrees:g}; degrees above 0 and up to {_MOST_DEG:g} are needed.",
+            culprits=["--widest-deg"],
+        )
+    return degrees
+
+
+def _tool(calibration: Calibration, name: str | None) -> FloatArray:
+    """(4, 4) `flange_from_tool`; the identity where the targets are of the flange."""
+    if name is None:
+        return np.eye(4)
+    placed = calibration.placed
+    transform = name if name.startswith(_TOOLS) else f"{_TOOLS}{name}"
+    if transform not in placed:
+        known = [it.removeprefix(_TOOLS) for it in placed if it.startswith(_TOOLS)]
+        raise DataError(
+            f"--tool {name}: calibration {calibration.session_name!r} has no {transform}; on its "
+            f"flange are {', '.join(known) or 'no tools'}.",
+            culprits=["--tool"],
+            next_step=did_you_mean(name, known) or "A tool joins it by visioncal tcp.",
+        )
+    return placed[transform].matrix
+
+
+def _seeds(own: FloatArray, words: str | None) -> FloatArray:
+    """The rows' seeds (m, n), that of the option in the first where it has none."""
+    if words is None:
+        return own
+    form = ",".join(f"q{it}" for it in range(1, own.shape[1] + 1))
+    seed = np.array(numbers_in(words, "--seed-joints", form))
+    if np.isnan(own[0, 0]):
+        own = own.copy()
+        own[0] = seed
+    return own
+
+
+def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, str]]:
+    """The rows that are not reached: where they stand, and why not."""
+    for row in np.flatnonzero(~corrected.reached):
+        off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
+        near = f"the nearest posture leaves {figure(off_mm)} mm and {figure(off_deg)} deg"
+        beyond = corrected.beyond[row]
+        why = (
+            f"reached only with {some_of(beyond)} beyond its limits; within them "
+            if beyond
+            else "out of reach: "
+        )
+        yield targets.places[row], why + near
+
+
+def _refusal(lost: Sequence[tuple[str, str]], count: int) -> DataError:
+    lines = [f"{place}: {why}." for place, why in lost[:_SHOWN]]
+    if len(lost) > _SHOWN:
+        lines.append(f"And {len(lost) - _SHOWN} more of the kind.")
+    return DataError(
+        "\n".join([f"{len(lost)} of {count} targets cannot be reached.", *lines]),
+        culprits=[place for place, _ in lost],
+        next_step="Move them, or write the others with --skip-unreachable."
+        if len(lost) < count
+        else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
+    )
+
+
+def _doubts(calibration: Calibration) -> Iterator[str]:
+    verdict = calibration.verdict
+    if verdict.status == "bad":
+        yield f"The calibration's verdict is bad: {' '.join(verdict.reasons[:1])}"
+
+
+def _turns(
+    arm: CalibratedArm, targets: Targets, corrected: Corrected, widest_deg: float
+) -> Iterator[str]:
+    """Says where the arm had to turn far, and may have taken another branch."""
+    turned = np.rad2deg(corrected.turned_rad)
+    wide = np.flatnonzero(corrected.reached & (turned.max(axis=1) > widest_deg))
+    for row in wide[:_SHOWN]:
+        joint = int(np.argmax(turned[row]))
+        yield (
+            f"{targets.places[row]}: {arm.real.joint_names[joint]} turns by "
+            f"{turned[row, joint]:.0f} deg from where this target was looked for; no posture "
+            "nearer was found."
+        )
+    if len(wide) > _SHOWN:
+        yield f"And {len(wide) - _SHOWN} more targets of the kind."
+
+
+def _tell(
+    columns: Mapping[str, FloatArray],
+    rows: IntArray,
+    lost: Sequence[tuple[str, str]],
+    warnings: Sequence[str],
+) -> None:
+    console = messages()
+    mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
+    told = (
+        f"{len(rows)} of {len(rows) + len(lost)} targets corrected: moved by "
+        f"{figure(float(np.median(mm)))} mm and {figure(float(np.median(deg)))} deg (median), by "
+        f"up to {figure(float(mm.max()))} mm and {figure(float(deg.max()))} deg"
+    )
+    if "sigma_mm" in columns:
+        told += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
+    console.print(escape(told))
+    for place, why in lost[:_SHOWN]:
+        console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
+    if len(lost) > _SHOWN:
+        console.print(f"  and {len(lost) - _SHOWN} more")
+    for it in warnings:
+        console.print(f"[bold yellow]warning:[/] {escape(it)}")
+
+
+def _document(
+    targets: Targets,
+    columns: Mapping[str, FloatArray],
+    rows: IntArray,
+    lost: Sequence[tuple[str, str]],
+) -> dict[str, Any]:
+    kept = [it for it in targets.table.columns if it not in columns]
+    cells = [dict(zip(targets.table.columns, it, strict=True)) for it in targets.table.rows]
+    return {
+        "targets": [
+            {
+                "place": targets.places[row],
+                **{name: cells[row][name] for name in kept},
+                **{name: float(numbers[row]) for name, numbers in columns.items()},
+            }
+            for row in rows
+        ],
+        "unreachable": [{"place": place, "reason": why} for place, why in lost],
+    }

@@ -1,0 +1,90 @@
+"""The two models of one arm that a calibration holds, and what it says of their use."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from visioncal.calibration import Calibration
+from visioncal.errors import DataError
+from visioncal.robot import Robot
+from visioncal.types import FloatArray
+
+# A place's sigma is that of so many places of the map around it.
+_AROUND = 4
+# Fewer joints reach no position at will.
+_LEAST_JOINTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedArm:
+    """An arm as its controller believes it to be, and as it was found.
+
+    Attributes:
+        nominal: What the controller computes with.
+        real: What the calibration found.
+    """
+
+    nominal: Robot
+    real: Robot
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Self:
+        """Takes both models out of a calibration.
+
+        Raises:
+            DataError: It has no calibrated arm, or one that reaches no position at will.
+        """
+        nominal, real = calibration.robot, calibration.calibrated_robot
+        if nominal is None or real is None or not calibration.arm_is_calibrated:
+            raise _without_arm(calibration)
+        if real.joint_count < _LEAST_JOINTS:
+            raise DataError(
+                f"robot {real.name} has {real.joint_count} joints, and {_LEAST_JOINTS} are needed "
+                "to reach a position.",
+                culprits=[real.name],
+            )
+        return cls(nominal, real)
+
+
+def _without_arm(calibration: Calibration) -> DataError:
+    name = calibration.session_name
+    found = calibration.stages.get("kinematics")
+    if found is None:
+        return DataError(
+            f"calibration {name!r} has no calibrated arm: its session had no joint angles of every "
+            "view or no known robot model, or it was made with --level hand-eye.",
+            next_step="Record q1_rad ... with every view, name the arm in [robot] model, and "
+            "calibrate with --level auto or kinematics.",
+        )
+    return DataError(
+        f"calibration {name!r} has no calibrated arm (level {found.get('level', 'unknown')}): its "
+        "views do not tell the arm from its nominal model, so there is nothing to correct.",
+        next_step="Send the targets as they are; or calibrate with more views, all over the "
+        "workspace.",
+    )
+
+
+def predicted_sigma_mm(calibration: Calibration, p_base: FloatArray) -> FloatArray:
+    """How surely the calibrated arm reaches places, as its calibration predicts.
+
+    Args:
+        calibration: Of a calibrated arm.
+        p_base: (m, 3) places of the flange [m].
+
+    Returns:
+        (m,) root of the trace of a place's covariance [mm]: of the map of the workspace around each
+        place, or else the median over the workspace; NaN where the calibration says neither.
+    """
+    found = calibration.stages.get("kinematics", {})
+    rows = found.get("workspace_map", ())
+    if not rows:
+        median = found.get("workspace_sigma_mm", {}).get("median", np.nan)
+        return np.full(len(p_base), float(median))
+    places = np.array([[row["x_m"], row["y_m"], row["z_m"]] for row in rows])
+    sigmas = np.array([row["sigma_mm"] for row in rows])
+    away = np.linalg.norm(p_base[:, None] - places, axis=2)
+    near = np.argsort(away, axis=1)[:, :_AROUND]
+    # A place of the map itself would have all the weight there is.
+    weights = 1.0 / np.maximum(np.take_along_axis(away, near, axis=1), 1e-6) ** 2
+    return np.asarray((weights * sigmas[near]).sum(axis=1) / weights.sum(axis=1))

@@ -1,0 +1,298 @@
+"""Inverse kinematics: joint positions that bring an arm's flange where it is wanted.
+
+One posture at a time: Pinocchio evaluates one in a microsecond, less than numpy needs to look at a
+batch of one, and each target is best started from the posture of the one before.
+
+Joints are moved by their effective positions here. In these a turn is exactly two pi whatever the
+gear's ratio, and encoders come in once, at the ends.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from visioncal.robot.model import Robot
+from visioncal.types import FloatArray, Mask
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+# A pose counts as reached from here on [m] and [rad]: rounding leaves a thousandth of it.
+_REACHED = 1e-9
+# Sums of squares [m^2 + rad^2] at which one more step would be lost in rounding.
+_DONE = 1e-24
+# With fewer than six joints the position is kept and the rotation is what is left. Beyond this
+# [rad] the target was never one of the arm's: errors of links are far smaller.
+_TURN_LEFT_RAD = float(np.deg2rad(1.0))
+# What a radian then counts against a metre, once both are near: what is left of the rotation moves
+# the position by the square of it.
+_LIGHT = 1e-4
+# Postures to start from where the seed does not lead there; an arm of six joints has up to sixteen
+# solutions, and half of the starts find one.
+_STARTS = 40
+_STEPS = 80
+# A search ends where a step gains less than this share of the sum of squares; the nearest of many
+# is then followed to the second.
+_SEARCH, _POLISH = 1e-3, 1e-9
+_MILDEST, _HARSHEST = 1e-4, 1e8
+# How far starts spread where a joint has no limits [rad or m].
+_SPREAD = float(np.pi)
+_TURN = 2 * np.pi
+# Keeps a singular system solvable, far below the square of any singular value that matters.
+_FLOOR = 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """How near an arm comes to a pose.
+
+    Attributes:
+        q: (n,) joint positions that the encoders tell [rad or m].
+        off_m: Distance of the flange from where it is wanted [m].
+        off_rad: Angle between the flange and how it is wanted [rad].
+        reached: Whether it is there, within the joints' limits.
+        beyond: Where it is not, the joints whose limits alone are in the way; empty where no
+            posture at all would do.
+    """
+
+    q: FloatArray
+    off_m: float
+    off_rad: float
+    reached: bool
+    beyond: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounds:
+    """Limits of the effective positions, (n,) each, infinite where there are none."""
+
+    lower: FloatArray
+    upper: FloatArray
+    turning: Mask
+
+    def nearest(self, positions: FloatArray, wanted: FloatArray) -> FloatArray:
+        """Turns joints by whole turns, within the limits, as near to `wanted` as can be.
+
+        Positions within the limits stay so.
+        """
+        turns = np.round((wanted - positions) / _TURN)
+        if not turns.any():
+            return positions
+        least = np.minimum(np.ceil((self.lower - positions) / _TURN), 0.0)
+        most = np.maximum(np.floor((self.upper - positions) / _TURN), 0.0)
+        turns = np.where(self.turning, np.minimum(np.maximum(turns, least), most), 0.0)
+        return np.asarray(positions + _TURN * turns)
+
+    def middle_and_half(self, around: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Middle (n,) and half (n,) of the range; about the given positions where it is open."""
+        known = np.isfinite(self.lower) & np.isfinite(self.upper)
+        lower, upper = (np.where(known, it, 0.0) for it in (self.lower, self.upper))
+        half = np.where(known, 0.5 * (upper - lower), _SPREAD)
+        half = np.where(self.turning, np.minimum(half, _SPREAD), half)
+        return np.where(known, 0.5 * (lower + upper), around), half
+
+    def beyond(self, positions: FloatArray) -> FloatArray:
+        """How far (n,) positions are beyond the limits [rad or m]."""
+        return np.maximum(np.maximum(self.lower - positions, positions - self.upper), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Try:
+    """Effective positions (n,), and what is left there: `size` is the sum of squares."""
+
+    positions: FloatArray
+    size: float
+    off_m: float
+    off_rad: float
+    reached: bool
+
+
+class Inverse:
+    """The inverse kinematics of one arm.
+
+    Method: Levenberg and Marquardt's, with a damping that follows the remaining error and so
+    vanishes at the end (Sugihara 2011, Solvability-unconcerned inverse kinematics): quadratic where
+    the pose can be reached, and at the nearest pose where it cannot. Joints at a limit that would
+    leave it are held. Of an arm with more than six joints the step is the shortest one, so that it
+    stays near to where it started. With fewer than six the position is reached and the rotation is
+    as near as it can be.
+
+    It holds Pinocchio's working memory: one object a thread.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Prepares the search for an arm."""
+        chain = robot.chain
+        self._chain = chain
+        self._model = robot.pinocchio_model
+        self._data: pin.Data = self._model.createData()
+        self._frame: int = self._model.getFrameId(robot.tip)
+        self._bounds = _Bounds(*_effective_limits(robot), ~chain.prismatic)
+
+    def solve(
+        self, base_from_flange: FloatArray, seed: FloatArray, *, widest_rad: float = np.inf
+    ) -> Posture:
+        """Finds the posture that reaches a pose, near to a given one.
+
+        Args:
+            base_from_flange: (4, 4) the pose [m].
+            seed: (n,) joint positions to start from [rad or m].
+            widest_rad: Where a joint turns farther than this from the seed, other postures are
+                looked for, and the nearest of all is taken [rad].
+
+        Returns:
+            The posture; where none reaches the pose, the one that comes nearest.
+        """
+        import pinocchio as pin
+
+        goal = pin.SE3(base_from_flange)
+        wanted = self._chain.effective(seed[None])[0]
+        first = self._descend(goal, wanted, self._bounds, wanted)
+        if first.reached and self._widest(first, wanted) <= widest_rad:
+            return self._posture(first)
+        tries = [first, *self._from_everywhere(goal, self._bounds, wanted)]
+        reached = [it for it in tries if it.reached]
+        if reached:
+            near = [float(np.linalg.norm(it.positions - wanted)) for it in reached]
+            return self._posture(reached[int(np.argmin(near))])
+        nearest = min(tries, key=lambda it: it.size)
+        nearest = self._descend(goal, nearest.positions, self._bounds, wanted, settle=_POLISH)
+        return replace(self._posture(nearest), beyond=self._in_the_way(goal, wanted))
+
+    def _posture(self, found: _Try) -> Posture:
+        q = self._chain.encoded(found.positions[None])[0]
+        return Posture(q, found.off_m, found.off_rad, found.reached)
+
+    def _widest(self, found: _Try, wanted: FloatArray) -> float:
+        turned = np.abs(found.positions - wanted)[self._bounds.turning]
+        return float(turned.max(initial=0.0))
+
+    def _from_everywhere(
+        self, goal: "pin.SE3", bounds: _Bounds, wanted: FloatArray
+    ) -> Iterator[_Try]:
+        """What is found from postures all over the joints' range, the same ones every time."""
+        rng = np.random.default_rng(0)
+        middle, half = self._bounds.middle_and_half(wanted)
+        for share in rng.uniform(-1.0, 1.0, (_STARTS, len(wanted))):
+            start = middle + share * half
+            yield self._descend(goal, start, bounds, wanted)
+
+    def _in_the_way(self, goal: "pin.SE3", wanted: FloatArray) -> tuple[str, ...]:
+        """The joints whose limits alone keep the arm from a pose, for the nearest such posture."""
+        free = replace(
+            self._bounds,
+            lower=np.full_like(self._bounds.lower, -np.inf),
+            upper=np.full_like(self._bounds.upper, np.inf),
+        )
+        middle, _ = self._bounds.middle_and_half(wanted)
+        tries = [it for it in self._from_everywhere(goal, free, middle) if it.reached]
+        if not tries:
+            return ()
+        excess = [self._bounds.beyond(it.positions) for it in tries]
+        least = min(excess, key=lambda it: float(np.sum(it)))
+        names = zip(self._chain.joint_names, least, strict=True)
+        return tuple(name for name, it in names if it > 0.0)
+
+    def _descend(
+        self,
+        goal: "pin.SE3",
+        start: FloatArray,
+        bounds: _Bounds,
+        wanted: FloatArray,
+        *,
+        settle: float = _SEARCH,
+    ) -> _Try:
+        """Goes downhill from a start, and turns what it finds towards what is wanted."""
+        few = len(start) < 6
+        begin = np.minimum(np.maximum(start, bounds.lower), bounds.upper)
+        positions, error = self._downhill(goal, begin, bounds, 1.0, settle)
+        size = float(error @ error)
+        if few:
+            settle = _POLISH * _LIGHT**2
+            positions, error = self._downhill(goal, positions, bounds, _LIGHT, settle)
+            error[3:] /= _LIGHT
+        off_m, off_rad = math.hypot(*error[:3]), math.hypot(*error[3:])
+        reached = off_m < _REACHED and off_rad < (_TURN_LEFT_RAD if few else _REACHED)
+        return _Try(bounds.nearest(positions, wanted), size, off_m, off_rad, reached)
+
+    def _downhill(
+        self, goal: "pin.SE3", positions: FloatArray, bounds: _Bounds, light: float, settle: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Levenberg and Marquardt's iteration: (the positions, what is left there)."""
+        damping = 1.0
+        error, jacobian = self._linearise(goal, positions, light)
+        size = float(error @ error)
+        for _ in range(_STEPS):
+            if size < _DONE or damping > _HARSHEST:
+                break
+            moved = _moved(positions, error, jacobian, damping * size + _FLOOR, bounds)
+            next_error, next_jacobian = self._linearise(goal, moved, light)
+            next_size = float(next_error @ next_error)
+            if not next_size < size:
+                damping *= 8.0
+                continue
+            gained = size - next_size
+            positions, error, jacobian, size = moved, next_error, next_jacobian, next_size
+            damping = max(damping / 8.0, _MILDEST)
+            if gained < settle * (size + gained):
+                break
+        return positions, error
+
+    def _linearise(
+        self, goal: "pin.SE3", positions: FloatArray, light: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """What is left to the goal (6,), seen from it, and how the joints change that (6, n).
+
+        In Pinocchio's order, translations [m] first; rotations [rad] count by `light`.
+        """
+        import pinocchio as pin
+
+        pin.computeJointJacobians(self._model, self._data, positions)
+        pose = pin.updateFramePlacement(self._model, self._data, self._frame)
+        own = pin.getFrameJacobian(self._model, self._data, self._frame, pin.LOCAL)
+        goal_from_flange = goal.actInv(pose)
+        rotation = goal_from_flange.rotation
+        error, jacobian = np.empty(6), np.empty_like(own)
+        error[:3], jacobian[:3] = goal_from_flange.translation, rotation @ own[:3]
+        error[3:] = light * pin.log3(rotation)
+        jacobian[3:] = light * pin.Jlog3(rotation) @ own[3:]
+        return error, jacobian
+
+
+def _moved(
+    positions: FloatArray, error: FloatArray, jacobian: FloatArray, damping: float, bounds: _Bounds
+) -> FloatArray:
+    """One damped step within the bounds; joints that would leave them from a limit are held."""
+    for _ in range(len(positions)):
+        wish = positions - _step(jacobian, error, damping)
+        moved = np.minimum(np.maximum(wish, bounds.lower), bounds.upper)
+        held = (moved == positions) & (wish != moved)
+        if not held.any():
+            break
+        jacobian = np.where(held, 0.0, jacobian)
+    return np.asarray(moved)
+
+
+def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray:
+    """The damped step; of the two equal forms the one with the smaller system."""
+    rows, columns = jacobian.shape
+    if columns > rows:
+        gram = jacobian @ jacobian.T
+        gram.flat[:: rows + 1] += damping
+        return np.asarray(jacobian.T @ np.linalg.solve(gram, error))
+    gram = jacobian.T @ jacobian
+    gram.flat[:: columns + 1] += damping
+    return np.asarray(np.linalg.solve(gram, jacobian.T @ error))
+
+
+def _effective_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper limits (n,) of the effective positions."""
+    ends = []
+    for limit in (robot.lower_rad, robot.upper_rad):
+        known = np.where(np.isfinite(limit), limit, 0.0)
+        moved = robot.chain.effective(known[None])[0]
+        ends.append(np.where(np.isfinite(limit), moved, limit))
+    return ends[0], ends[1]
