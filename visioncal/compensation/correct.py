@@ -32,6 +32,7 @@ class Corrected:
     """What to send, for m targets.
 
     Attributes:
+        wanted: (m, 4, 4) the targets: where the flange is to be [m].
         q: (m, n) joint targets [rad or m]; where `reached` is false, those that come nearest.
         base_from_flange: (m, 4, 4) Cartesian targets [m]: where the nominal controller has the
             flange at `q`.
@@ -39,25 +40,33 @@ class Corrected:
         off_m: (m,) distance that is left [m].
         off_rad: (m,) angle that is left [rad]. An arm of fewer than six joints reaches the
             position, and the rotation as nearly as it can.
-        moved_m: (m,) distance of the Cartesian target to send from the one that is wanted [m].
-        moved_rad: (m,) angle between both [rad].
         turned_rad: (m, n) how far each joint turns from where it was looked for: the row's seed, or
             the target before; zero for a prismatic joint, and for a first target without a seed.
         beyond: (m,) where a target is not reached, the joints whose limits alone are in the way.
     """
 
+    wanted: FloatArray
     q: FloatArray
     base_from_flange: FloatArray
     reached: Mask
     off_m: FloatArray
     off_rad: FloatArray
-    moved_m: FloatArray
-    moved_rad: FloatArray
     turned_rad: FloatArray
     beyond: tuple[tuple[str, ...], ...]
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def moved_m(self) -> FloatArray:
+        """(m,) distance of the flange as it is sent from where it is wanted [m]."""
+        away = self.base_from_flange[:, :3, 3] - self.wanted[:, :3, 3]
+        return np.asarray(np.linalg.norm(away, axis=1))
+
+    @property
+    def moved_rad(self) -> FloatArray:
+        """(m,) angle between both [rad]."""
+        return rotation_angle(invert(self.wanted) @ self.base_from_flange)
 
 
 def correct(
@@ -87,48 +96,43 @@ def correct(
         DataError: The calibration has no calibrated arm, or a target or a seed is none.
     """
     arm = CalibratedArm.of(calibration)
-    targets = _matrices(base_from_flange)
-    first, own = _seeds(q_seed, arm.real, len(targets))
-    inverse = Inverse(arm.real)
+    wanted = _matrices(base_from_flange)
+    own = _seeds(q_seed, arm.real, len(wanted))
+    chain, inverse = arm.real.chain, Inverse(arm.real)
+    seeds = chain.effective(own)
+    seeded = np.asarray(np.isfinite(own).all(axis=1))
+    last: FloatArray | None = None
     found: list[Posture] = []
-    starts = np.empty((len(targets), arm.real.joint_count))
-    last = first
-    for at, target in enumerate(targets):
-        start = own[at] if own is not None and not np.isnan(own[at, 0]) else last
-        # Without a seed any branch is as good: the one nearest to the middle is taken.
-        anywhere = start is None
-        starts[at] = _middle(arm.real) if start is None else start
-        found.append(inverse.solve(target, starts[at], widest_rad=0.0 if anywhere else widest_rad))
-        if anywhere:
-            starts[at] = found[-1].q
-        last = found[-1].q if found[-1].reached else start
-    return _corrected(arm, targets, found, starts)
-
-
-def _corrected(
-    arm: CalibratedArm, targets: FloatArray, found: Sequence[Posture], starts: FloatArray
-) -> Corrected:
-    q = np.array([it.q for it in found]).reshape(starts.shape)
-    sent = arm.nominal.base_from_flange(q)
-    between = invert(targets) @ sent
+    starts = np.empty_like(seeds)
+    for at, target in enumerate(wanted):
+        start = seeds[at] if seeded[at] else last
+        if start is None:
+            # Any branch is as good: the one nearest to the middle is taken.
+            found.append(inverse.solve(target, _middle(arm.real), widest_rad=0.0))
+            starts[at] = found[-1].positions
+        else:
+            found.append(inverse.solve(target, start, widest_rad=widest_rad))
+            starts[at] = start
+        last = found[-1].positions if found[-1].reached else start
+    positions = np.array([it.positions for it in found]).reshape(seeds.shape)
+    q = chain.encoded(positions)
     return Corrected(
+        wanted=wanted,
         q=q,
-        base_from_flange=sent,
+        base_from_flange=arm.nominal.base_from_flange(q),
         reached=np.array([it.reached for it in found], dtype=bool),
         off_m=np.array([it.off_m for it in found]),
         off_rad=np.array([it.off_rad for it in found]),
-        moved_m=np.linalg.norm(between[:, :3, 3], axis=1),
-        moved_rad=rotation_angle(between),
-        turned_rad=np.where(arm.real.chain.prismatic, 0.0, np.abs(q - starts)),
+        turned_rad=np.where(chain.prismatic, 0.0, np.abs(positions - starts)),
         beyond=tuple(it.beyond for it in found),
     )
 
 
 def _middle(robot: Robot) -> FloatArray:
-    """(n,) the middle of the joints' limits; zero where there are none [rad or m]."""
+    """(n,) effective positions in the middle of the limits, zero without limits [rad or m]."""
     known = np.isfinite(robot.lower_rad) & np.isfinite(robot.upper_rad)
     ends = [np.where(known, it, 0.0) for it in (robot.lower_rad, robot.upper_rad)]
-    return np.asarray(0.5 * (ends[0] + ends[1]))
+    return np.asarray(robot.chain.effective((0.5 * (ends[0] + ends[1]))[None])[0])
 
 
 def _matrices(poses: Poses) -> FloatArray:
@@ -142,48 +146,46 @@ def _matrices(poses: Poses) -> FloatArray:
         )
     rotations = matrices[:, :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    wrong = np.flatnonzero(~((off < _RIGID) & (np.linalg.det(rotations) > 0.0)))
-    if len(wrong):
+    rigid = (off < _RIGID) & (np.linalg.det(rotations) > 0.0)
+    if not rigid.all():
+        at = int(np.argmin(rigid))
         raise DataError(
-            f"correct: target {wrong[0]} is no rigid transform: its rotation is off by "
-            f"{off[wrong[0]]:.2g}.",
-            culprits=[f"target {it}" for it in wrong],
+            f"correct: target {at} is no rigid transform: its rotation is off by {off[at]:.2g}.",
+            culprits=[f"target {at}"],
         )
     away = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0.0)
-    far = np.flatnonzero(~(away < FAR_M))
-    if len(far):
+    near = away < FAR_M
+    if not near.all():
+        at = int(np.argmin(near))
         raise DataError(
-            f"correct: target {far[0]} is {away[far[0]]:.4g} m from the base, and no arm reaches "
+            f"correct: target {at} is {away[at]:.4g} m from the base, and no arm reaches "
             f"{FAR_M:g} m.",
-            culprits=[f"target {it}" for it in far],
+            culprits=[f"target {at}"],
             next_step="Positions are in metres.",
         )
     return matrices
 
 
-def _seeds(
-    q_seed: FloatArray | Sequence[float] | None, robot: Robot, count: int
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """The seed (n,) of the first target, and the seeds (m, n) of all; None for none."""
-    if q_seed is None:
-        return None, None
-    seeds = np.asarray(q_seed, dtype=float)
+def _seeds(q_seed: FloatArray | Sequence[float] | None, robot: Robot, count: int) -> FloatArray:
+    """The seeds (m, n) of all targets; NaN in a row that follows the target before it."""
     size = robot.joint_count
+    if q_seed is None:
+        return np.full((count, size), np.nan)
+    seeds = np.asarray(q_seed, dtype=float)
     if seeds.shape not in ((size,), (count, size)):
         raise DataError(
             f"correct: seeds of shape ({size},) or ({count}, {size}) are needed, for the joints of "
             f"{robot.name}, not {seeds.shape}.",
         )
-    turns = np.abs(seeds[..., ~robot.chain.prismatic])
-    largest = float(np.nanmax(turns, initial=0.0))
-    if largest > WIDE_RAD:
+    if seeds.ndim == 1:
+        if not np.isfinite(seeds).all():
+            raise DataError("correct: the seed has a joint that is no finite number.")
+        seeds = np.concatenate([seeds[None], np.full((max(count - 1, 0), size), np.nan)])[:count]
+    turns = np.abs(seeds[:, ~robot.chain.prismatic])
+    if (turns > WIDE_RAD).any():
         raise DataError(
-            f"correct: a seed has a joint at {largest:.4g} rad, more than two turns: these look "
-            "like degrees.",
+            f"correct: a seed has a joint at {np.nanmax(turns):.4g} rad, more than two turns: "
+            "these look like degrees.",
             next_step="Write radians.",
         )
-    if seeds.ndim == 1:
-        if np.isnan(seeds).any():
-            raise DataError("correct: the seed has a joint that is no number.")
-        return seeds, None
-    return None, seeds
+    return seeds

@@ -73,17 +73,23 @@ class Chain:
 
     def effective(self, q: FloatArray) -> FloatArray:
         """Effective positions (m, n) of the joints where the encoders tell (m, n) `q`."""
-        return np.asarray(np.einsum("mnk,nk->mn", self.function_basis(q), self.functions))
+        offset, ratio = self.functions[:, 0], self.functions[:, 1]
+        plain = offset + ratio * q
+        if not self.functions[:, 2:].any():
+            return np.asarray(plain)
+        sine, cosine = self._eccentricity
+        return np.asarray(plain + sine * np.sin(q) + cosine * np.cos(q))
 
     def encoded(self, positions: FloatArray) -> FloatArray:
         """What encoders tell (m, n) where the joints' effective positions are (m, n): the inverse.
 
         Newton's iteration; an eccentricity is some thousandths of the ratio: three steps do.
         """
-        offset, ratio, sine, cosine = self.functions.T
+        offset, ratio = self.functions[:, 0], self.functions[:, 1]
         q = (positions - offset) / ratio
         if not self.functions[:, 2:].any():
             return np.asarray(q)
+        sine, cosine = self._eccentricity
         for _ in range(_INVERSIONS):
             sines, cosines = np.sin(q), np.cos(q)
             off = offset + ratio * q + sine * sines + cosine * cosines - positions
@@ -94,9 +100,13 @@ class Chain:
 
     def slopes(self, q: FloatArray) -> FloatArray:
         """Derivatives (m, n) of the effective positions by (m, n) `q`."""
-        _, ratio, sine, cosine = self.functions.T
-        turning = np.where(self.prismatic, 0.0, 1.0)
-        return np.asarray(ratio + turning * (sine * np.cos(q) - cosine * np.sin(q)))
+        sine, cosine = self._eccentricity
+        return np.asarray(self.functions[:, 1] + sine * np.cos(q) - cosine * np.sin(q))
+
+    @property
+    def _eccentricity(self) -> FloatArray:
+        """(2, n) sine and cosine of the joints; a prismatic one has none."""
+        return np.where(self.prismatic, 0.0, self.functions[:, 2:].T)
 
     def with_offsets_placed(self) -> "Chain":
         """The same arm with the functions' offsets in the placements."""

@@ -3,8 +3,8 @@
 One posture at a time: Pinocchio evaluates one in a microsecond, less than numpy needs to look at a
 batch of one, and each target is best started from the posture of the one before.
 
-Joints are moved by their effective positions here. In these a turn is exactly two pi whatever the
-gear's ratio, and encoders come in once, at the ends.
+Joints stand at their effective positions here (`Chain.effective`, `Chain.encoded`): in these a turn
+is exactly two pi, whatever the gear's ratio.
 """
 
 import math
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from visioncal.robot.model import Robot
 from visioncal.types import FloatArray, Mask
@@ -22,8 +23,9 @@ if TYPE_CHECKING:
 
 # A pose counts as reached from here on [m] and [rad]: rounding leaves a thousandth of it.
 _REACHED = 1e-9
-# Sums of squares [m^2 + rad^2] at which one more step would be lost in rounding.
-_DONE = 1e-24
+# The sum of squares [m^2 + rad^2] at which a pose is reached beyond doubt; one more step would be
+# lost in rounding.
+_DONE = 1e-20
 # With fewer than six joints the position is kept and the rotation is what is left. Beyond this
 # [rad] the target was never one of the arm's: errors of links are far smaller.
 _TURN_LEFT_RAD = float(np.deg2rad(1.0))
@@ -41,8 +43,8 @@ _MILDEST, _HARSHEST = 1e-4, 1e8
 # How far starts spread where a joint has no limits [rad or m].
 _SPREAD = float(np.pi)
 _TURN = 2 * np.pi
-# Keeps a singular system solvable, far below the square of any singular value that matters.
-_FLOOR = 1e-15
+# Keeps a singular system solvable; far below the square of any singular value that matters.
+_FLOOR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Posture:
     """How near an arm comes to a pose.
 
     Attributes:
-        q: (n,) joint positions that the encoders tell [rad or m].
+        positions: (n,) effective positions of the joints [rad or m].
         off_m: Distance of the flange from where it is wanted [m].
         off_rad: Angle between the flange and how it is wanted [rad].
         reached: Whether it is there, within the joints' limits.
@@ -58,7 +60,7 @@ class Posture:
             posture at all would do.
     """
 
-    q: FloatArray
+    positions: FloatArray
     off_m: float
     off_rad: float
     reached: bool
@@ -99,17 +101,6 @@ class _Bounds:
         return np.maximum(np.maximum(self.lower - positions, positions - self.upper), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Try:
-    """Effective positions (n,), and what is left there: `size` is the sum of squares."""
-
-    positions: FloatArray
-    size: float
-    off_m: float
-    off_rad: float
-    reached: bool
-
-
 class Inverse:
     """The inverse kinematics of one arm.
 
@@ -126,53 +117,43 @@ class Inverse:
     def __init__(self, robot: Robot) -> None:
         """Prepares the search for an arm."""
         chain = robot.chain
-        self._chain = chain
+        self._names = chain.joint_names
         self._model = robot.pinocchio_model
         self._data: pin.Data = self._model.createData()
         self._frame: int = self._model.getFrameId(robot.tip)
         self._bounds = _Bounds(*_effective_limits(robot), ~chain.prismatic)
 
     def solve(
-        self, base_from_flange: FloatArray, seed: FloatArray, *, widest_rad: float = np.inf
+        self, base_from_flange: FloatArray, wanted: FloatArray, *, widest_rad: float = np.inf
     ) -> Posture:
         """Finds the posture that reaches a pose, near to a given one.
 
         Args:
             base_from_flange: (4, 4) the pose [m].
-            seed: (n,) joint positions to start from [rad or m].
-            widest_rad: Where a joint turns farther than this from the seed, other postures are
-                looked for, and the nearest of all is taken [rad].
+            wanted: (n,) effective positions to start from [rad or m].
+            widest_rad: Where a joint turns farther than this from there, other postures are looked
+                for, and the nearest of all is taken [rad].
 
         Returns:
             The posture; where none reaches the pose, the one that comes nearest.
         """
         import pinocchio as pin
 
-        goal = pin.SE3(base_from_flange)
-        wanted = self._chain.effective(seed[None])[0]
-        first = self._descend(goal, wanted, self._bounds, wanted)
-        if first.reached and self._widest(first, wanted) <= widest_rad:
-            return self._posture(first)
-        tries = [first, *self._from_everywhere(goal, self._bounds, wanted)]
+        goal, bounds = pin.SE3(base_from_flange), self._bounds
+        first = self._descend(goal, wanted, bounds, wanted)
+        if first.reached and _widest(first.positions - wanted, bounds) <= widest_rad:
+            return first
+        tries = [first, *self._from_everywhere(goal, bounds, wanted)]
         reached = [it for it in tries if it.reached]
         if reached:
-            near = [float(np.linalg.norm(it.positions - wanted)) for it in reached]
-            return self._posture(reached[int(np.argmin(near))])
-        nearest = min(tries, key=lambda it: it.size)
-        nearest = self._descend(goal, nearest.positions, self._bounds, wanted, settle=_POLISH)
-        return replace(self._posture(nearest), beyond=self._in_the_way(goal, wanted))
-
-    def _posture(self, found: _Try) -> Posture:
-        q = self._chain.encoded(found.positions[None])[0]
-        return Posture(q, found.off_m, found.off_rad, found.reached)
-
-    def _widest(self, found: _Try, wanted: FloatArray) -> float:
-        turned = np.abs(found.positions - wanted)[self._bounds.turning]
-        return float(turned.max(initial=0.0))
+            return min(reached, key=lambda it: float(np.linalg.norm(it.positions - wanted)))
+        nearest = min(tries, key=lambda it: it.off_m**2 + it.off_rad**2)
+        nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
+        return replace(nearest, beyond=self._in_the_way(goal, wanted))
 
     def _from_everywhere(
         self, goal: "pin.SE3", bounds: _Bounds, wanted: FloatArray
-    ) -> Iterator[_Try]:
+    ) -> Iterator[Posture]:
         """What is found from postures all over the joints' range, the same ones every time."""
         rng = np.random.default_rng(0)
         middle, half = self._bounds.middle_and_half(wanted)
@@ -193,7 +174,7 @@ class Inverse:
             return ()
         excess = [self._bounds.beyond(it.positions) for it in tries]
         least = min(excess, key=lambda it: float(np.sum(it)))
-        names = zip(self._chain.joint_names, least, strict=True)
+        names = zip(self._names, least, strict=True)
         return tuple(name for name, it in names if it > 0.0)
 
     def _descend(
@@ -204,47 +185,50 @@ class Inverse:
         wanted: FloatArray,
         *,
         settle: float = _SEARCH,
-    ) -> _Try:
+    ) -> Posture:
         """Goes downhill from a start, and turns what it finds towards what is wanted."""
         few = len(start) < 6
         begin = np.minimum(np.maximum(start, bounds.lower), bounds.upper)
         positions, error = self._downhill(goal, begin, bounds, 1.0, settle)
-        size = float(error @ error)
         if few:
             settle = _POLISH * _LIGHT**2
             positions, error = self._downhill(goal, positions, bounds, _LIGHT, settle)
             error[3:] /= _LIGHT
         off_m, off_rad = math.hypot(*error[:3]), math.hypot(*error[3:])
         reached = off_m < _REACHED and off_rad < (_TURN_LEFT_RAD if few else _REACHED)
-        return _Try(bounds.nearest(positions, wanted), size, off_m, off_rad, reached)
+        return Posture(bounds.nearest(positions, wanted), off_m, off_rad, reached)
 
     def _downhill(
         self, goal: "pin.SE3", positions: FloatArray, bounds: _Bounds, light: float, settle: float
     ) -> tuple[FloatArray, FloatArray]:
         """Levenberg and Marquardt's iteration: (the positions, what is left there)."""
         damping = 1.0
-        error, jacobian = self._linearise(goal, positions, light)
+        error, rotation = self._left(goal, positions, light)
         size = float(error @ error)
         for _ in range(_STEPS):
             if size < _DONE or damping > _HARSHEST:
                 break
-            moved = _moved(positions, error, jacobian, damping * size + _FLOOR, bounds)
-            next_error, next_jacobian = self._linearise(goal, moved, light)
-            next_size = float(next_error @ next_error)
-            if not next_size < size:
+            jacobian = self._slopes(rotation, light)
+            while damping <= _HARSHEST:
+                moved = _moved(positions, error, jacobian, damping * size + _FLOOR, bounds)
+                next_error, rotation = self._left(goal, moved, light)
+                next_size = float(next_error @ next_error)
+                if next_size < size:
+                    break
                 damping *= 8.0
-                continue
+            else:
+                break
             gained = size - next_size
-            positions, error, jacobian, size = moved, next_error, next_jacobian, next_size
+            positions, error, size = moved, next_error, next_size
             damping = max(damping / 8.0, _MILDEST)
             if gained < settle * (size + gained):
                 break
         return positions, error
 
-    def _linearise(
+    def _left(
         self, goal: "pin.SE3", positions: FloatArray, light: float
     ) -> tuple[FloatArray, FloatArray]:
-        """What is left to the goal (6,), seen from it, and how the joints change that (6, n).
+        """What is left to the goal, seen from it: (6,) and the rotation itself (3, 3).
 
         In Pinocchio's order, translations [m] first; rotations [rad] count by `light`.
         """
@@ -252,14 +236,25 @@ class Inverse:
 
         pin.computeJointJacobians(self._model, self._data, positions)
         pose = pin.updateFramePlacement(self._model, self._data, self._frame)
-        own = pin.getFrameJacobian(self._model, self._data, self._frame, pin.LOCAL)
         goal_from_flange = goal.actInv(pose)
-        rotation = goal_from_flange.rotation
-        error, jacobian = np.empty(6), np.empty_like(own)
-        error[:3], jacobian[:3] = goal_from_flange.translation, rotation @ own[:3]
-        error[3:] = light * pin.log3(rotation)
-        jacobian[3:] = light * pin.Jlog3(rotation) @ own[3:]
-        return error, jacobian
+        rotation, error = goal_from_flange.rotation, np.empty(6)
+        error[:3], error[3:] = goal_from_flange.translation, light * pin.log3(rotation)
+        return error, rotation
+
+    def _slopes(self, rotation: FloatArray, light: float) -> FloatArray:
+        """How the joints change what is left (6, n), where `_left` was called last."""
+        import pinocchio as pin
+
+        own = pin.getFrameJacobian(self._model, self._data, self._frame, pin.LOCAL)
+        jacobian: FloatArray = np.empty_like(own)
+        np.matmul(rotation, own[:3], out=jacobian[:3])
+        np.matmul(light * pin.Jlog3(rotation), own[3:], out=jacobian[3:])
+        return jacobian
+
+
+def _widest(turned: FloatArray, bounds: _Bounds) -> float:
+    """The largest of (n,) turns; a prismatic joint has none [rad]."""
+    return float(np.abs(turned[bounds.turning]).max(initial=0.0))
 
 
 def _moved(
@@ -269,7 +264,10 @@ def _moved(
     for _ in range(len(positions)):
         wish = positions - _step(jacobian, error, damping)
         moved = np.minimum(np.maximum(wish, bounds.lower), bounds.upper)
-        held = (moved == positions) & (wish != moved)
+        cut = moved != wish
+        if not cut.any():
+            break
+        held = cut & (moved == positions)
         if not held.any():
             break
         jacobian = np.where(held, 0.0, jacobian)
@@ -277,22 +275,21 @@ def _moved(
 
 
 def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray:
-    """The damped step; of the two equal forms the one with the smaller system."""
+    """The damped step; of the two equal forms the one with the smaller system.
+
+    LAPACK itself: numpy's way to it takes as long as the rest of a step.
+    """
     rows, columns = jacobian.shape
-    if columns > rows:
-        gram = jacobian @ jacobian.T
-        gram.flat[:: rows + 1] += damping
-        return np.asarray(jacobian.T @ np.linalg.solve(gram, error))
-    gram = jacobian.T @ jacobian
-    gram.flat[:: columns + 1] += damping
-    return np.asarray(np.linalg.solve(gram, jacobian.T @ error))
+    long = columns > rows
+    gram = jacobian @ jacobian.T if long else jacobian.T @ jacobian
+    gram.flat[:: len(gram) + 1] += damping
+    solved = dposv(gram, error if long else error @ jacobian)[1]
+    return np.asarray(solved @ jacobian if long else solved)
 
 
 def _effective_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
     """Lower and upper limits (n,) of the effective positions."""
-    ends = []
-    for limit in (robot.lower_rad, robot.upper_rad):
-        known = np.where(np.isfinite(limit), limit, 0.0)
-        moved = robot.chain.effective(known[None])[0]
-        ends.append(np.where(np.isfinite(limit), moved, limit))
-    return ends[0], ends[1]
+    limits = np.array([robot.lower_rad, robot.upper_rad])
+    known = np.isfinite(limits)
+    moved = np.where(known, robot.chain.effective(np.where(known, limits, 0.0)), limits)
+    return moved[0], moved[1]
