@@ -144,6 +144,8 @@ def _matrices(poses: Poses) -> FloatArray:
         raise DataError(
             f"correct: targets of shape (m, 4, 4) are needed, not {np.shape(given)}.",
         )
+    if not np.isfinite(matrices).all():
+        raise DataError("correct: a target has an entry that is no finite number.")
     rotations = matrices[:, :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     rigid = (off < _RIGID) & (np.linalg.det(rotations) > 0.0)

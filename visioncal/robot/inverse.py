@@ -88,6 +88,14 @@ class _Bounds:
         turns = np.where(self.turning, np.minimum(np.maximum(turns, least), most), 0.0)
         return np.asarray(positions + _TURN * turns)
 
+    def apart(self, turned: FloatArray) -> float:
+        """How far postures are apart that differ by (n,) positions; whole turns do not count.
+
+        A posture that is a whole turn away is the same branch of the arm; any other is not.
+        """
+        turns = np.where(self.turning, np.round(turned / _TURN), 0.0)
+        return float(np.linalg.norm(turned - _TURN * turns))
+
     def middle_and_half(self, around: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Middle (n,) and half (n,) of the range; about the given positions where it is open."""
         known = np.isfinite(self.lower) & np.isfinite(self.upper)
@@ -106,8 +114,8 @@ class Inverse:
 
     Method: Levenberg and Marquardt's, with a damping that follows the remaining error and so
     vanishes at the end (Sugihara 2011, Solvability-unconcerned inverse kinematics): quadratic where
-    the pose can be reached, and at the nearest pose where it cannot. Joints at a limit that would
-    leave it are held. Of an arm with more than six joints the step is the shortest one, so that it
+    the pose can be reached; where it cannot, the end is the nearest pose. Joints at a limit that
+    would leave it are held. Of an arm with more than six joints the step is the shortest one, so that it
     stays near to where it started. With fewer than six the position is reached and the rotation is
     as near as it can be.
 
@@ -132,7 +140,7 @@ class Inverse:
             base_from_flange: (4, 4) the pose [m].
             wanted: (n,) effective positions to start from [rad or m].
             widest_rad: Where a joint turns farther than this from there, other postures are looked
-                for, and the nearest of all is taken [rad].
+                for, and the nearest of all is taken, but for whole turns [rad].
 
         Returns:
             The posture; where none reaches the pose, the one that comes nearest.
@@ -146,7 +154,7 @@ class Inverse:
         tries = [first, *self._from_everywhere(goal, bounds, wanted)]
         reached = [it for it in tries if it.reached]
         if reached:
-            return min(reached, key=lambda it: float(np.linalg.norm(it.positions - wanted)))
+            return min(reached, key=lambda it: bounds.apart(it.positions - wanted))
         nearest = min(tries, key=lambda it: it.off_m**2 + it.off_rad**2)
         nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
         return replace(nearest, beyond=self._in_the_way(goal, wanted))

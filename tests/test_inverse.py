@@ -1,0 +1,155 @@
+"""Inverse kinematics: poses are reached, near to the seed and within the limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from visioncal.robot import Robot, load_robot, robot_names
+from visioncal.robot.chain import chain_document
+from visioncal.robot.inverse import Inverse
+
+# A wrist bent and an elbow bent: far from every singular posture of a UR.
+HOME = np.array([0.4, -1.3, 1.5, -1.75, -1.57, 0.3])
+
+
+def with_chain(robot: Robot, **changes) -> Robot:
+    return Robot.from_document(
+        chain_document(robot.name, robot.tip, replace(robot.chain, **changes))
+    )
+
+
+def disturbed(robot: Robot, rng: np.random.Generator) -> Robot:
+    """An arm whose links, gears and encoders all err."""
+    n = robot.joint_count
+    functions = np.column_stack([1e-3 * rng.normal(size=n), 1e-4 * rng.normal(size=n)])
+    functions = np.column_stack([functions, 1e-3 * rng.normal(size=(n, 2))])
+    functions[robot.chain.prismatic, 2:] = 0.0
+    return robot.corrected(5e-4 * rng.normal(size=(n + 1, 6)), functions)
+
+
+def reached(robot: Robot, pose, q, **options):
+    """The posture found from joint angles q, and its own joint angles."""
+    found = Inverse(robot).solve(pose, robot.chain.effective(q[None])[0], **options)
+    return found, robot.chain.encoded(found.positions[None])[0]
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_poses_are_reached_from_anywhere_within_the_limits(name):
+    rng = np.random.default_rng(3)
+    robot = disturbed(load_robot(name), rng)
+    q = rng.uniform(
+        np.maximum(robot.lower_rad, -3.0), np.minimum(robot.upper_rad, 3.0), (8, robot.joint_count)
+    )
+    for pose in robot.base_from_flange(q):
+        found, joints = reached(robot, pose, np.zeros(robot.joint_count), widest_rad=0.0)
+        assert found.reached
+        # A nanometre and a nanoradian, as promised.
+        assert robot.base_from_flange(joints[None])[0] == pytest.approx(pose, abs=1e-9)
+        assert (robot.lower_rad - 1e-12 <= joints).all()
+        assert (joints <= robot.upper_rad + 1e-12).all()
+
+
+def test_what_encoders_tell_is_what_positions_came_from():
+    robot = disturbed(load_robot("panda"), np.random.default_rng(4))
+    q = np.random.default_rng(5).uniform(-6.0, 6.0, (50, 7))
+    assert robot.chain.encoded(robot.chain.effective(q)) == pytest.approx(q, abs=1e-14)
+
+
+def test_the_branch_is_that_of_the_seed():
+    robot = load_robot("ur5e")
+    flipped = HOME * [1, 1, 1, 1, -1, 1] + [0, 0, 0, np.pi, 0, np.pi]
+    for seed in (HOME, flipped):
+        (pose,) = robot.base_from_flange(seed[None])
+        near = seed + np.random.default_rng(6).uniform(-0.2, 0.2, 6)
+        _, joints = reached(robot, pose, near)
+        # Newton's end is as exact as the pose, divided by the least singular value, some tenths.
+        assert joints == pytest.approx(seed, abs=1e-8)
+
+
+def test_whole_turns_keep_to_the_seed():
+    robot = disturbed(load_robot("ur5e"), np.random.default_rng(7))
+    turned = HOME + np.array([-2, 2, -2, 2, 2, -2]) * np.pi
+    (pose,) = robot.base_from_flange(turned[None])
+    _, joints = reached(robot, pose, turned + 0.1)
+    assert joints == pytest.approx(turned, abs=1e-8)
+    _, joints = reached(robot, pose, HOME + 0.1)
+    # A gear's ratio of 1 + 1e-4 makes a turn of the axis another one of the encoder: 1 mrad or so,
+    # and the same flange.
+    assert joints == pytest.approx(HOME, abs=5e-3)
+    assert np.abs(joints - HOME).max() > 1e-5
+    assert robot.base_from_flange(joints[None])[0] == pytest.approx(pose, abs=1e-9)
+
+
+def test_beyond_the_last_turn_it_goes_back_by_a_whole_one():
+    robot = load_robot("ur5e")
+    seed = np.array([*HOME[:5], 6.27])
+    past = np.array([*HOME[:5], 6.32])
+    (pose,) = robot.base_from_flange(past[None])
+    found, joints = reached(robot, pose, seed, widest_rad=1.0)
+    assert found.reached
+    # The same posture but for the turn: its other branches turn five joints.
+    assert joints == pytest.approx(past - [0, 0, 0, 0, 0, 2 * np.pi], abs=1e-8)
+
+
+def test_a_limit_in_the_way_is_named():
+    free = load_robot("irb120")
+    q = np.array([0.2, 0.4, 0.3, 0.5, 0.9, 0.1])
+    upper = free.upper_rad.copy()
+    upper[0] = -0.5
+    robot = with_chain(free, upper=upper, lower=np.array([-0.7, *free.lower_rad[1:]]))
+    (pose,) = free.base_from_flange(q[None])
+    found, joints = reached(robot, pose, q)
+    assert not found.reached
+    assert found.beyond == ("joint_1",)
+    assert joints[0] <= -0.5
+
+
+def test_out_of_reach_is_told_with_the_nearest_distance():
+    robot = load_robot("ur5e")
+    found, _ = reached(robot, np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 2.0, HOME)
+    assert not found.reached
+    assert found.beyond == ()
+    # A UR5e reaches 0.95 m from its shoulder at the most.
+    assert 1.0 < found.off_m < 1.3
+
+
+def test_a_seventh_joint_stays_near_to_the_seed():
+    robot = load_robot("panda")
+    seed = np.array([0.1, -0.5, 0.2, -2.0, 0.1, 1.6, 0.7])
+    (pose,) = robot.base_from_flange(seed[None])
+    shifted = pose.copy()
+    shifted[:3, 3] += 1e-3
+    found, joints = reached(robot, shifted, seed)
+    assert found.reached
+    shortest = np.linalg.pinv(robot.joint_jacobian(seed[None])[0])
+    step = shortest @ np.concatenate([np.zeros(3), pose[:3, :3].T @ np.full(3, 1e-3)])
+    # The shortest step of first order; the second order of 5 mrad is under 1e-4.
+    assert joints - seed == pytest.approx(step, abs=1e-4)
+
+
+def test_five_axes_reach_the_position_and_nearly_the_rotation():
+    six = load_robot("irb120")
+    keep = [0, 1, 2, 4, 5]
+    placements = six.chain.placements.copy()
+    placements[4] = placements[3] @ placements[4]
+    five = with_chain(
+        six,
+        joint_names=tuple(six.joint_names[it] for it in keep),
+        prismatic=six.chain.prismatic[keep],
+        axes=six.chain.axes[keep],
+        placements=np.delete(placements, 3, axis=0),
+        lower=six.lower_rad[keep],
+        upper=six.upper_rad[keep],
+        functions=six.chain.functions[keep],
+    )
+    real = disturbed(five, np.random.default_rng(8))
+    q = np.array([0.2, 0.3, 0.1, 0.7, 0.4])
+    (pose,) = five.base_from_flange(q[None])
+    found, joints = reached(real, pose, q)
+    assert found.reached
+    assert np.linalg.norm(real.base_from_flange(joints[None])[0, :3, 3] - pose[:3, 3]) < 1e-9
+    # Links that err by a milliradian or two.
+    assert 1e-5 < found.off_rad < 1e-2
+    pose[:3, :3] = pose[:3, :3] @ np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    assert not reached(real, pose, q)[0].reached
