@@ -115,9 +115,9 @@ class Inverse:
     Method: Levenberg and Marquardt's, with a damping that follows the remaining error and so
     vanishes at the end (Sugihara 2011, Solvability-unconcerned inverse kinematics): quadratic where
     the pose can be reached; where it cannot, the end is the nearest pose. Joints at a limit that
-    would leave it are held. Of an arm with more than six joints the step is the shortest one, so that it
-    stays near to where it started. With fewer than six the position is reached and the rotation is
-    as near as it can be.
+    would leave it are held. Of an arm with more than six joints the step is the shortest one, so
+    that it stays near to where it started. With fewer than six the position is reached, and the
+    rotation is as near as it can be.
 
     It holds Pinocchio's working memory: one object a thread.
     """
