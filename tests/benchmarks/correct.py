@@ -152,16 +152,16 @@ def main(worlds: int) -> None:
         )
     text = "\n".join(
         (
-            f"{worlds} worlds a row, 40 views each; 5 MP, 0.1 px, a robot that repeats to 0.03 mm",
-            "and 0.05 mrad. Targets all over the workspace; the error is that of the camera's place,",
-            "seen from the board. Nominal: the fit of both edges alone, and the nominal controller.",
-            "Medians over worlds of the root mean square.\n",
+            f"{worlds} worlds a row, 40 views each; 5 MP, 0.1 px, a robot that repeats to",
+            "0.03 mm and 0.05 mrad. Targets all over the workspace; the error is that of the",
+            "camera's place, seen from the board. Nominal: the fit of both edges alone, and the",
+            "nominal controller. Medians over worlds of the root mean square.\n",
             "| arm | nominal [mm] | corrected [mm] | share | targets in reach |",
             "| --- | --- | --- | --- | --- |",
             *rows,
             "",
-            f"What a target costs [ms], best of {REPEATS} runs. The processor's time is what the wall",
-            "clock shows on a machine that does nothing else; this one was shared.\n",
+            f"What a target costs [ms], best of {REPEATS} runs. The processor's time is what the",
+            "wall clock shows on a machine that does nothing else; this one was shared.\n",
             "| what | processor | wall clock |",
             "| --- | --- | --- |",
             *costs(result),

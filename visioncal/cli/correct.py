@@ -29,10 +29,9 @@ _TOOLS = "flange_from_"
 
 
 def correct_command(
-    source: Annotated[
+    targets: Annotated[
         Path,
         typer.Argument(
-            metavar="TARGETS",
             help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
             "base_from_flange; q1_rad ... may say which posture is meant; others are kept.",
         ),
@@ -61,8 +60,8 @@ def correct_command(
         str | None,
         typer.Option(
             metavar="Q1,Q2,...",
-            help="Joint angles near which the first target is reached [rad]; else the middle of "
-            "the joints' limits. Each further target is reached near to the one before.",
+            help="Joint angles near which the first target is reached, in radians; else the "
+            "middle of the joints' limits. Each further target is reached near to the one before.",
         ),
     ] = None,
     widest_deg: Annotated[
@@ -88,31 +87,33 @@ def correct_command(
     written_to = None if out is None or out == Path("-") else out
     if written_to is not None:
         check_free(written_to, force=force)
-    targets = read_targets(source, arm.real)
+    wanted = read_targets(targets, arm.real)
     flange_from_tool = _tool(known, tool)
-    base_from_flange = targets.base_from_tool @ invert(flange_from_tool)
+    base_from_flange = wanted.base_from_tool @ invert(flange_from_tool)
     corrected = correct(
         known,
         base_from_flange,
-        _seeds(targets.q_seed, seed_joints),
+        _seeds(wanted.q_seed, seed_joints),
         widest_rad=np.deg2rad(_widest(widest_deg)),
     )
-    lost = tuple(_unreachable(targets, corrected))
+    lost = tuple(_unreachable(wanted, corrected))
     rows = np.flatnonzero(corrected.reached)
     if lost and (not skip or not len(rows)):
-        raise _refusal(lost, len(targets))
+        raise _refusal(lost, len(wanted))
     sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3])
     base_from_tool = corrected.base_from_flange @ flange_from_tool
-    columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
+    columns = columns_to_send(wanted, corrected, base_from_tool, sigma_mm)
     if written_to is not None:
-        write_atomically(written_to, table_to_send(targets, columns, rows))
+        write_atomically(written_to, table_to_send(wanted, columns, rows))
     if as_json:
-        write_stdout(json.dumps(_document(targets, columns, rows, lost), indent=2) + "\n")
+        write_stdout(json.dumps(_document(wanted, columns, rows, lost), indent=2) + "\n")
         return
     if written_to is None:
-        write_stdout(table_to_send(targets, columns, rows))
-    warnings = [*_doubts(known), *_turns(arm, targets, corrected, widest_deg)]
+        write_stdout(table_to_send(wanted, columns, rows))
+    warnings = [*_doubts(known), *_turns(arm, wanted, corrected, widest_deg)]
     _tell(columns, rows, lost, warnings)
+    if np.isnan(wanted.q_seed).all() and seed_joints is None:
+        messages().print(escape(_posture(arm, corrected.q[rows[0]])))
     if written_to is not None:
         messages().print(escape(f"wrote {written_to}"))
 
@@ -203,6 +204,19 @@ def _turns(
         )
     if len(wide) > _SHOWN:
         yield f"And {len(wide) - _SHOWN} more targets of the kind."
+
+
+def _posture(arm: CalibratedArm, q: FloatArray) -> str:
+    """Says in which posture targets without a seed begin."""
+    turning = ~arm.real.chain.prismatic
+    words = [
+        f"{np.rad2deg(it):.0f}" if turns else f"{1e3 * it:.0f} mm"
+        for it, turns in zip(q, turning, strict=True)
+    ]
+    return (
+        f"the first is reached in the posture nearest to the middle of the joints' limits, "
+        f"({', '.join(words)}) deg; --seed-joints begins in another"
+    )
 
 
 def _tell(
