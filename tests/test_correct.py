@@ -316,7 +316,7 @@ def test_json_has_the_same_numbers(stored, result):
     command = ("correct", table, "-c", stored, "--seed-joints", SEED)
     document = json.loads(run(*command, "--json").out)
     rows = rows_of(run(*command).out)
-    assert document["unreachable"] == []
+    assert document["unreachable"] == document["warnings"] == []
     for target, row in zip(document["targets"], rows, strict=True):
         assert target["view"] == row["view"]
         assert [target[it] for it in JOINTS] == pytest.approx(numbers(row, JOINTS), abs=1e-9)
@@ -332,6 +332,20 @@ def test_another_branch_is_told(stored, result):
     assert "no posture nearer was found" in done.err
     assert "warning" not in run(*command, "--widest-deg", 160).err
     assert run(*command, "--widest-deg", 0).status == 2
+
+
+def test_singular_postures_are_told(stored, result):
+    """A UR's wrist is singular where joint 5 is zero; the way through turns joint 4 far."""
+    joints = np.tile([*HOME[:4], 0.0, 0.3], (41, 1))
+    joints[:, 4] = np.linspace(-0.1, 0.1, 41)
+    table = write_poses(stored / "t.csv", result.robot.base_from_flange(joints))
+    done = run("correct", table, "-c", stored, "--seed-joints", "0.4,-1.3,1.5,-1.75,-0.1,0.3")
+    assert done.status == 0, done.err
+    assert "nearly singular; at t.csv, line 2" in done.err
+    # Reached all the same, to the digits of the table.
+    for row, pose in zip(rows_of(done.out), result.robot.base_from_flange(joints), strict=True):
+        (there,) = result.base_from_flange(numbers(row, JOINTS)[None]).as_matrix()
+        assert there == pytest.approx(pose, abs=1e-6)
 
 
 def test_what_is_no_table_of_targets_is_named(stored, result):

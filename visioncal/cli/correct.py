@@ -25,6 +25,9 @@ from visioncal.types import FloatArray, IntArray
 
 _SHOWN = 10
 _MOST_DEG = 720.0
+# Elsewhere a millimetre turns no joint by more than some tenths of a degree; beyond the second, how
+# far it is matters no more.
+_SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
 _TOOLS = "flange_from_"
 
 
@@ -103,14 +106,19 @@ def correct_command(
     sigma_mm = predicted_sigma_mm(known, base_from_flange[:, :3, 3])
     base_from_tool = corrected.base_from_flange @ flange_from_tool
     columns = columns_to_send(wanted, corrected, base_from_tool, sigma_mm)
+    warnings = [
+        *_doubts(known),
+        *_turns(arm, wanted, corrected, widest_deg),
+        *_singular(arm, wanted, corrected.q, rows),
+    ]
     if written_to is not None:
         write_atomically(written_to, table_to_send(wanted, columns, rows))
     if as_json:
-        write_stdout(json.dumps(_document(wanted, columns, rows, lost), indent=2) + "\n")
+        document = _document(wanted, columns, rows, lost) | {"warnings": warnings}
+        write_stdout(json.dumps(document, indent=2) + "\n")
         return
     if written_to is None:
         write_stdout(table_to_send(wanted, columns, rows))
-    warnings = [*_doubts(known), *_turns(arm, wanted, corrected, widest_deg)]
     _tell(columns, rows, lost, warnings)
     if np.isnan(wanted.q_seed).all() and seed_joints is None:
         messages().print(escape(_posture(arm, corrected.q[rows[0]])))
@@ -204,6 +212,23 @@ def _turns(
         )
     if len(wide) > _SHOWN:
         yield f"And {len(wide) - _SHOWN} more targets of the kind."
+
+
+def _singular(arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArray) -> Iterator[str]:
+    """Says where a correction of a millimetre turns a joint far, and so does the way there."""
+    turns = arm.turns_deg_per_mm(q[rows])
+    near = np.flatnonzero(turns.max(axis=1) > _SINGULAR_DEG)
+    if not len(near):
+        return
+    worst = near[int(np.argmax(turns[near].max(axis=1)))]
+    joint = int(np.argmax(turns[worst]))
+    most = float(turns[worst, joint])
+    far = f"{most:.0f}" if most < _MOST_TURN_DEG else f"over {_MOST_TURN_DEG:.0f}"
+    yield (
+        f"{some_of([targets.places[rows[it]] for it in near])}: nearly singular; at "
+        f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "
+        f"{far} deg. Move slowly there, or keep away from it."
+    )
 
 
 def _posture(arm: CalibratedArm, q: FloatArray) -> str:

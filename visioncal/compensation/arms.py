@@ -46,6 +46,19 @@ class CalibratedArm:
             )
         return cls(nominal, real)
 
+    def turns_deg_per_mm(self, q: FloatArray) -> FloatArray:
+        """How far joints turn at the most for a millimetre of the flange, its rotation kept.
+
+        Args:
+            q: (m, n) joint positions [rad or m].
+
+        Returns:
+            (m, n) degrees a millimetre, large near singular postures; zero for a prismatic joint.
+        """
+        joints_by_flange = np.linalg.pinv(self.real.joint_jacobian(q))
+        turns = np.linalg.norm(joints_by_flange[:, :, 3:], axis=2)
+        return np.where(self.real.chain.prismatic, 0.0, 1e-3 * np.rad2deg(turns))
+
 
 def _without_arm(calibration: Calibration) -> DataError:
     name = calibration.session_name
