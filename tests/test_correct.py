@@ -137,6 +137,10 @@ def test_one_target_or_many_as_matrices_or_transforms(result):
     as_transforms = result.base_from_flange(many.q)
     assert visioncal.correct(result, as_transforms, HOME).q == pytest.approx(many.q, abs=1e-7)
     assert len(visioncal.correct(result, np.empty((0, 4, 4)))) == 0
+    # Printed to five digits, a matrix is no rotation; the nearest one is reached.
+    rounded = visioncal.correct(result, np.round(flange, 5), HOME)
+    assert rounded.reached.all()
+    assert rounded.q == pytest.approx(many.q, abs=1e-3)
 
 
 def test_each_target_follows_the_one_before_it(result):

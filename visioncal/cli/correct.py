@@ -14,7 +14,7 @@ from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.stdout import write_stdout
 from visioncal.compensation.arms import CalibratedArm, predicted_sigma_mm
-from visioncal.compensation.correct import WIDEST_RAD, Corrected, correct
+from visioncal.compensation.correction import WIDEST_RAD, Corrected, correct
 from visioncal.compensation.table import Targets, columns_to_send, read_targets, table_to_send
 from visioncal.errors import DataError
 from visioncal.figures import figure

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.compensation.correct import FAR_M, WIDE_RAD, Corrected
+from visioncal.compensation.correction import FAR_M, WIDE_RAD, Corrected
 from visioncal.documents import TextTable, is_number, read_table
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean, some_of

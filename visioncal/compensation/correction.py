@@ -12,7 +12,7 @@ from visioncal.compensation.arms import CalibratedArm
 from visioncal.errors import DataError
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse, Posture
-from visioncal.transforms import invert, rotation_angle
+from visioncal.transforms import compose, invert, nearest_rotation, rotation_angle
 from visioncal.types import FloatArray, Mask
 
 # Transforms, or their (4, 4) or (m, 4, 4) matrices.
@@ -25,6 +25,8 @@ WIDEST_RAD = float(np.pi / 2)
 FAR_M, WIDE_RAD = 20.0, 4 * np.pi
 # Poses come with five digits or more; a matrix that is off by more is no rotation.
 _RIGID = 1e-4
+# No rotation is at a matrix that is off by more: it is written with fewer digits than count here.
+_ROUNDED = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +167,8 @@ def _matrices(poses: Poses) -> FloatArray:
             culprits=[f"target {at}"],
             next_step="Positions are in metres.",
         )
+    if off.max(initial=0.0) > _ROUNDED:
+        return compose(nearest_rotation(rotations), matrices[:, :3, 3])
     return matrices
 
 
