@@ -134,6 +134,8 @@ def test_one_target_or_many_as_matrices_or_transforms(result):
     one = visioncal.correct(result, flange[1], joints_near(3)[1])
     assert len(one) == 1
     assert one.q[0] == pytest.approx(many.q[1], abs=1e-12)
+    arm = visioncal.CalibratedArm.of(result)
+    assert np.array_equal(visioncal.correct(arm, flange, joints_near(3)).q, many.q)
     as_transforms = result.base_from_flange(many.q)
     assert visioncal.correct(result, as_transforms, HOME).q == pytest.approx(many.q, abs=1e-7)
     assert len(visioncal.correct(result, np.empty((0, 4, 4)))) == 0
@@ -176,7 +178,7 @@ def test_without_a_seed_it_is_the_posture_nearest_to_the_middle(result):
         (2 * np.eye(4), None, "rigid"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), None, "rigid"),
         (np.eye(4) + 400 * np.eye(4, k=3), None, "no arm reaches"),
-        (np.full((4, 4), np.nan), None, "no finite number"),
+        (np.full((4, 4), np.nan), None, "rigid"),
         (np.eye(4), np.zeros(5), "seeds of shape"),
         (np.eye(4), [0, 90, 0, 0, 0, 0], "degrees"),
         (np.eye(4), [0, np.nan, 0, 0, 0, 0], "no finite number"),

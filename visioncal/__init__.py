@@ -17,7 +17,7 @@ from visioncal.version import __version__
 
 if TYPE_CHECKING:
     from visioncal.calibration import Calibration
-    from visioncal.compensation import Corrected, correct
+    from visioncal.compensation import CalibratedArm, Corrected, correct
     from visioncal.errors import (
         ConvergenceError,
         DataError,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from visioncal.session import Session
 
 _HOMES = {
+    "CalibratedArm": "visioncal.compensation",
     "Calibration": "visioncal.calibration",
     "Corrected": "visioncal.compensation",
     "correct": "visioncal.compensation",
@@ -57,6 +58,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "CalibratedArm",
     "Calibration",
     "ConvergenceError",
     "Corrected",

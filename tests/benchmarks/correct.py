@@ -108,6 +108,7 @@ def costs(result: visioncal.Calibration) -> list[str]:
     line = np.tile(result.robot.base_from_flange(HOME[None]), (TARGETS, 1, 1))
     line[:, 1, 3] += np.linspace(0.0, 0.3, TARGETS)
     singles = list(zip(flange[:100], q, strict=False))
+    prepared = visioncal.CalibratedArm.of(result)
     lost = flange[:5].copy()
     lost[:, :3, 3] *= 4.0
     works = (
@@ -115,7 +116,9 @@ def costs(result: visioncal.Calibration) -> list[str]:
          lambda: visioncal.correct(result, flange, q)),
         (f"one call for a line of {TARGETS} targets, 0.6 mm apart", TARGETS,
          lambda: visioncal.correct(result, line, HOME)),
-        ("a call a target, started from its nominal joints", len(singles),
+        ("a call a target, the arm prepared once", len(singles),
+         lambda: [visioncal.correct(prepared, pose, near) for pose, near in singles]),
+        ("a call a target, of the calibration itself", len(singles),
          lambda: [visioncal.correct(result, pose, near) for pose, near in singles]),
         ("a call a target without a seed: all branches", 10,
          lambda: [visioncal.correct(result, pose) for pose in flange[:10]]),

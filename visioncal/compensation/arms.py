@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.robot import Robot
+from visioncal.robot.inverse import Inverse
 from visioncal.types import FloatArray
 
 # A place's sigma is that of so many places of the map around it.
@@ -20,13 +21,17 @@ _LEAST_JOINTS = 3
 class CalibratedArm:
     """An arm as its controller believes it to be, and as it was found.
 
+    What `correct` needs besides the targets is prepared here: for a loop, once and for each thread.
+
     Attributes:
         nominal: What the controller computes with.
         real: What the calibration found.
+        inverse: The inverse kinematics of the real arm.
     """
 
     nominal: Robot
     real: Robot
+    inverse: Inverse
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
@@ -44,7 +49,7 @@ class CalibratedArm:
                 "to reach a position.",
                 culprits=[real.name],
             )
-        return cls(nominal, real)
+        return cls(nominal, real, Inverse(real))
 
     def turns_deg_per_mm(self, q: FloatArray) -> FloatArray:
         """How far joints turn at the most for a millimetre of the flange, its rotation kept.

@@ -11,7 +11,7 @@ from visioncal.calibration import Calibration
 from visioncal.compensation.arms import CalibratedArm
 from visioncal.errors import DataError
 from visioncal.robot import Robot
-from visioncal.robot.inverse import Inverse, Posture
+from visioncal.robot.inverse import Posture
 from visioncal.transforms import compose, invert, nearest_rotation, rotation_angle
 from visioncal.types import FloatArray, Mask
 
@@ -72,7 +72,7 @@ class Corrected:
 
 
 def correct(
-    calibration: Calibration,
+    calibration: Calibration | CalibratedArm,
     base_from_flange: Poses,
     q_seed: FloatArray | Sequence[float] | None = None,
     *,
@@ -85,7 +85,7 @@ def correct(
     flange at `q`, from which the controller finds `q` again.
 
     Args:
-        calibration: Of a calibrated arm.
+        calibration: Of a calibrated arm; or that arm, prepared once by `CalibratedArm.of`.
         base_from_flange: The targets, in the calibration's base [m]: (4, 4), (m, 4, 4) or
             transforms.
         q_seed: (n,) where the first is looked for, and each further one from the target before it;
@@ -97,10 +97,11 @@ def correct(
     Raises:
         DataError: The calibration has no calibrated arm, or a target or a seed is none.
     """
-    arm = CalibratedArm.of(calibration)
+    known = calibration
+    arm = known if isinstance(known, CalibratedArm) else CalibratedArm.of(known)
     wanted = _matrices(base_from_flange)
     own = _seeds(q_seed, arm.real, len(wanted))
-    chain, inverse = arm.real.chain, Inverse(arm.real)
+    chain, inverse = arm.real.chain, arm.inverse
     seeds = chain.effective(own)
     seeded = np.asarray(np.isfinite(own).all(axis=1))
     last: FloatArray | None = None
@@ -146,11 +147,11 @@ def _matrices(poses: Poses) -> FloatArray:
         raise DataError(
             f"correct: targets of shape (m, 4, 4) are needed, not {np.shape(given)}.",
         )
-    if not np.isfinite(matrices).all():
-        raise DataError("correct: a target has an entry that is no finite number.")
     rotations = matrices[:, :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid = (off < _RIGID) & (np.linalg.det(rotations) > 0.0)
+    rigid = off < _RIGID
+    if rigid.all():
+        rigid = np.linalg.det(rotations) > 0.0
     if not rigid.all():
         at = int(np.argmin(rigid))
         raise DataError(
