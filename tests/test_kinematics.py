@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimator.workspace import observability, pose_slopes, postures
+from visioncal.estimator.workspace import pose_slopes, postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows
-from visioncal.pipeline.arm import workspace_mm
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, fine_camera, forward, simulate
 from visioncal.simulation.arms import inverse
@@ -155,22 +154,11 @@ def test_predictions_move_as_their_derivatives_say(mount):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_thirty_values_of_a_six_axis_arm_are_told_by_one_board(mount):
-    """Everett and Hsu (1988): 4 a revolute joint and 6 for the frames: 24 + 6."""
-    known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=5)))
-    model, edges = known.arm_model, known.solved.edges
-    units = np.concatenate([np.full(12, 1e-3), np.full(len(model.values), 1e-3)])
-    seen = observability(model, edges, mount, known.joints(known.used), units)
-    assert (seen.columns, seen.rank, seen.told) == (48, 30, 30)
-    assert 1.0 < seen.condition < 1e4
-
-
-@pytest.mark.parametrize("mount", MOUNTS)
 def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
     cell = simulate(replace(WRONG_LINKS, seed=6, mount=mount, target=sure))
     known = calibrated(cell)
-    sigma = 1e-3 * float(np.sqrt(np.mean(workspace_mm(known, known.arm_model) ** 2)))
+    sigma = float(np.sqrt(np.mean(known.telling.sigmas_m**2)))
     bound = workspace_bound_m(cell, postures(known.robot)[::20])
     # The bound knows the size of each error; the fit estimates one size and the noise's levels from
     # 30 views, which tell them to a tenth. Twenty postures stand for all to about as much.

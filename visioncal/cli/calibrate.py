@@ -12,6 +12,7 @@ from visioncal.cli.console import messages, print_summary, shown_progress
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import run
+from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.types import SolverName
 
@@ -31,6 +32,12 @@ def calibrate_command(
             help="The arm: auto, hand-eye (none comes out), offsets (of its joints), kinematics."
         ),
     ] = "auto",
+    convention: Annotated[
+        Convention | None,
+        typer.Option(
+            help="Of the arm's joint table in the result; the stated one where it is left out."
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print calibration.json to stdout.")
     ] = False,
@@ -47,7 +54,7 @@ def calibrate_command(
     loaded = Session.load(session)
     left = leftover(out)
     with shown_progress(quiet=as_json) as told:
-        result = run(loaded, solver=solver, level=level, progress=told)
+        result = run(loaded, solver=solver, level=level, convention=convention, progress=told)
         told("write", 0, 1)
         if left is not None:
             left.keep()

@@ -60,19 +60,28 @@ class ArmModel:
     @cached_property
     def robot(self) -> Robot:
         """The arm with its errors, up to the frame of the reported poses."""
+        mounted = np.zeros((self.nominal.joint_count + 1, 6))
+        mounted[-1] = log(self.flange_from_reported)
+        return self.bare.corrected(mounted)
+
+    @cached_property
+    def bare(self) -> Robot:
+        """The arm with its errors, up to its own flange."""
+        return self.nominal.corrected(*self.changes(self.values))
+
+    def changes(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What (p,) values change: twists (n + 1, 6) of the placements, and functions (n, 4)."""
         count, at = self.nominal.joint_count, 0
         placements, functions = np.zeros((count + 1, 6)), np.zeros((count, 4))
         for name, weight in self.weights.items():
             size = _size(name, count)
-            block = weight * self.values[at : at + size]
+            block = weight * values[at : at + size]
             at += size
             if name == "links":
                 placements[1:] += block.reshape(-1, 6) * TWIST_UNITS
             else:
                 functions[:, _FUNCTIONS[name]] += block.reshape(-1, count).T
-        mounted = np.zeros((count + 1, 6))
-        mounted[-1] = log(self.flange_from_reported)
-        return self.nominal.corrected(placements, functions).corrected(mounted)
+        return placements, functions
 
     def columns(self, name: str, q: FloatArray) -> FloatArray:
         """How the reported frame moves with a block's errors.

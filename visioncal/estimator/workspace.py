@@ -1,45 +1,26 @@
 """What a calibrated arm is worth where it was not measured: the whole workspace."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Edges
 from visioncal.robot import Robot
-from visioncal.transforms import adjoint, invert
+from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import FloatArray, Mount
 
 # Postures that stand for the workspace, and how far a joint without limits turns.
 _POSTURES, _TURN_RAD = 400, np.pi
-# Directions that move the flange by less than this share of the best told are not told at all.
-_LEAST_SHARE = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class Observability:
-    """What poses of the target in the camera can tell of an arm.
-
-    Attributes:
-        columns: How many values are carried: both edges and the arm's errors.
-        rank: How many of them any posture tells apart.
-        told: How many of them the used stops tell apart.
-        condition: Largest over smallest singular value of what is told, in units of the errors'
-            standard deviations.
-    """
-
-    columns: int
-    rank: int
-    told: int
-    condition: float
+def turning_range(robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """How far joints turn (or move), at most half a turn either way: (n,) least and greatest."""
+    return np.maximum(robot.lower_rad, -_TURN_RAD), np.minimum(robot.upper_rad, _TURN_RAD)
 
 
 def postures(robot: Robot, count: int = _POSTURES) -> FloatArray:
     """(k, n) joint angles all over the workspace, above the base's plane [rad]."""
     rng = np.random.default_rng(0)
-    lower = np.maximum(robot.lower_rad, -_TURN_RAD)
-    upper = np.minimum(robot.upper_rad, _TURN_RAD)
-    q = rng.uniform(lower, upper, (count, robot.joint_count))
+    q = rng.uniform(*turning_range(robot), (count, robot.joint_count))
     above = robot.base_from_flange(q)[:, 2, 3] > 0.0
     # A positioner may hang below the plane altogether.
     return q[above] if above.any() else q
@@ -59,66 +40,60 @@ def pose_slopes(model: ArmModel, edges: Edges, mount: Mount, q: FloatArray) -> F
     Returns:
         (m, 6, 12 + p) right perturbations of `cam_from_target`.
     """
-    flange, moved = model.robot.base_from_flange(q), model.basis(q)
+    return chain_slopes(edges, mount, model.robot.base_from_flange(q), model.basis(q))
+
+
+def chain_slopes(
+    edges: Edges, mount: Mount, base_from_flange: FloatArray, moved: FloatArray
+) -> FloatArray:
+    """How the predicted pose of the target moves with both edges and with anything of the arm.
+
+    Args:
+        edges: x and z.
+        mount: Where the camera is.
+        base_from_flange: (m, 4, 4) the flange.
+        moved: (m, 6, p) its right perturbations.
+
+    Returns:
+        (m, 6, 12 + p) right perturbations of `cam_from_target`.
+    """
+    cam_from_target = _cam_from_target(edges, mount, base_from_flange)
     if mount == "eye-in-hand":
-        target_from_flange = invert(edges.z) @ flange
-        cam_from_target = invert(target_from_flange @ edges.x)
-        by_arm = -adjoint(target_from_flange) @ moved
-        by_z = np.broadcast_to(np.eye(6), (len(q), 6, 6))
+        by_arm = -adjoint(invert(edges.z) @ base_from_flange) @ moved
     else:
-        cam_from_target = invert(edges.x) @ flange @ edges.z
         by_arm = adjoint(invert(edges.z)) @ moved
-        by_z = np.broadcast_to(np.eye(6), (len(q), 6, 6))
+    by_z = np.broadcast_to(np.eye(6), (len(moved), 6, 6))
     by_x = -adjoint(invert(cam_from_target))
     return np.concatenate([by_x, by_z, by_arm], axis=2)
 
 
-def workspace_sigmas(
-    model: ArmModel, edges: Edges, mount: Mount, spread: FloatArray, at: FloatArray
+def tool_slopes(
+    model: ArmModel, edges: Edges, mount: Mount, at: FloatArray, q: FloatArray
 ) -> FloatArray:
-    """Predicted sigma of a tool's place all over the workspace.
+    """How the place of what the flange carries moves, seen from what stands still.
+
+    That is the camera's centre, seen from the target, or a point of the target, seen from the
+    camera.
 
     Args:
         model: The arm.
         edges: x and z.
         mount: Where the camera is.
-        spread: (12 + p, 12 + p) covariance of both edges and the arm's errors.
-        at: (3,) the point that is looked at, in the target's frame [m].
+        at: (3,) the point of a target that the flange carries, in its frame [m].
+        q: (m, n) joint angles [rad].
 
     Returns:
-        (k,) root of the trace of the point's covariance at each of k postures [m].
+        (m, 3, 12 + p) derivatives of its place, up to a rotation [m].
     """
-    slopes = pose_slopes(model, edges, mount, postures(model.robot))
-    turn = np.cross(np.eye(3), at)
-    place = np.concatenate([turn, np.eye(3)], axis=1) @ slopes
-    return np.asarray(np.sqrt(np.einsum("mij,jk,mik->m", place, spread, place)))
+    slopes = pose_slopes(model, edges, mount, q)
+    if mount == "eye-in-hand":
+        flange = model.robot.base_from_flange(q)
+        at = invert(_cam_from_target(edges, mount, flange))[:, :3, 3]
+    turned = -skew(np.broadcast_to(at, (len(q), 3))) @ slopes[:, :3]
+    return np.asarray(turned + slopes[:, 3:])
 
 
-def observability(
-    model: ArmModel, edges: Edges, mount: Mount, q: FloatArray, sigmas: FloatArray
-) -> Observability:
-    """Counts what the stops tell, and what any stops could.
-
-    Args:
-        model: The arm.
-        edges: x and z.
-        mount: Where the camera is.
-        q: (m, n) joint angles of the stops [rad].
-        sigmas: (12 + p,) what one unit of each value is.
-    """
-    everywhere = _singular(model, edges, mount, postures(model.robot), sigmas)
-    here = _singular(model, edges, mount, q, sigmas)
-    told = here[here > _LEAST_SHARE * here[0]]
-    return Observability(
-        len(sigmas),
-        int(np.sum(everywhere > _LEAST_SHARE * everywhere[0])),
-        len(told),
-        float(told[0] / told[-1]),
-    )
-
-
-def _singular(
-    model: ArmModel, edges: Edges, mount: Mount, q: FloatArray, sigmas: FloatArray
-) -> FloatArray:
-    slopes = pose_slopes(model, edges, mount, q).reshape(-1, len(sigmas)) * sigmas
-    return np.asarray(np.linalg.svd(slopes, compute_uv=False))
+def _cam_from_target(edges: Edges, mount: Mount, base_from_flange: FloatArray) -> FloatArray:
+    if mount == "eye-in-hand":
+        return invert(base_from_flange @ edges.x) @ edges.z
+    return np.asarray(invert(edges.x) @ base_from_flange @ edges.z)

@@ -13,7 +13,7 @@ from visioncal.estimator.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
-from visioncal.robot import Robot
+from visioncal.robot import Convention, Robot
 from visioncal.session import Session
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
@@ -22,6 +22,7 @@ from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.refine import Refined, remade
+from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
 
@@ -50,11 +51,13 @@ class Known:
         agreed: Which of them do.
         free: Lens and board as all views see them together; None without corners.
         level: How far to go: `auto`, `hand-eye`, `offsets` or `kinematics`.
+        convention: Of the joint table in which the arm is told; None for the stated one.
         arm: Errors that follow the arm's posture, where they are likely.
         kinematics: Which of them the views tell; None where that was not asked or cannot be.
         arm_model: The arm with these errors; None where it stays nominal.
         hand_eye: Both unknown edges.
         diagnosis: What the residuals show beyond noise.
+        telling: What the stops tell of a calibrated arm.
         held_out: Residuals of used views, left out of the fit.
         findings: What the verdict is made of.
         verdict: Whether to trust it all.
@@ -79,11 +82,13 @@ class Known:
     agreed: Agreed | None = None
     free: Free | None = None
     level: str = "auto"
+    convention: Convention | None = None
     arm: ArmErrors | None = None
     kinematics: Kinematics | None = None
     arm_model: ArmModel | None = None
     hand_eye: HandEyeResult | None = None
     diagnosis: Diagnosis | None = None
+    telling: Telling | None = None
     held_out: HeldOut | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None

@@ -18,6 +18,7 @@ from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.pipeline.views import view_evidence
+from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES
@@ -45,6 +46,7 @@ def calibrate(
     *,
     solver: SolverName = "joint",
     level: str = "auto",
+    convention: Convention | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrates a session.
@@ -54,6 +56,8 @@ def calibrate(
         solver: `joint` for the fit of both edges, or the name of a closed form.
         level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
             arm, `offsets` of its joints, or its `kinematics`.
+        convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
+            `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         progress: Told of long work.
 
     Returns:
@@ -64,7 +68,9 @@ def calibrate(
         DegenerateError: The motion leaves a direction of the answer open.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    return run(session, solver=solver, level=level, progress=progress).calibration
+    return run(
+        session, solver=solver, level=level, convention=convention, progress=progress
+    ).calibration
 
 
 def run(
@@ -72,6 +78,7 @@ def run(
     *,
     solver: SolverName = "joint",
     level: str = "auto",
+    convention: Convention | None = None,
     progress: Progress | None = None,
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
@@ -79,8 +86,10 @@ def run(
         raise DataError(f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.")
     if level not in _LEVELS:
         raise DataError(f"level {level!r} is not one of {', '.join(_LEVELS)}.")
+    if convention is not None and convention not in CONVENTIONS:
+        raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    known = Known(loaded, solver, progress, level=level)
+    known = Known(loaded, solver, progress, level=level, convention=convention)
     seen: Known | None = None
     for at, stage in enumerate(STAGES):
         if progress is not None:

@@ -15,7 +15,7 @@ from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import BLOCKS, ArmModel
 from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
-from visioncal.pipeline.arm import workspace_mm
+from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
@@ -282,15 +282,17 @@ def _validate(known: Known) -> Known:
     return replace(known, held_out=held_out)
 
 
-def _workspace_mm(known: Known) -> float | None:
-    model = known.arm_model
-    return None if model is None else float(np.median(workspace_mm(known, model)))
+def _tell(known: Known) -> Known:
+    telling = telling_of(known)
+    advice = () if telling is None or not telling.advice else (telling.advice,)
+    return replace(known, telling=telling, notes=(*known.notes, *advice))
 
 
 def _judge(known: Known) -> Known:
     held, diagnosis, agreed = known.held_out, known.diagnosis, known.agreed
     if held is None or diagnosis is None or agreed is None:
         raise RuntimeError("the verdict comes before what it is made of")
+    telling = known.telling
     findings = Findings(
         views=view_results(known),
         stops=len(np.unique(known.stops)),
@@ -309,7 +311,7 @@ def _judge(known: Known) -> Known:
         diagnosis=diagnosis,
         warnings=known.warnings,
         notes=known.notes,
-        workspace_mm=_workspace_mm(known),
+        workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
     )
     return replace(known, findings=findings, verdict=judge(findings))
 
@@ -326,6 +328,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("kinematics", _kinematics),
     Stage("hand-eye", _hand_eye),
     Stage("diagnose", _diagnose),
+    Stage("tell", _tell),
     Stage("validate", _validate),
     Stage("judge", _judge),
 )

@@ -20,7 +20,7 @@ from visioncal.types import FloatArray, Mask
 PARALLEL_RAD = float(np.deg2rad(5.0))
 # Axes closer than this are parallel [rad], and meet when they pass so close [m]: a common normal at
 # 1e8 times their offset has lost as many digits as the angle that is neglected.
-_EXACTLY = 1e-8
+EXACTLY = 1e-8
 # Rounding of a product of a few transforms with entries near 1.
 _ROUNDING = 1e-12
 
@@ -72,7 +72,7 @@ def convert_table(
     for place, row in enumerate(_rows(table)):
         link = replace(row, theta=row.theta + moved[0], d=row.d + moved[1])
         flat = bool(parallel[place + 1])
-        keeps = link.d == 0.0 or bool(off[place + 1] < _EXACTLY) if flat else link.beta == 0.0
+        keeps = link.d == 0.0 or bool(off[place + 1] < EXACTLY) if flat else link.beta == 0.0
         rows.append(link if keeps else _between(link.transform, link, flat=flat))
         moved = np.zeros(2) if keeps else _left_over(link.transform, rows[-1])
     return _with_rows(replace(table, convention=convention, parallel=parallel), rows)
@@ -164,7 +164,7 @@ def _with_rows(table: DHTable, rows: list[_Row]) -> DHTable:
 
 def _about_z(chain: Chain) -> Chain:
     """The chain with each joint's frame turned so that its axis is z."""
-    turns = np.array([np.eye(4), *map(_swing, chain.axes), np.eye(4)])
+    turns = np.array([np.eye(4), *map(swing, chain.axes), np.eye(4)])
     return replace(
         chain,
         axes=np.tile([0.0, 0.0, 1.0], (len(chain), 1)),
@@ -172,10 +172,10 @@ def _about_z(chain: Chain) -> Chain:
     )
 
 
-def _swing(direction: FloatArray) -> FloatArray:
+def swing(direction: FloatArray) -> FloatArray:
     """The least rotation (4, 4) that takes z to a unit vector."""
     x, y, z = direction
-    if z < _EXACTLY - 1.0:
+    if z < EXACTLY - 1.0:
         return np.diag([1.0, -1.0, -1.0, 1.0])
     cross = skew(np.array([-y, x, 0.0]))
     return compose(np.eye(3) + cross + cross @ cross / (1.0 + z), np.zeros(3))
@@ -202,13 +202,13 @@ def _between(link: FloatArray, hint: _Row, *, flat: bool) -> _Row:
         flat: Whether the row is Hayati's, with beta and d = 0.
     """
     direction, position = link[:3, 2], link[:3, 3]
-    parallel = bool(_off_parallel(direction) < _EXACTLY)
+    parallel = bool(_off_parallel(direction) < EXACTLY)
     if not (flat or parallel):
         return _common_normal(direction, position, hint)
     d = hint.d if parallel else 0.0
     x, y, _ = position - direction * (position[2] - d) / direction[2]
     a = float(np.hypot(x, y))
-    if a < _EXACTLY:
+    if a < EXACTLY:
         theta, sign = hint.theta, 1.0
         a = float(np.cos(theta) * x + np.sin(theta) * y)
     else:
@@ -227,7 +227,7 @@ def _common_normal(direction: FloatArray, position: FloatArray, hint: _Row) -> _
     normal = np.array([-direction[1], direction[0]]) / sine
     a, alpha = float(position[:2] @ normal), float(np.arctan2(sine, direction[2]))
     along = position[:2] @ direction[:2] / sine**2
-    forward = a > 0.0 or abs(a) < _EXACTLY
+    forward = a > 0.0 or abs(a) < EXACTLY
     theta, sign = _nearer(float(np.arctan2(normal[1], normal[0])), hint.theta, forward=forward)
     d = float(position[2] - along * direction[2])
     return _Row(theta, d, sign * a, _near(sign * alpha, hint.alpha))
@@ -247,7 +247,7 @@ def _nearer(theta: float, hint: float, *, forward: bool) -> tuple[float, float]:
     """
     way, back = _near(theta, hint), _near(theta + np.pi, hint)
     gain = abs(back - hint) - abs(way - hint)
-    if abs(gain) < _EXACTLY:
+    if abs(gain) < EXACTLY:
         gain = 1.0 if forward else -1.0
     return (way, 1.0) if gain > 0.0 else (back, -1.0)
 
@@ -256,7 +256,7 @@ def _base(placement: FloatArray, nominal: FloatArray, first: FloatArray) -> Floa
     """The base so that the first axis is z behind it and X_0, as near to the nominal as can be."""
     away = invert(nominal @ first) @ placement
     direction, position = away[:3, 2], away[:3, 3]
-    tilt = _swing(direction)
+    tilt = swing(direction)
     tilt[:3, 3] = position - direction * (position @ direction)
     if np.abs(tilt - np.eye(4)).max() < _ROUNDING:
         return nominal

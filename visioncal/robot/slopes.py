@@ -1,0 +1,143 @@
+"""How the numbers of a joint table move with an arm's geometry, and the arm with the numbers.
+
+Both follow from one 6 x 5 matrix a row: how the end of `Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)`
+moves with its five numbers. Four of them at a time, and a screw about the next axis that goes into
+the next row, span all motions; so each row takes what it can of a link's motion and hands on the
+rest, as `table_of` does with finite ones.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.robot.chain import Chain, chain_document
+from visioncal.robot.conversion import EXACTLY, swing
+from visioncal.robot.model import Robot
+from visioncal.robot.tables import DHTable, about_x, chain_of_table
+from visioncal.transforms import adjoint, exp, invert
+from visioncal.types import FloatArray
+
+# The numbers of a row, in the order of the last axis of what is returned here.
+ROW_NAMES = ("theta", "d", "a", "alpha", "beta")
+_THETA, _D, _A, _ALPHA, _BETA = range(5)
+# A screw's turn about and way along z, as rows of a twist.
+_Z = [2, 5]
+
+
+def table_moves(
+    robot: Robot, table: DHTable, placements: FloatArray, functions: FloatArray
+) -> FloatArray:
+    """How a robot's table moves with its geometry.
+
+    Args:
+        robot: The robot.
+        table: `table_of(robot, ..., like=...)`: what the derivatives are of.
+        placements: (p, n + 1, 6) twists of the placements, as `Robot.corrected` takes them.
+        functions: (p, n, 4) changes of the joints' functions that go with them.
+
+    Returns:
+        (p, n, 5) derivatives of theta, d, a, alpha and beta of each Z_i X_i [rad and m]. What a
+        row keeps by the table's convention has zeros: beta or d, and a and alpha behind the last
+        axis, where the flange takes all that is not about or along it.
+    """
+    count, chain = len(table), robot.chain
+    twists = _seen_about_z(chain, placements, functions)
+    moves = np.zeros((len(placements), count, 5))
+    frames = _Frames(table, chain)
+    # What a row hands on: a turn about the next axis and a way along it, (p, 2).
+    screw = (twists[:, 0] @ adjoint(frames.rest[0]).T)[:, _Z]
+    for row in range(count - 1):
+        link = twists[:, row + 1] + screw @ adjoint(invert(frames.links[row]))[:, _Z].T
+        held = _columns(table, row)
+        basis = np.concatenate([_row_jacobian(table, row)[:, held], np.eye(6)[:, _Z]], axis=1)
+        seen = link @ adjoint(frames.rest[row + 1]).T
+        found = np.linalg.lstsq(basis, seen.T, rcond=None)[0].T
+        moves[:, row, held], screw = found[:, :-2], found[:, -2:]
+    last = twists[:, count] + screw @ adjoint(invert(frames.links[-1]))[:, _Z].T
+    across = about_x(table.a_m[-1], table.alpha_rad[-1], table.beta_rad[-1])
+    moves[:, -1, [_THETA, _D]] = (last @ adjoint(across @ table.flange).T)[:, _Z]
+    return moves
+
+
+def number_slopes(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How the flange moves with the numbers of a table.
+
+    Args:
+        table: The table.
+        q: (m, n) joint angles [rad or m].
+
+    Returns:
+        (m, 6, n + 1, 5) right perturbations of `base_from_flange` for a unit of theta, d, a, alpha
+        and beta; first those of X_0, which has no theta and d, then of each Z_i X_i. And
+        (m, 6, n, 4) for a unit of the joints' functions.
+    """
+    # All conventions are one product of their numbers; this one may have a beta or none.
+    chain = chain_of_table(replace(table, convention="hayati"))
+    robot = Robot.from_document(chain_document(table.name, table.tip, chain))
+    moved = robot.placement_jacobian(q).reshape(len(q), 6, len(table) + 1, 6)
+    ends = np.array([_row_jacobian(table, row) for row in range(-1, len(table))])
+    ends[0, :, [_THETA, _D]] = 0.0
+    ends[-1] = adjoint(invert(table.flange)) @ ends[-1]
+    functions = robot.function_jacobian(q).reshape(len(q), 6, len(table), -1)
+    return np.einsum("mirj,rjk->mirk", moved, ends), functions
+
+
+class _Frames:
+    """A table's links as its robot has them, in frames with z along the axes.
+
+    Attributes:
+        rest: (n, 4, 4) what each row, the first of the base, leaves to the next axis.
+        links: (n, 4, 4) the placements behind each joint, turned so that axes are z.
+    """
+
+    def __init__(self, table: DHTable, chain: Chain) -> None:
+        placed = chain.with_offsets_placed()
+        turns = np.array([np.eye(4), *map(swing, placed.axes), np.eye(4)])
+        placements = invert(turns[:-1]) @ placed.placements @ turns[1:]
+        along = table.along_z @ table.along_x[1:]
+        rest = [invert(table.base @ table.along_x[0]) @ placements[0]]
+        for row in range(len(table) - 1):
+            rest.append(invert(along[row]) @ rest[-1] @ placements[row + 1])
+        self.rest, self.links = np.array(rest), placements[1:]
+
+
+def _seen_about_z(chain: Chain, placements: FloatArray, functions: FloatArray) -> FloatArray:
+    """Twists (p, n + 1, 6) with the functions' offsets in them, in frames with z along the axes."""
+    twists = np.array(placements)
+    # A joint's offset is placed behind the twist of its frame.
+    placed = exp(chain.twists * chain.functions[:, :1])
+    twists[:, :-1] = np.einsum("nij,pnj->pni", adjoint(invert(placed)), twists[:, :-1])
+    twists[:, :-1] += functions[:, :, :1] * chain.twists
+    turns = np.array([*map(swing, chain.axes), np.eye(4)])
+    return np.asarray(np.einsum("nij,pnj->pni", adjoint(invert(turns)), twists))
+
+
+def _row_jacobian(table: DHTable, row: int) -> FloatArray:
+    """(6, 5) twists of the end of Z_i X_i by theta, d, a, alpha and beta; row -1 is X_0 alone."""
+    a, alpha, beta = table.a_m[row + 1], table.alpha_rad[row + 1], table.beta_rad[row + 1]
+    zero = np.zeros(())
+    behind_z, behind_a = about_x(a, alpha, beta), about_x(zero, alpha, beta)
+    about_y = about_x(zero, zero, beta)
+    along_z, along_x = adjoint(invert(behind_z)), adjoint(invert(behind_a))
+    columns = [
+        along_z[:, 2],
+        along_z[:, 5],
+        along_x[:, 3],
+        adjoint(invert(about_y))[:, 0],
+        np.eye(6)[:, 1],
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _columns(table: DHTable, row: int) -> list[int]:
+    """Which numbers of a row move; the others stay by the convention or because nothing tells them.
+
+    Between exactly parallel axes d stays, and theta too where the axes are one.
+    """
+    has_beta = bool(table.parallel[row + 1])
+    alpha, beta = table.alpha_rad[row + 1], table.beta_rad[row + 1]
+    next_axis = about_x(np.zeros(()), alpha, beta)[:3, 2]
+    if not has_beta and np.hypot(next_axis[0], next_axis[1]) >= EXACTLY:
+        return [_THETA, _D, _A, _ALPHA]
+    turning = [] if abs(float(table.a_m[row + 1])) < EXACTLY else [_THETA]
+    return [*turning, _A, *([_ALPHA, _BETA] if has_beta else [])]

@@ -1,0 +1,295 @@
+"""Stage 7: what the stops tell of a calibrated arm, and what it is worth all over its workspace."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.closure import Closure
+from visioncal.estimator.indices import Indices
+from visioncal.estimator.lacking import Move, joints_to_move
+from visioncal.estimator.linalg import one_blas_thread
+from visioncal.estimator.parameters import (
+    Parameter,
+    free_parameters,
+    parameter_moves,
+    parameter_slopes,
+)
+from visioncal.estimator.told import (
+    EDGES,
+    WHOLE_POSE,
+    Slopes,
+    Told,
+    count_told,
+    mean_weight,
+    posture_slopes,
+    stop_slopes,
+    what_is_told,
+)
+from visioncal.estimator.untold import Null, dominant_words, joint_words, null_of, null_words
+from visioncal.estimator.workspace import chain_slopes, pose_slopes, postures, tool_slopes
+from visioncal.estimator.worth import stop_worth
+from visioncal.figures import figure
+from visioncal.robot import (
+    Convention,
+    DHTable,
+    Robot,
+    convert_table,
+    parallel_axes,
+    table_from_document,
+    table_of,
+)
+from visioncal.stages.handeye import HandEyeResult
+from visioncal.types import FloatArray, IntArray, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A number of the arm's table.
+
+    Attributes:
+        parameter: Which.
+        nominal: As stated [rad or m].
+        identified: As found.
+        sigma: Standard deviation of what was found. What the stops do not tell keeps about what was
+            stated, and the sigma of the arm's errors.
+    """
+
+    parameter: Parameter
+    nominal: float
+    identified: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Telling:
+    """What the stops tell of the arm.
+
+    Attributes:
+        convention: Of the table whose numbers are told.
+        estimates: Its numbers that are not held.
+        told: What the stops tell, and what any stops could.
+        indices: How well; None where they tell nothing of the arm.
+        not_told: What they do not, in words: first what no stops tell.
+        advice: What to do where other stops would tell more; empty where they would not.
+        worth: (m,) by which share the mean predicted variance of the places below would grow
+            without each stop, lens and board as they are.
+        places: (k, 3) of the flange all over the workspace, in the base's frame [m].
+        sigmas_m: (k,) predicted sigma of the place of what the flange carries there [m].
+    """
+
+    convention: Convention
+    estimates: tuple[Estimate, ...]
+    told: Told
+    indices: Indices | None
+    not_told: tuple[str, ...]
+    advice: str
+    worth: FloatArray
+    places: FloatArray
+    sigmas_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ArmData:
+    """What was seen of an arm whose errors are estimated.
+
+    Attributes:
+        data: The views, one a stop; the arm's errors are the last of what they share.
+        result: The answer.
+        model: The arm.
+        error_rad: The size of its errors.
+        q: (m, n) joint angles of the stops [rad].
+        at: (3,) the point of a target that the flange carries, in its frame [m].
+        frames: (f,) which of the unknowns are frames of which nothing is known, x and z first.
+        measured: (6,) which components of the target's pose are seen (rotation, translation).
+    """
+
+    data: Closure
+    result: HandEyeResult
+    model: ArmModel
+    error_rad: float
+    q: FloatArray
+    at: FloatArray
+    frames: IntArray = field(default_factory=EDGES.copy)
+    measured: Mask = field(default_factory=WHOLE_POSE.copy)
+
+    @property
+    def units(self) -> FloatArray:
+        """(p,) the size of each of the arm's errors."""
+        return np.full(len(self.model.values), self.error_rad)
+
+    @property
+    def chain(self) -> IntArray:
+        """(f + p,) which of the unknowns are frames and the arm's errors."""
+        size, errors = len(self.result.covariance), len(self.model.values)
+        return np.concatenate([self.frames, np.arange(size - errors, size)])
+
+
+def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
+    """Says what the stops tell of an arm, and what it is worth.
+
+    Args:
+        arm: What was seen of it.
+        convention: Of the table that is wanted; None for the stated one, or Hayati's where axes are
+            nearly parallel, which has no leap there.
+    """
+    anywhere = postures(arm.model.robot)
+    with one_blas_thread():
+        numbers = _numbers(arm.model, convention)
+        noise = arm.result.noise
+        weight = mean_weight(arm.data, arm.result.edges, noise, arm.measured)
+        told = what_is_told(_at_stops(arm), _at(arm, anywhere, weight))
+        null = _null(arm, numbers, anywhere, weight)
+        lacking = _Lacking(
+            null.without(numbers.moves @ (arm.error_rad * told.missing)),
+            _moves(arm, told, weight) if told.missing.size else (),
+        )
+        place = _place_slopes(arm, anywhere)
+        seen = arm.result.covariance[np.ix_(arm.chain, arm.chain)]
+        sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, seen, place))
+        worth = stop_worth(arm.data, arm.result.edges, noise, place, arm.chain)
+    nominal = arm.model.nominal
+    return Telling(
+        convention=numbers.before.convention,
+        estimates=tuple(_estimates(arm, numbers)),
+        told=told,
+        indices=Indices.of(told.values, len(arm.data)) if len(told.values) else None,
+        not_told=(
+            *null_words(null, numbers.parameters, nominal, arm.data.mount),
+            *_missing_words(lacking, numbers.parameters, nominal),
+        ),
+        advice=_advice(lacking, told, numbers.parameters, nominal),
+        worth=worth,
+        places=arm.model.robot.base_from_flange(anywhere)[:, :3, 3],
+        sigmas_m=sigmas_m,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbers:
+    """The arm's table as stated and as found, and how its free numbers (k) move with the errors."""
+
+    before: DHTable
+    after: DHTable
+    parameters: tuple[Parameter, ...]
+    moves: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Lacking:
+    """How the table's numbers (k, n) move in what is not told, and the joints that would tell."""
+
+    changes: FloatArray
+    moves: tuple[Move, ...]
+
+
+def _numbers(model: ArmModel, convention: Convention | None) -> _Numbers:
+    before = _stated_table(model.nominal)
+    if convention is None and parallel_axes(model.nominal).any():
+        convention = "hayati"
+    before = convert_table(before, convention or before.convention)
+    after = table_of(model.bare, before.convention, like=before)
+    parameters = free_parameters(model, before)
+    return _Numbers(before, after, parameters, parameter_moves(model, after, parameters))
+
+
+def _stated_table(robot: Robot) -> DHTable:
+    if "convention" in robot.document:
+        return table_from_document(robot.document)
+    return table_of(robot, "standard")
+
+
+def _at_stops(arm: ArmData) -> Slopes:
+    return stop_slopes(
+        arm.data,
+        arm.result.edges,
+        arm.result.noise,
+        arm.units,
+        frames=arm.frames,
+        measured=arm.measured,
+    )
+
+
+def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Slopes:
+    """Slopes at other stops, with joint angles (m, n)."""
+    slopes = pose_slopes(arm.model, arm.result.edges, arm.data.mount, q)
+    return posture_slopes(slopes, weight, arm.units)
+
+
+def _null(arm: ArmData, numbers: _Numbers, anywhere: FloatArray, weight: FloatArray) -> Null:
+    """What no stops tell of the nominal arm's numbers; its axes are exactly as they are meant."""
+    model, parameters = arm.model, numbers.parameters
+    moved = parameter_slopes(numbers.before, parameters, anywhere, model.flange_from_reported)
+    flange = model.nominal.base_from_flange(anywhere) @ model.flange_from_reported
+    slopes = chain_slopes(arm.result.edges, arm.data.mount, flange, moved)
+    return null_of(posture_slopes(slopes, weight, np.array([it.unit for it in parameters])))
+
+
+def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
+    """The joints that would tell what is missing, for noise that is alike at all stops."""
+
+    def count(q: FloatArray) -> int:
+        return count_told(_at(arm, q, weight))
+
+    return joints_to_move(arm.model.robot, arm.q, count, told.identifiable - told.told)
+
+
+def _place_slopes(arm: ArmData, q: FloatArray) -> FloatArray:
+    """How the place of what the flange carries moves with the chain's unknowns, (m, 3, f + p)."""
+    place = tool_slopes(arm.model, arm.result.edges, arm.data.mount, arm.at, q)
+    others = np.zeros((len(q), 3, len(arm.frames) - len(EDGES)))
+    return np.concatenate([place[:, :, EDGES], others, place[:, :, len(EDGES) :]], axis=2)
+
+
+def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
+    size, links = len(arm.units), arm.error_rad * arm.model.weights.get("links", 1.0)
+    spread = arm.result.covariance[-size:, -size:]
+    sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, spread, numbers.moves))
+    for parameter, sigma, moves in zip(numbers.parameters, sigmas, numbers.moves, strict=True):
+        # Where the base or the flange takes a number's place it is as open as it was beforehand.
+        known = 0.0 if moves.any() else links * parameter.unit
+        yield Estimate(
+            parameter,
+            parameter.value(numbers.before),
+            parameter.value(numbers.after),
+            float(max(sigma, known)),
+        )
+
+
+def _missing_words(
+    lacking: _Lacking, parameters: Sequence[Parameter], robot: Robot
+) -> Iterator[str]:
+    if not lacking.changes.size:
+        return
+    named = dominant_words(lacking.changes, parameters, robot)
+    if not lacking.moves:
+        yield f"these stops do not tell {named}"
+        return
+    moved = " and ".join(
+        f"{joint_words(it.joint, robot)} moved by {_length(it.moved, it.joint, robot)} only"
+        for it in lacking.moves
+    )
+    yield f"{moved}, too little to tell {named}"
+
+
+def _advice(lacking: _Lacking, told: Told, parameters: Sequence[Parameter], robot: Robot) -> str:
+    reasons = list(_missing_words(lacking, parameters, robot))
+    if not reasons:
+        return ""
+    further = "Add stops in which the arm stands otherwise, all over the workspace."
+    if lacking.moves:
+        joints = " and ".join(
+            f"joint {it.joint + 1} by {_length(it.wanted, it.joint, robot)}" for it in lacking.moves
+        )
+        further = f"Add stops that turn {joints} or more."
+    return (
+        f"The stops tell {told.told} of the {told.identifiable} values that can be told of this "
+        f"arm and its frames: {reasons[0]}. What is not told stays about as stated. {further}"
+    )
+
+
+def _length(way: float, joint: int, robot: Robot) -> str:
+    if robot.chain.prismatic[joint]:
+        return f"{figure(1e3 * way)} mm"
+    return f"{figure(float(np.rad2deg(way)))} deg"
