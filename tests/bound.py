@@ -97,7 +97,7 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
     scale = 1.0 / np.sqrt(np.diag(information))
     spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
     at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheet)
-    turn = np.concatenate([np.cross(np.eye(3), at), np.eye(3)], axis=1)
+    turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
     slopes = [turn @ _carried(cell, it) @ _pose_slopes(cell, it) for it in q]
     return float(np.sqrt(np.mean([np.trace(it @ spread @ it.T) for it in slopes])))
 
