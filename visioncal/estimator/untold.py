@@ -32,17 +32,11 @@ class Null:
 
     Attributes:
         directions: (r, k) reduced to row echelon form: each but for a few numbers is zero.
-        pivots: (r,) which number each is of; zero in all others.
         frames: (12, r) how the frames at both ends of the chain make up for each.
     """
 
     directions: FloatArray
-    pivots: tuple[int, ...]
     frames: FloatArray
-
-    def without(self, changes: FloatArray) -> FloatArray:
-        """The same (k, n) changes, with nothing in the pivots."""
-        return np.asarray(changes - self.directions.T @ changes[list(self.pivots)])
 
 
 def null_of(slopes: Slopes) -> Null:
@@ -53,15 +47,14 @@ def null_of(slopes: Slopes) -> Null:
     """
     _, free = slopes.free()
     sizes, turned = right_vectors(free)
-    directions, pivots = _echelon(turned[sizes <= LEAST_SHARE * sizes[0]])
+    directions = _echelon(turned[sizes <= LEAST_SHARE * sizes[0]])
     made_up = np.linalg.lstsq(slopes.frames, slopes.arm @ directions.T, rcond=LEAST_SHARE)[0]
-    return Null(directions, pivots, np.asarray(made_up))
+    return Null(directions, np.asarray(made_up))
 
 
-def _echelon(rows: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
+def _echelon(rows: FloatArray) -> FloatArray:
     """Reduced row echelon form of (r, k) independent rows, the largest pivots first."""
     rows = rows.copy()
-    pivots: list[int] = []
     for at in range(len(rows)):
         left = np.abs(rows[at:])
         row, column = divmod(int(np.argmax(left)), left.shape[1])
@@ -69,8 +62,22 @@ def _echelon(rows: FloatArray) -> tuple[FloatArray, tuple[int, ...]]:
         rows[at] /= rows[at, column]
         others = np.arange(len(rows)) != at
         rows[others] -= np.outer(rows[others, column], rows[at])
-        pivots.append(column)
-    return np.where(np.abs(rows) < _NOTHING, 0.0, rows), tuple(pivots)
+    return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
+
+
+def imitated(numbers: Slopes, arm: Slopes, directions: FloatArray) -> FloatArray:
+    """The least changes of a table's numbers that do what some errors of the arm do.
+
+    Args:
+        numbers: Slopes by the frames and by the table's numbers, at some postures.
+        arm: Slopes by the frames and by the arm's errors, at the same.
+        directions: (p, n) errors of the arm.
+
+    Returns:
+        (k, n) changes of the numbers, in the units of their slopes.
+    """
+    (_, by_numbers), (_, by_arm) = numbers.free(), arm.free()
+    return np.asarray(np.linalg.lstsq(by_numbers, by_arm @ directions, rcond=LEAST_SHARE)[0])
 
 
 def null_words(
@@ -146,16 +153,20 @@ def joint_words(joint: int, robot: Robot) -> str:
     return f"joint {joint + 1} ({robot.joint_names[joint]})"
 
 
+def listed(words: Sequence[str]) -> str:
+    """Words one after the other, with an `and` before the last."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def _listed(named: Sequence[Parameter], robot: Robot) -> str:
-    words = [_thing(it, robot) for it in named]
-    return f"{', '.join(words[:-1])} and {words[-1]}"
+    return listed([_thing(it, robot) for it in named])
 
 
 def dominant_words(changes: FloatArray, parameters: Sequence[Parameter], robot: Robot) -> str:
-    """Names the numbers that make up most of (k, n) changes of a table."""
-    units = np.array([it.unit for it in parameters])
-    sizes = np.linalg.norm(changes / units[:, None], axis=1)
-    largest = np.argsort(-sizes, kind="stable")[:_MOST_NAMED]
+    """Names the numbers that make up most of (k, n) changes of a table, in units of their size."""
+    sizes = np.linalg.norm(changes, axis=1)
+    largest = np.argsort(-sizes, kind="stable")[:_MOST_NAMED].tolist()
     kept = sorted(at for at in largest if sizes[at] >= _NAMED_SHARE * sizes.max())
-    named = [parameters[at] for at in kept]
-    return _thing(named[0], robot) if len(named) == 1 else _listed(named, robot)
+    words = [_thing(parameters[at], robot) for at in kept]
+    return listed([*words, "others"] if len(words) < changes.shape[1] else words)

@@ -27,7 +27,14 @@ from visioncal.estimator.told import (
     stop_slopes,
     what_is_told,
 )
-from visioncal.estimator.untold import Null, dominant_words, joint_words, null_of, null_words
+from visioncal.estimator.untold import (
+    dominant_words,
+    imitated,
+    joint_words,
+    listed,
+    null_of,
+    null_words,
+)
 from visioncal.estimator.workspace import chain_slopes, pose_slopes, postures, tool_slopes
 from visioncal.estimator.worth import stop_worth
 from visioncal.figures import figure
@@ -139,12 +146,13 @@ def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
         numbers = _numbers(arm.model, convention)
         noise = arm.result.noise
         weight = mean_weight(arm.data, arm.result.edges, noise, arm.measured)
-        told = what_is_told(_at_stops(arm), _at(arm, anywhere, weight))
-        null = _null(arm, numbers, anywhere, weight)
-        lacking = _Lacking(
-            null.without(numbers.moves @ (arm.error_rad * told.missing)),
-            _moves(arm, told, weight) if told.missing.size else (),
-        )
+        by_arm, by_numbers = _at(arm, anywhere, weight), _by_numbers(arm, numbers, anywhere, weight)
+        told, null = what_is_told(_at_stops(arm), by_arm), null_of(by_numbers)
+        lacking = None
+        if told.missing.size:
+            lacking = _Lacking(
+                imitated(by_numbers, by_arm, told.missing), _moves(arm, told, weight)
+            )
         place = _place_slopes(arm, anywhere)
         seen = arm.result.covariance[np.ix_(arm.chain, arm.chain)]
         sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, seen, place))
@@ -157,9 +165,9 @@ def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
         indices=Indices.of(told.values, len(arm.data)) if len(told.values) else None,
         not_told=(
             *null_words(null, numbers.parameters, nominal, arm.data.mount),
-            *_missing_words(lacking, numbers.parameters, nominal),
+            *([_missing_words(lacking, numbers.parameters, nominal)] if lacking else []),
         ),
-        advice=_advice(lacking, told, numbers.parameters, nominal),
+        advice=_advice(lacking, told, numbers.parameters, nominal) if lacking else "",
         worth=worth,
         places=arm.model.robot.base_from_flange(anywhere)[:, :3, 3],
         sigmas_m=sigmas_m,
@@ -178,7 +186,7 @@ class _Numbers:
 
 @dataclass(frozen=True, eq=False)
 class _Lacking:
-    """How the table's numbers (k, n) move in what is not told, and the joints that would tell."""
+    """What numbers of the table (k, n) do what is not told, and the joints that would tell."""
 
     changes: FloatArray
     moves: tuple[Move, ...]
@@ -217,13 +225,13 @@ def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Slopes:
     return posture_slopes(slopes, weight, arm.units)
 
 
-def _null(arm: ArmData, numbers: _Numbers, anywhere: FloatArray, weight: FloatArray) -> Null:
-    """What no stops tell of the nominal arm's numbers; its axes are exactly as they are meant."""
+def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArray) -> Slopes:
+    """Slopes by the nominal arm's numbers, whose axes are exactly as they are meant."""
     model, parameters = arm.model, numbers.parameters
-    moved = parameter_slopes(numbers.before, parameters, anywhere, model.flange_from_reported)
-    flange = model.nominal.base_from_flange(anywhere) @ model.flange_from_reported
+    moved = parameter_slopes(numbers.before, parameters, q, model.flange_from_reported)
+    flange = model.nominal.base_from_flange(q) @ model.flange_from_reported
     slopes = chain_slopes(arm.result.edges, arm.data.mount, flange, moved)
-    return null_of(posture_slopes(slopes, weight, np.array([it.unit for it in parameters])))
+    return posture_slopes(slopes, weight, np.array([it.unit for it in parameters]))
 
 
 def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
@@ -257,35 +265,28 @@ def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
         )
 
 
-def _missing_words(
-    lacking: _Lacking, parameters: Sequence[Parameter], robot: Robot
-) -> Iterator[str]:
-    if not lacking.changes.size:
-        return
+def _missing_words(lacking: _Lacking, parameters: Sequence[Parameter], robot: Robot) -> str:
     named = dominant_words(lacking.changes, parameters, robot)
     if not lacking.moves:
-        yield f"these stops do not tell {named}"
-        return
-    moved = " and ".join(
-        f"{joint_words(it.joint, robot)} moved by {_length(it.moved, it.joint, robot)} only"
-        for it in lacking.moves
+        return f"these stops do not tell {named}"
+    first, *others = (
+        (joint_words(it.joint, robot), _length(it.moved, it.joint, robot)) for it in lacking.moves
     )
-    yield f"{moved}, too little to tell {named}"
+    moved = listed([f"{first[0]} moved by {first[1]}", *(f"{it} by {way}" for it, way in others)])
+    return f"{moved} only, too little to tell {named}"
 
 
 def _advice(lacking: _Lacking, told: Told, parameters: Sequence[Parameter], robot: Robot) -> str:
-    reasons = list(_missing_words(lacking, parameters, robot))
-    if not reasons:
-        return ""
     further = "Add stops in which the arm stands otherwise, all over the workspace."
     if lacking.moves:
-        joints = " and ".join(
+        joints = [
             f"joint {it.joint + 1} by {_length(it.wanted, it.joint, robot)}" for it in lacking.moves
-        )
-        further = f"Add stops that turn {joints} or more."
+        ]
+        further = f"Add stops that move {listed(joints)} or more."
     return (
         f"The stops tell {told.told} of the {told.identifiable} values that can be told of this "
-        f"arm and its frames: {reasons[0]}. What is not told stays about as stated. {further}"
+        f"arm and its frames: {_missing_words(lacking, parameters, robot)}. What is not told stays "
+        f"about as stated. {further}"
     )
 
 
