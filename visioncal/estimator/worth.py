@@ -3,7 +3,7 @@
 import numpy as np
 
 from visioncal.estimator.closure import Closure, Edges, Noise, closure_information, weighted_slopes
-from visioncal.estimator.linalg import covariance
+from visioncal.estimator.linalg import covariance, gram
 from visioncal.types import FloatArray, IntArray
 
 
@@ -32,7 +32,7 @@ def stop_worth(
     spread = camera + robot
     slopes = (spread @ weighted)[:, :, free]
     fitted = covariance(closure_information(data, edges, noise)[np.ix_(free, free)])
-    mean = np.einsum("mij,mik->jk", place, place) / len(place)
+    mean = gram(place, place) / len(place)
     gain = slopes @ fitted
     left = spread - gain @ np.swapaxes(slopes, 1, 2)
     growth = np.einsum("mij,mji->m", covariance(left), gain @ mean @ np.swapaxes(gain, 1, 2))
