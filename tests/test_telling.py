@@ -11,7 +11,7 @@ from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimator.closure import Closure, closure_information
+from visioncal.estimator.closure import Closure, Shared, closure_information
 from visioncal.estimator.indices import Indices, singular_values
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.parameters import free_parameters, parameter_moves
@@ -126,6 +126,32 @@ def test_ranks_are_those_of_theory(name, mount):
     assert (told.identifiable, told.told, told.missing.shape[1]) == (expected, expected, 0)
     # Forty stops all over the workspace tell all of it well.
     assert len(told.values) == expected - 12
+
+
+@pytest.mark.parametrize("name", ["ur5e", "irb120", "panda"])
+def test_readings_of_one_point_tell_three_values_less(name):
+    """A point of the tool has a place and no direction."""
+    robot = load_robot(name)
+    arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
+    whole, point = tell(arm).told, tell(replace(arm, measured=np.arange(6) > 2)).told
+    assert (point.identifiable, point.told) == (whole.identifiable - 3, whole.told - 3)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_second_board_adds_six_values(mount):
+    robot = load_robot("ur5e")
+    arm = arm_data(robot, postures(robot)[:40], mount)
+    seen = np.where(np.arange(40)[:, None, None] % 2 == 1, np.eye(6), 0.0)
+    place = Shared(np.zeros((6, 6)), np.zeros(6), np.zeros(6), seen, np.zeros_like(seen))
+    data = replace(arm.data, shared=place.joined(arm.data.shared))
+    edges = replace(arm.result.edges, shared=np.zeros(6 + len(arm.units)))
+    spread = covariance(closure_information(data, edges, NOISE))
+    result = replace(arm.result, edges=edges, covariance=spread)
+    telling = tell(replace(arm, data=data, result=result, frames=np.arange(18)))
+    told = telling.told
+    assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
+    # Half of the stops have a board of their own to place: they tell less of the arm.
+    assert np.median(telling.sigmas_m) > np.median(tell(arm).sigmas_m)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

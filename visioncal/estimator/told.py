@@ -55,9 +55,8 @@ class Slopes:
         Both are exact where nothing is known of the frames.
         """
         scale = np.linalg.norm(self.frames, axis=0)
-        basis, sizes, _ = np.linalg.svd(
-            self.frames / np.where(scale > 0.0, scale, 1.0), full_matrices=False
-        )
+        shown = scale > LEAST_SHARE * scale.max()
+        basis, sizes, _ = np.linalg.svd(self.frames[:, shown] / scale[shown], full_matrices=False)
         basis = basis[:, sizes > LEAST_SHARE * sizes[0]]
         return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
 
