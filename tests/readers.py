@@ -309,6 +309,9 @@ FIXTURE_READERS = {
     "fanuc-uframe": fanuc_uframe,
 }
 
+# Those of an arm, which test_arm_exports.py reads.
+ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")
+
 # By the format's name: every format that holds any transform.
 READERS = {
     "ros": ros,

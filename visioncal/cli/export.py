@@ -61,18 +61,27 @@ def export_command(
         tuple[float, float, float] | None,
         typer.Option("--cog-mm", help="Its centre of mass in the flange's frame: X Y Z [mm]."),
     ] = None,
+    convention: Annotated[
+        str | None,
+        typer.Option("--convention", help="robot-dh: standard, modified (Craig) or hayati."),
+    ] = None,
+    calibration_hash: Annotated[
+        str | None,
+        typer.Option("--hash", help="ur-kinematics: the hash that ur_calibration extracts."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     _list: Annotated[
         bool,
         typer.Option("--list", callback=_show_formats, is_eager=True, help="List the formats."),
     ] = False,
 ) -> None:
-    """Write a result in another program's or a robot's format.
+    """Write a result in another program's or a robot's format, or the arm that was calibrated.
 
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
     nothing was written, for the reason given.
     """
-    selection = Selection(edge, inverse, parent, child, number, _load(mass_kg, cog_mm))
+    load = _load(mass_kg, cog_mm)
+    selection = Selection(edge, inverse, parent, child, number, load, convention, calibration_hash)
     written = document(load_placed(source), to, selection)
     for it in written.warnings:
         messages().print(f"[bold red]warning:[/] {escape(it)}")

@@ -21,6 +21,7 @@ from visioncal.transforms import adjoint, invert
 
 # Such a name needs no quotes in YAML, XML, Python or a shell, and is no option of a command.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
+_OPTIONS = {"load": "--mass-kg and --cog-mm"}
 
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
@@ -101,11 +102,15 @@ def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> 
 
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:
-    given = {"number": selection.number is not None, "load": selection.load is not None}
+    given = {
+        "number": selection.number is not None,
+        "load": selection.load is not None,
+        "convention": selection.convention is not None,
+        "hash": selection.calibration_hash is not None,
+    }
     for what in sorted(it for it, there in given.items() if there and it not in form.takes):
-        option = "--number" if what == "number" else "--mass-kg and --cog-mm"
         raise DataError(
-            f"{form.name} has no place for {option}.",
+            f"{form.name} has no place for {_OPTIONS.get(what, f'--{what}')}.",
             culprits=[form.name],
             next_step="Leave it out.",
         )

@@ -31,6 +31,8 @@ class Selection:
         child: What to call the frame whose pose it is; the camera, in a format of lenses.
         number: Which of the controller's tools or bases it becomes.
         load: What the tool weighs.
+        convention: In which form the joints of an arm are tabulated.
+        calibration_hash: The `hash` of a UR's own kinematics.
     """
 
     edge: str | None = None
@@ -39,6 +41,8 @@ class Selection:
     child: str | None = None
     number: int | None = None
     load: Load | None = None
+    convention: str | None = None
+    calibration_hash: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

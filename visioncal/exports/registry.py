@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 
+from visioncal.calibration import Verdict
 from visioncal.errors import DataError
+from visioncal.exports.arm import ArmFormat, select_arm
+from visioncal.exports.armfiles import ARMS
 from visioncal.exports.choosing import select
-from visioncal.exports.content import Content, Selection
+from visioncal.exports.content import Selection
 from visioncal.exports.controllers import CONTROLLERS
 from visioncal.exports.format import ExportFormat
 from visioncal.exports.launch import MOVEIT, ROS_LAUNCH
@@ -17,7 +20,7 @@ from visioncal.exports.sources import Source
 from visioncal.exports.urdf import URDF
 from visioncal.files import did_you_mean
 
-EXPORT_FORMATS: tuple[ExportFormat, ...] = (
+EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     ROS,
     ROS_LAUNCH,
     MOVEIT,
@@ -31,6 +34,7 @@ EXPORT_FORMATS: tuple[ExportFormat, ...] = (
     *ROBOTS,
     *CONTROLLERS,
     *PROGRAMS,
+    *ARMS,
 )
 _EVERYTHING = Selection()
 
@@ -54,14 +58,15 @@ def export(source: Source, to: str, selection: Selection = _EVERYTHING) -> str:
     Args:
         source: A calibration, or frames alone.
         to: The name of a format among `EXPORT_FORMATS`.
-        selection: Which transform, in which direction, and what its frames are to be called.
+        selection: Which transform, in which direction, and what its frames are to be called; of
+            an arm, in which form.
 
     Returns:
         The document.
 
     Raises:
-        DataError: There is no such format or transform, the format cannot hold what is asked for,
-            or a name cannot be written safely.
+        DataError: There is no such format, transform or calibrated arm, the format cannot hold
+            what is asked for, or a name cannot be written safely.
     """
     return document(source, to, selection).text
 
@@ -73,18 +78,23 @@ def document(source: Source, to: str, selection: Selection = _EVERYTHING) -> Doc
         DataError: As `export` has it.
     """
     form = _find(to)
+    if isinstance(form, ArmFormat):
+        arm = select_arm(source, selection, form)
+        return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm)))
     content = select(source, selection, form)
-    warnings = (_of_verdict(content), form.warn(content))
-    return Document(form.write(content), tuple(it for it in warnings if it))
+    warning = form.warn(content)
+    return Document(
+        form.write(content), (*_of_verdict(content.verdict), *([warning] if warning else []))
+    )
 
 
-def _of_verdict(content: Content) -> str:
-    if content.verdict.status != "bad":
-        return ""
-    return f"the verdict on this result is bad. {' '.join(content.verdict.reasons)}"
+def _of_verdict(verdict: Verdict) -> tuple[str, ...]:
+    if verdict.status != "bad":
+        return ()
+    return (f"the verdict on this result is bad. {' '.join(verdict.reasons)}",)
 
 
-def _find(name: str) -> ExportFormat:
+def _find(name: str) -> ExportFormat | ArmFormat:
     by_name = {it.name: it for it in EXPORT_FORMATS}
     if name in by_name:
         return by_name[name]

@@ -18,7 +18,7 @@ from visioncal.formats.boards import described_target, target_name
 from visioncal.formats.foreign import Foreign, rows_of
 from visioncal.formats.intrinsics import read_intrinsics
 from visioncal.formats.wishes import Wishes
-from visioncal.robot import Robot, read_robot_document
+from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import MemoryImages, Session
 from visioncal.session import columns as known
 from visioncal.types import Mount
@@ -329,5 +329,5 @@ def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
     robot = read_robot_document(arm["model"], tip=arm.get("tip"))
     Robot.from_document(robot)
     suffix = Path(arm["model"]).suffix.lower()
-    document["robot"] = arm | ({"model": f"robot{suffix}"} if suffix in (".toml", ".urdf") else {})
+    document["robot"] = arm | ({"model": f"robot{suffix}"} if suffix in ROBOT_SUFFIXES else {})
     return robot

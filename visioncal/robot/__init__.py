@@ -5,7 +5,13 @@ This is the only package that knows Pinocchio, and it imports it where a model i
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain
 from visioncal.robot.conversion import PARALLEL_RAD, convert_table, parallel_axes, table_of
-from visioncal.robot.files import load_robot, read_robot_document, robot_file, robot_names
+from visioncal.robot.files import (
+    ROBOT_SUFFIXES,
+    load_robot,
+    read_robot_document,
+    robot_file,
+    robot_names,
+)
 from visioncal.robot.model import Robot
 from visioncal.robot.recognising import Recognised, recognised_convention
 from visioncal.robot.tables import (
@@ -15,19 +21,27 @@ from visioncal.robot.tables import (
     table_document,
     table_from_document,
 )
-from visioncal.robot.urdfs import corrected_urdf
-from visioncal.robot.writing import small_urdf, table_toml, unwritten, ur_kinematics_yaml
+from visioncal.robot.urdfs import corrected_tip, corrected_urdf
+from visioncal.robot.writing import (
+    small_urdf,
+    table_toml,
+    unwritten,
+    ur_flange,
+    ur_kinematics_yaml,
+)
 
 __all__ = [
     "CONVENTIONS",
     "FUNCTION_NAMES",
     "PARALLEL_RAD",
+    "ROBOT_SUFFIXES",
     "Chain",
     "Convention",
     "DHTable",
     "Recognised",
     "Robot",
     "convert_table",
+    "corrected_tip",
     "corrected_urdf",
     "load_robot",
     "parallel_axes",
@@ -41,5 +55,6 @@ __all__ = [
     "table_of",
     "table_toml",
     "unwritten",
+    "ur_flange",
     "ur_kinematics_yaml",
 ]

@@ -1,6 +1,7 @@
 """A given URDF with other origins of its joints, and nothing else changed."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -36,7 +37,7 @@ class _Joint:
         return compose(ROTATION_FORMS["euler-xyz-rad"].read(rpy[None])[0], xyz)
 
 
-def corrected_urdf(nominal: Robot, corrected: Robot) -> str:
+def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) -> str:
     """Writes the URDF of a robot with the geometry that a calibration found.
 
     Only the origins of the joints between base and tip change, and that of the fixed joint before
@@ -47,6 +48,7 @@ def corrected_urdf(nominal: Robot, corrected: Robot) -> str:
     Args:
         nominal: The robot as the URDF describes it.
         corrected: Its corrected model.
+        notes: Lines for comments at the head of the robot.
 
     Returns:
         The text.
@@ -65,7 +67,7 @@ def corrected_urdf(nominal: Robot, corrected: Robot) -> str:
     joints, (start, end) = _read(data)
     was, now = nominal.chain, corrected.chain.with_offsets_placed()
     steps = invert(was.placements) @ now.placements
-    edits, notes = [], comment_lines(corrected)
+    edits, comments = [], comment_lines(corrected, notes)
     for name, before, after, step in zip(
         (*was.joint_names, None), was.placements, now.placements, steps, strict=True
     ):
@@ -76,11 +78,19 @@ def corrected_urdf(nominal: Robot, corrected: Robot) -> str:
             edits.append((end, 0, _more(nominal.tip, joints, step)))
         else:
             edits.append(_edit(data, joint, joint.placement @ step))
-    if notes:
-        edits.append((start, 0, ("\n" + "\n".join(notes)).encode("utf-8")))
+    if comments:
+        edits.append((start, 0, ("\n" + "\n".join(comments)).encode("utf-8")))
     for at, length, piece in sorted(edits, reverse=True):
         data = data[:at] + piece + data[at + length :]
     return data.decode("utf-8")
+
+
+def corrected_tip(nominal: Robot, corrected: Robot) -> str:
+    """Names the frame in `corrected_urdf` of which `corrected.base_from_flange` tells the pose."""
+    if np.array_equal(nominal.chain.placements[-1], corrected.chain.placements[-1]):
+        return nominal.tip
+    joints, _ = _read(str(nominal.document["urdf"]).encode("utf-8"))
+    return nominal.tip if _of_tip(joints, nominal) else f"{nominal.tip}_corrected"
 
 
 def _read(data: bytes) -> tuple[dict[str, _Joint], tuple[int, int]]:

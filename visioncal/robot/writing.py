@@ -1,5 +1,7 @@
 """A robot's geometry as files: joint tables, small URDFs, and the kinematics of UR's driver."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from xml.sax.saxutils import quoteattr
 
@@ -10,7 +12,7 @@ from visioncal.conventions import POSE_FORMS, write_pose
 from visioncal.errors import DataError
 from visioncal.files import one_line
 from visioncal.robot.chain import FUNCTION_NAMES, IDENTITY_FUNCTION, chain_document
-from visioncal.robot.conversion import table_of
+from visioncal.robot.conversion import parallel_axes, table_of
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, table_document
 from visioncal.types import FloatArray
@@ -18,17 +20,21 @@ from visioncal.types import FloatArray
 # The links of ur_description in its file of kinematics, in order.
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _UR_FIELDS = ("x", "y", "z", "roll", "pitch", "yaw")
+# Which consecutive axes of a UR are parallel: those of shoulder, elbow and first wrist.
+_UR_PARALLEL = (False, True, True, False, False)
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def table_toml(table: DHTable, source: str) -> str:
+def table_toml(table: DHTable, source: str, notes: Sequence[str] = ()) -> str:
     """Writes a joint table as a `.toml` that `load_robot` reads.
 
     Args:
         table: The table.
         source: Where its values come from.
+        notes: Lines for a comment at its head.
     """
-    return tomli_w.dumps(table_document(table, source))
+    head = "".join(f"# {one_line(it)}\n" for it in notes)
+    return head + tomli_w.dumps(table_document(table, source))
 
 
 def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
@@ -51,18 +57,22 @@ def unwritten(robot: Robot) -> tuple[str, ...]:
     return tuple(said)
 
 
-def small_urdf(robot: Robot) -> str:
+def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     """Writes a URDF of bare links: the joints with their axes and limits, and the tip.
 
     Joint offsets go into the origins. A URDF has no place for gear ratio and eccentricity; a
     comment says which are missing.
+
+    Args:
+        robot: The robot.
+        notes: Lines for comments at its head.
     """
     chain = robot.chain.with_offsets_placed()
     links = ["base", *(f"link_{place}" for place in range(1, len(chain) + 1))]
     lines = [
         '<?xml version="1.0"?>',
         f"<robot name={quoteattr(robot.name)}>",
-        *comment_lines(robot),
+        *comment_lines(robot, notes),
     ]
     lines += [f"  <link name={quoteattr(link)}/>" for link in [*links, robot.tip]]
     for place, joint in enumerate(chain.joint_names):
@@ -85,12 +95,13 @@ def small_urdf(robot: Robot) -> str:
     return "\n".join([*lines, "  </joint>", "</robot>", ""])
 
 
-def comment_lines(robot: Robot) -> list[str]:
-    """The lines of an XML comment on what is missing; none where nothing is."""
+def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
+    """Lines of XML comments: the notes, and what is missing where something is."""
     missing = unwritten(robot)
+    said = f"Not in this file, for URDF cannot say it: {'; '.join(missing)}"
     # XML ends a comment at two hyphens.
-    text = one_line("; ".join(missing)).replace("--", "- -")
-    return [f"  <!-- Not in this file, for URDF cannot say it: {text} -->"] if missing else []
+    texts = [re.sub("-(?=-)", "- ", one_line(it)) for it in (*notes, *([said] if missing else []))]
+    return [f"  <!-- {it} -->" for it in texts]
 
 
 def _joint_lines(parent: str, child: str, placement: FloatArray) -> list[str]:
@@ -102,34 +113,38 @@ def _joint_lines(parent: str, child: str, placement: FloatArray) -> list[str]:
     ]
 
 
-def ur_kinematics_yaml(robot: Robot, *, calibration_hash: str, like: DHTable | None = None) -> str:
+def ur_kinematics_yaml(
+    robot: Robot,
+    *,
+    calibration_hash: str,
+    like: DHTable | None = None,
+    notes: Sequence[str] = (),
+) -> str:
     """Writes the `kinematics` file that ur_description takes as `kinematics_params_file`.
 
     Each link's x, y, z [m] and roll, pitch, yaw [rad] place its joint in the link before it, the
     shoulder in base_link_inertia, which is the controller's base; joints turn about z. wrist_3 is
     the flange, tool0 (ur_description, urdf/ur_macro.xacro and config/ur*/default_kinematics.yaml).
-    A part of the flange's placement has no field there: a comment says it.
+    What `ur_flange` gives has no field there: a comment says it.
 
     Args:
         robot: The robot. Where its base is ROS's base_link, a half turn before base_link_inertia,
             that turn is left out.
         calibration_hash: The `hash` of the arm's own file, as ur_calibration extracts it; the
-            driver compares it with the arm it is connected to and complains of another.
+            driver compares it with the arm it is connected to and complains of another. It must be
+            there: ur_description reads it (urdf/inc/ur_common.xacro).
         like: The nominal table, so that the links lie as they do there.
+        notes: Lines for a comment at its head.
 
     Raises:
-        DataError: The robot has not six revolute joints.
+        DataError: The robot has not six revolute joints with a UR's parallel axes.
     """
-    if robot.joint_count != len(_UR_LINKS) or robot.chain.prismatic.any():
-        raise DataError(
-            f"robot {robot.name}: ur_description's kinematics are of six revolute joints, not of "
-            f"{', '.join(robot.joint_names)}.",
-            culprits=[robot.name],
-        )
-    table = table_of(_in_controllers_base(robot), "hayati", like=like)
+    table = _ur_table(robot, like)
     placements = table.along_x[:-1] @ table.along_z
     placements[0] = table.base @ placements[0]
-    lines = [f"# {one_line(it)}" for it in unwritten(robot)]
+    missing = unwritten(robot)
+    said = [f"Not in this file, which has no field for it: {'; '.join(missing)}"] if missing else []
+    lines = [f"# {one_line(it)}" for it in (*notes, *said)]
     rest = table.along_x[-1] @ table.flange
     if np.abs(rest - np.eye(4)).max() > 0.0:
         xyz, rpy = numbers_text(rest)
@@ -140,6 +155,29 @@ def ur_kinematics_yaml(robot: Robot, *, calibration_hash: str, like: DHTable | N
         lines.append(f"  {link}:")
         lines += [f"    {key}: {it}" for key, it in zip(_UR_FIELDS, [*xyz, *rpy], strict=True)]
     return "\n".join([*lines, f"  hash: {calibration_hash}", ""])
+
+
+def ur_flange(robot: Robot, like: DHTable | None = None) -> FloatArray:
+    """(4, 4) the flange in the last link of `ur_kinematics_yaml`, which takes it for the flange.
+
+    Raises:
+        DataError: The robot is no UR.
+    """
+    table = _ur_table(robot, like)
+    return np.asarray(table.along_x[-1] @ table.flange)
+
+
+def _ur_table(robot: Robot, like: DHTable | None) -> DHTable:
+    """The robot as Hayati's table in the controller's base."""
+    six = robot.joint_count == len(_UR_LINKS) and not robot.chain.prismatic.any()
+    if not six or tuple(parallel_axes(robot)) != _UR_PARALLEL:
+        raise DataError(
+            f"robot {robot.name}: ur_description's kinematics are of six revolute joints, the "
+            f"second, third and fourth axis parallel, and {', '.join(robot.joint_names)} are not.",
+            culprits=[robot.name],
+            next_step="Write another robot as a URDF or a joint table.",
+        )
+    return table_of(_in_controllers_base(robot), "hayati", like=like)
 
 
 def _in_controllers_base(robot: Robot) -> Robot:

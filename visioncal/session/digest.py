@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date, time
 
 from visioncal.files import sha256
+from visioncal.robot import ROBOT_SUFFIXES
 from visioncal.session.images import ImageStore
 from visioncal.session.table import View
 
@@ -36,7 +37,7 @@ def digest_facts(
 
 def is_file(name: object) -> bool:
     """Tells a path from a name that comes with visioncal."""
-    return isinstance(name, str) and name.lower().endswith((".toml", ".urdf"))
+    return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
 
 
 def _without_paths(document: Mapping[str, object]) -> dict[str, object]:

@@ -38,7 +38,7 @@ class CameraTable(_TableModel):
 
 
 class RobotTable(_TableModel):
-    """`[robot]`. model: a built-in name, or the path of a .urdf or a DH .toml."""
+    """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json."""
 
     model: str
     tip: str | None = None

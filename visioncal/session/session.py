@@ -240,7 +240,7 @@ class Session:
             document["target"] = _place_inside(str(self.declaration.target), "target.toml")
             texts[document["target"]] = tomli_w.dumps(self.target_document)
         if self.robot_document is not None and is_file(self.robot_name):
-            name, content = robot_file(self.robot_document)
+            name, content = robot_file(self.robot_document, str(self.robot_name))
             model = _place_inside(str(self.robot_name), name)
             document["robot"] = {**document["robot"], "model": model}
             texts[model] = content
