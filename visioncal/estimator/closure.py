@@ -279,7 +279,7 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
     weights = _weights(data, edges.z, noise)
 
     def linearise(at: Edges) -> Linearised[Edges]:
-        residuals, jacobian = _residuals(data, at), closure_jacobian(data, at)
+        residuals, jacobian = _linear(data, at)
         weighted, known = weights @ jacobian, knowledge_of(data, at)
         information = gram(jacobian, weighted) + known.information
         gradient = gram(weighted, residuals) + known.pull
@@ -297,15 +297,21 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
 
 def closure_jacobian(data: Closure, edges: Edges) -> FloatArray:
     """Derivatives (m, 6, 12 + k) of the residuals by the unknowns' steps: x, z, shared."""
+    return _linear(data, edges)[1]
+
+
+def _linear(data: Closure, edges: Edges) -> tuple[FloatArray, FloatArray]:
+    """Residuals (m, 6) and their derivatives (m, 6, 12 + k)."""
     seen = data.under(edges.shared)
     error = invert(edges.z) @ seen.placed(edges.x)
-    log_slope = inverse_right_jacobian(log(error))
+    residuals = log(error)
+    log_slope = inverse_right_jacobian(residuals)
     blocks = [log_slope @ adjoint(invert(seen.camera)), -log_slope @ adjoint(invert(error))]
     if data.shared is not None:
         # The change is so small that the order of its steps does not matter.
         flange = flange_to_residual(seen, edges) @ data.shared.by_flange
         blocks.append(log_slope @ (data.shared.by_camera + flange))
-    return np.concatenate(blocks, axis=2)
+    return residuals, np.concatenate(blocks, axis=2)
 
 
 def flange_to_residual(data: Closure, edges: Edges) -> FloatArray:
