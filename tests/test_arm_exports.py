@@ -20,6 +20,7 @@ from visioncal.errors import DataError
 from visioncal.exports import Selection, document, export
 from visioncal.exports.arm import omission_mm
 from visioncal.robot import CONVENTIONS, Robot, load_robot
+from visioncal.session import Session
 from visioncal.stored import load_placed
 from visioncal.transforms import exp
 
@@ -251,3 +252,27 @@ def test_the_command_writes_the_arm_and_warns(tmp_path):
     assert "--convention hayati" in done.stderr
     loaded = load_placed(tmp_path)
     assert off(load_robot(str(out)), loaded) < EXACT
+
+
+def test_a_session_takes_a_calibrated_arm_for_its_own(tmp_path):
+    result = calibrated(load_robot("ur5e"), waves=True)
+    sample = made_up(3, images=False).session
+    folder, again = tmp_path / "a", tmp_path / "b"
+    sample.save(folder)
+    (folder / "arm.json").write_text(export(result, "robot-json"), encoding="utf-8")
+    toml = folder / "session.toml"
+    toml.write_text(toml.read_text().replace('"ur10e"', '"arm.json"'), encoding="utf-8")
+    session = Session.load(folder)
+    session.save(again)
+    assert Session.load(again).robot_document == session.robot_document
+    # Written again in its own form, so that it stands under its own name.
+    assert off(load_robot(str(again / "arm.json")), result) < EXACT
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("{", "not valid JSON"), ("[]", "kind chain"), ('{"a": 1}', "--to robot-json")],
+)
+def test_a_json_that_is_no_arm_is_refused(tmp_path, text, words):
+    with pytest.raises(DataError, match=words):
+        read_back(tmp_path, "arm.json", text)
