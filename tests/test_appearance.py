@@ -140,7 +140,7 @@ def test_a_size_that_is_held_counts_by_what_the_views_say_against_it():
 def with_lens(cell, off, **table):
     """What is known at the end where the session states a lens that is off by (4,) pixels."""
     wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
-    told = replace(cell, options=replace(cell.options, camera=wrong))
+    told = replace(cell, stated_camera=wrong)
     session = known_of(told).session
     camera = session.document["camera"] | table
     return calibrated(
@@ -179,7 +179,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     cell = simulate(replace(FINE, seed=5, views=15))
     off = np.array([6.0, 6.0, -8.0, 5.0])
     wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
-    told = replace(cell, options=replace(cell.options, camera=wrong))
+    told = replace(cell, stated_camera=wrong)
     known = calibrated(told)
     assert any("given intrinsics do not fit" in it for it in known.warnings)
     refined = known.free.after(known.solved.edges.shared).camera

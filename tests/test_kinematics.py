@@ -113,6 +113,18 @@ def test_a_dirty_cell_is_calibrated_all_over_its_workspace():
     assert share < 0.12
 
 
+def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
+    sure = replace(WRONG_LINKS.target, square_sigma_m=1e-6 * WRONG_LINKS.target.square_m)
+    cell = simulate(replace(WRONG_LINKS, seed=3, target=sure))
+    known = calibrated(cell)
+    # As if nothing but errors of one size could be, this arm makes the board 0.16 % smaller, at
+    # three sigma; what was measured to a millionth is kept.
+    assert known.free.columns.tolist() == [9]
+    assert known.free.anchored.all()
+    sigma = float(np.sqrt(np.mean(known.telling.sigmas_m**2)))
+    assert error_m(cell, known, known.arm_model.robot) < 2.0 * sigma
+
+
 def test_a_right_arm_stays_nominal():
     known = calibrated(simulate(replace(GOOD, seed=3)))
     assert known.kinematics.level == "nominal"

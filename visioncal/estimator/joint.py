@@ -35,6 +35,9 @@ _SPARE = 10
 _SETTLED, _ROUNDS = 0.02, 8
 # What is stated is contradicted by so many standard deviations.
 _CONTRADICTION = 3.0
+# Errors of an arm are taken to be of one size; those few that a board's scale looks like may well
+# be so much larger.
+_UNEVEN = 2.0
 # Given intrinsics that are set free are known to so much without the session: the focal length and
 # the centre as shares of the focal length, and the distortion's coefficients.
 _FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
@@ -317,9 +320,10 @@ def measured_scale(problem: Problem, arm: Arm, state: State) -> MeasuredScale:
     spread = covariance(information)
     at = 12 + int(np.searchsorted(state.seen.free.columns, problem.scale[0]))
     now = state.seen.free.after(state.fit.edges.shared).board[SCALE]
+    uneven = 1.0 if arm.errors is None else _UNEVEN
     return MeasuredScale(
         now - float(spread[at] @ gradient),
-        float(np.sqrt(spread[at, at])),
+        uneven * float(np.sqrt(spread[at, at])),
         float(board_prior(problem.scene.target, problem.positions)[SCALE]),
     )
 
