@@ -79,7 +79,7 @@ def diagnose(
             rest = fit_closure(data, edges)
             alike = neighbours(data, rest.edges, rest.noise)
             moved = drift(data, rest.edges, rest.noise)
-        parts = covariance_by_source(data, edges, noise, _owners(free, arm, boards))
+        parts = covariance_by_source(data, edges, noise, _owners(data, free, arm, boards))
         if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
         if result.held.any():
@@ -105,10 +105,12 @@ def diagnose(
     )
 
 
-def _owners(free: Free | None, arm: ArmErrors | None, boards: Boards) -> dict[str, IntArray]:
+def _owners(
+    data: Closure, free: Free | None, arm: ArmErrors | None, boards: Boards
+) -> dict[str, IntArray]:
     """Which of the unknowns that all views share are whose."""
     owners: dict[str, IntArray] = {}
-    if boards.unknowns:
+    if boards.unknowns and data.camera_covariance is not None:
         # All that is known of where boards are beside the chain is from images that show several.
         owners["pixels"] = np.arange(boards.begin, boards.begin + boards.unknowns)
     looks = 0 if free is None else len(free.columns)
