@@ -32,14 +32,14 @@ class Told:
         cell: What was seen.
         joints: (m, n) joint angles as told.
         poses: (m, 4, 4) `base_from_flange` as told; None where joints are all there is.
-        robot: The model's description.
+        robot: The model's description; None where none is named.
         words: What has to be said about it; empty where nothing is wrong.
     """
 
     cell: Cell
     joints: FloatArray
     poses: FloatArray | None
-    robot: Mapping[str, Any]
+    robot: Mapping[str, Any] | None
     words: str = ""
 
     @classmethod

@@ -10,6 +10,7 @@ joints.
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 
 import numpy as np
 from results import write_section
@@ -24,7 +25,7 @@ from slips import (
     with_tool,
 )
 
-from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
 from visioncal.types import MOUNTS
 
 SESSIONS = 20
@@ -43,22 +44,27 @@ SOUND: dict[str, Callable[[Told, np.random.Generator], Told]] = {
 }
 
 
+@cache
+def cell(arm: str, seed: int) -> Cell:
+    """A cell of any kind."""
+    length, angle = ARMS[arm]
+    rng = np.random.default_rng([57, seed])
+    options = CellOptions(
+        mount=MOUNTS[seed % 2],
+        robot=ROBOTS[rng.integers(len(ROBOTS))],
+        camera=fine_camera(),
+        views=int(rng.integers(10, 41)),
+        pixel_sigma_px=0.1,
+        dh_sigma_m=length,
+        dh_sigma_rad=angle,
+        seed=seed,
+    )
+    return simulate(options)
+
+
 def sessions(arm: str, count: int, *, with_poses: bool) -> Iterator[Told]:
     """Sound sessions of many kinds."""
-    length, angle = ARMS[arm]
-    for seed in range(count):
-        rng = np.random.default_rng([57, seed])
-        options = CellOptions(
-            mount=MOUNTS[seed % 2],
-            robot=ROBOTS[rng.integers(len(ROBOTS))],
-            camera=fine_camera(),
-            views=int(rng.integers(10, 41)),
-            pixel_sigma_px=0.1,
-            dh_sigma_m=length,
-            dh_sigma_rad=angle,
-            seed=seed,
-        )
-        yield Told.of(simulate(options), with_poses=with_poses)
+    return (Told.of(cell(arm, seed), with_poses=with_poses) for seed in range(count))
 
 
 def table(rows: list[list[str]]) -> str:

@@ -60,6 +60,8 @@ def _read_robot(known: Known) -> Known:
     robot = None if document is None else Robot.from_document(document)
     reported = reported_poses(known.session, robot)
     matched = reported.matched
+    if matched is not None and matched.misread:
+        check_asked(known.level, can=False, misread=matched.misread)
     known = replace(
         known,
         robot=robot if matched is None else matched.robot,
@@ -251,8 +253,7 @@ def _kinematics(known: Known) -> Known:
     """Chooses which errors of the arm are told, and takes them up as unknowns."""
     robot, agreed = known.zeroed_robot, known.agreed
     can = robot is not None and known.joints_rad is not None and known.solver == "joint"
-    misread = "" if known.matched is None else known.matched.misread
-    check_asked(known.level, can=can, misread=misread)
+    check_asked(known.level, can=can)
     if not can or known.level == "hand-eye" or robot is None or agreed is None:
         return known
     stated = replace(known, arm=None)

@@ -38,10 +38,12 @@ def _held_back(
         Twice (m, 2) rotation [rad] and distance [m].
     """
     stated = replace(known, arm=None, arm_model=None)
+    lost = stated.stated_closure(views)
+    data = (stated.closure(views) if lost is None else lost, known.closure(views))
     edges = (found.fits[0].fit.edges, known.solved.edges)
     before, after = (
-        distances(one.closure(views).under(it.shared).placed(it.x), it.z)
-        for one, it in zip((stated, known), edges, strict=True)
+        distances(one.under(it.shared).placed(it.x), it.z)
+        for one, it in zip(data, edges, strict=True)
     )
     return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
 
