@@ -36,6 +36,8 @@ _STARTS, _REFINED = 12, 6
 # Where most of it is gone as told, the zero is nearer than that. A half turn looks like an opposite
 # sign of the joint before it, or behind it, and is not meant.
 _STEP_RAD, _FARTHEST_RAD = 0.25, 2.75
+# Rows that are looked at first, and the share of what is left as told that is worth a second look.
+_SCREENED, _WORTH = 16, 0.6
 # Rows beyond this many times the typical distance do not belong to the others.
 _OUT = 5.0
 
@@ -139,11 +141,20 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
         told = _fitted(declared, q, poses, _STARTS)
         if told.score <= _FITS or is_about_one_axis(poses[:, :3, :3]):
             return JointGuess(told, told)
-        tried = [_fitted(it, q, poses, 0) for it in joint_readings(robot)]
-        tried.sort(key=lambda it: it.score * (1.0 + it.reading.cost))
-        best = [_fitted(it.reading, q, poses, _STARTS) for it in tried[:_REFINED]]
-        best += _with_zeros(told, q, poses)
-    return _decided(told, best)
+        few = thinned(np.arange(len(q)), _SCREENED)
+        screened = _screened(told, q[few], poses[few])
+        best = [_fitted(it, q, poses, _STARTS) for it in screened]
+    return _decided(told, best) if best else JointGuess(told, told)
+
+
+def _screened(told: FittedJoints, q: FloatArray, poses: FloatArray) -> list[JointReading]:
+    """The readings that may explain a few rows far better than the declared one."""
+    declared = told.reading
+    tried = [_fitted(it, q, poses, 0) for it in joint_readings(declared.robot)]
+    tried.sort(key=lambda it: it.score * (1.0 + it.reading.cost))
+    best = [*tried[:_REFINED], *_with_zeros(told, q, poses)]
+    limit = _WORTH * _fitted(declared, q, poses, 0).score
+    return [it.reading for it in best if it.score < limit]
 
 
 def _decided(told: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
@@ -174,7 +185,7 @@ def _with_zeros(told: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterato
         start = min(np.arange(-farthest, farthest + _STEP_RAD, _STEP_RAD), key=score)
         reach = start - _STEP_RAD, start + _STEP_RAD
         least = minimize_scalar(score, bounds=reach, method="bounded", options={"xatol": 1e-6})
-        yield _fitted(with_zero(declared, int(joint), float(least.x)), q, poses, _STARTS)
+        yield _fitted(with_zero(declared, int(joint), float(least.x)), q, poses, 0)
 
 
 def _fitted(reading: JointReading, q: FloatArray, poses: FloatArray, starts: int) -> FittedJoints:
