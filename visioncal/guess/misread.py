@@ -102,8 +102,11 @@ class JointGuess:
 
     @property
     def zero(self) -> JointReading | None:
-        """The reading in which one joint's zero is off; None where something else is wrong."""
-        lost = self.best.reading.is_zero and not self.rivals
+        """The reading in which one joint's zero is off; None where something else may be wrong.
+
+        Of joints with parallel axes it is the likelier: whose zero it is takes a fit of all.
+        """
+        lost = all(it.is_zero for it in (self.best.reading, *self.rivals))
         return self.best.reading if lost else None
 
     def sentence(self, what: str) -> str:

@@ -29,8 +29,8 @@ from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.joints import (
     contradicted_joints,
     guess_seen_joints,
+    lost_zero,
     misread_joints,
-    zero_sentences,
 )
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
@@ -177,7 +177,7 @@ def _joints(known: Known) -> Known:
         has_poses = any(it.base_from_flange() is not None for it in known.session.views)
         raise misread_joints(guess, robot, has_poses=has_poses)
     taken = known.level != "hand-eye" and known.solver == "joint" and known.lost_zero is None
-    known = known.noting((), zero_sentences(guess, zero, taken=taken))
+    known = known.noting((), (lost_zero(guess, zero, taken=taken),))
     return known.with_zero(zero) if taken else known
 
 

@@ -151,7 +151,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
         return Matched(robot, misread=sentence, warnings=(words,))
     zero = None if guess is None else guess.zero
     if zero is not None and guess is not None:
-        words = f"{guess.sentence('the reported poses')} They were taken so. {zero.fix}"
+        words = f"{guess.sentence('the reported poses')} {_zero_taken(zero)} {zero.fix}"
         matched = replace(matched, zero=zero, warnings=(words,))
     model = matched.arm.base_from_flange(q)
     found = _constants(model, poses, guess)
@@ -368,10 +368,15 @@ def misread_joints(guess: JointGuess, robot: Robot, *, has_poses: bool) -> DataE
     )
 
 
-def zero_sentences(guess: JointGuess, zero: JointReading, *, taken: bool) -> Iterator[str]:
+def lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> str:
     """Says which joint's zero is lost, and what becomes of it."""
-    what = "They were taken so, and the arm is calibrated from there." if taken else zero.fix
-    yield f"{guess.sentence('what the camera sees')} {what}"
+    what = _zero_taken(zero) if taken else zero.fix
+    return f"{guess.sentence('what the camera sees')} {what}"
+
+
+def _zero_taken(zero: JointReading) -> str:
+    name = zero.robot.joint_names[zero.columns[0]]
+    return f"That of {name} was taken so, and the arm is calibrated from there."
 
 
 def _deg(angle: float) -> str:
