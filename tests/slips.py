@@ -95,7 +95,7 @@ Plant = Callable[[Told, np.random.Generator], Told]
 
 
 def _degrees(told: Told, _: np.random.Generator) -> Told:
-    return replace(told, joints=np.rad2deg(told.joints), words="the joint angles in degrees")
+    return replace(told, joints=np.rad2deg(told.joints), words="the angles in degrees")
 
 
 def _columns(told: Told, rng: np.random.Generator) -> Told:

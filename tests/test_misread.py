@@ -67,7 +67,7 @@ def test_sound_sessions_raise_no_alarm(change):
 
 
 def test_joints_alone_that_are_misread_are_refused_with_the_fix():
-    with pytest.raises(DataError, match="opposite sign, the joint angles fit") as caught:
+    with pytest.raises(DataError, match="opposite sign, they fit") as caught:
         finished(planted("a joint's sign", with_poses=False))
     error = caught.value
     assert "not those of ur5e" in error.message
@@ -114,7 +114,7 @@ def test_degrees_are_known_by_their_fit_and_not_by_their_size():
     assert np.abs(np.rad2deg(near)).max() < 13.0
     assert not guess_joints(robot, near, poses).stands_out
     guess = guess_joints(robot, np.rad2deg(near), poses)
-    assert guess.best.reading.words == "the joint angles in degrees"
+    assert guess.best.reading.words == "the angles in degrees"
 
 
 def test_two_turns_are_no_degrees():

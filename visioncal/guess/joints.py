@@ -93,14 +93,14 @@ def _units(declared: JointReading) -> Iterator[JointReading]:
     yield replace(
         declared,
         mixing=np.diag(np.where(turns, np.pi / 180.0, 1.0)),
-        words="the joint angles in degrees",
+        words="the angles in degrees",
         fix=f"Multiply {many} by pi / 180 (visioncal convert: --joint-unit deg).",
         cost=1,
     )
     yield replace(
         declared,
         mixing=np.diag(np.where(turns, 180.0 / np.pi, 1.0)),
-        words="the joint angles in radians that were taken for degrees",
+        words="the angles in radians that were taken for degrees",
         fix=f"Multiply {many} by 180 / pi (visioncal convert: without --joint-unit deg).",
         cost=1,
     )

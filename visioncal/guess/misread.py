@@ -117,7 +117,7 @@ class JointGuess:
         agreeing = len(fit.away) - len(self.best.out)
         rows = "" if agreeing == len(fit.away) else f" in {agreeing} of {len(fit.away)} views"
         return (
-            f"With {words}, the joint angles fit {what} to {self.best.figures}{rows}; as told, to "
+            f"With {words}, they fit {what} to {self.best.figures}{rows}; as told, to "
             f"{self.declared.figures}."
         )
 

@@ -56,7 +56,13 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
         DataError: There is nothing to read.
         DegenerateError: Too few views have both poses.
     """
-    chain = chain_poses(seen.session)
+    matched = seen.matched
+    # Joints that are misread say nothing about the poses.
+    chain = (
+        None
+        if matched is not None and matched.misread
+        else chain_poses(seen.session, seen.zeroed_robot)
+    )
     if robot is None:
         robot = told_or_chained(numbers_in(seen.session, POSE), chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
@@ -78,16 +84,21 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
     return _camera_numbers(_seen(Known(session, "joint", progress)))
 
 
-def chain_poses(session: Session) -> FloatArray | None:
+def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
     """Computes (n, 4, 4) `base_from_flange` of every view through the robot's model.
+
+    Args:
+        session: The session.
+        robot: The model; the one that the session names where None.
 
     Returns:
         The poses, NaN where there are no joint angles; None where the session names no known
         robot, or no view has as many angles as it has joints.
     """
-    if session.robot_document is None:
+    if robot is None and session.robot_document is not None:
+        robot = Robot.from_document(session.robot_document)
+    if robot is None:
         return None
-    robot = Robot.from_document(session.robot_document)
     poses = np.full((len(session.views), 4, 4), np.nan)
     for at, view in enumerate(session.views):
         joints = view.joints_rad

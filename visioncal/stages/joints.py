@@ -148,10 +148,13 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
     if guess is not None and guess.stands_out and guess.zero is None:
         sentence = f"{guess.sentence('the reported poses')} {guess.fix}"
         words = f"The joint angles were not used: they are misread. {sentence}"
-        return Matched(robot, misread=sentence, warnings=(words,))
+        return Matched(
+            robot, misread=f"The angles of this session are misread. {sentence}", warnings=(words,)
+        )
     zero = None if guess is None else guess.zero
     if zero is not None and guess is not None:
-        words = f"{guess.sentence('the reported poses')} {_zero_taken(zero)} {zero.fix}"
+        told = "The joint angles do not belong to the reported poses as they are told."
+        words = f"{told} {guess.sentence('the reported poses')} {_zero_taken(zero)} {zero.fix}"
         matched = replace(matched, zero=zero, warnings=(words,))
     model = matched.arm.base_from_flange(q)
     found = _constants(model, poses, guess)
@@ -248,7 +251,8 @@ def _based(matched: Matched, found: _Constants) -> Matched:
             f"base_link was taken for base: the reported poses are in a frame that is turned by "
             f"180 deg about z from the base of {name}, as ROS's base_link is from the controller's "
             "base. The results are in the frame of the poses, and so is the arm. To have them in "
-            "the controller's, report poses in base; or name a model whose root is base_link."
+            "the controller's base, report poses in it (visioncal convert SESSION FIXED --guess "
+            "turns these); to keep base_link, name a model that has it for its root."
         )
         return replace(matched, warnings=(*matched.warnings, words))
     x, y, z = 1e3 * base[:3, 3]
@@ -371,12 +375,13 @@ def misread_joints(guess: JointGuess, robot: Robot, *, has_poses: bool) -> DataE
 def lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> str:
     """Says which joint's zero is lost, and what becomes of it."""
     what = _zero_taken(zero) if taken else zero.fix
-    return f"{guess.sentence('what the camera sees')} {what}"
+    told = f"The joint angles do not belong to {zero.robot.name} as they are told."
+    return f"{told} {guess.sentence('what the camera sees')} {what}"
 
 
 def _zero_taken(zero: JointReading) -> str:
     name = zero.robot.joint_names[zero.columns[0]]
-    return f"That of {name} was taken so, and the arm is calibrated from there."
+    return f"The zero of {name} was taken so, and the arm is calibrated from there."
 
 
 def _deg(angle: float) -> str:
