@@ -26,17 +26,17 @@ from visioncal.stages.detect import detect
 from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
-from visioncal.stages.joints import (
-    contradicted_joints,
-    guess_seen_joints,
-    lost_zero,
-    misread_joints,
-)
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
 from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses
+from visioncal.stages.seen_joints import (
+    contradicted_joints,
+    guess_seen_joints,
+    lost_zero,
+    misread_joints,
+)
 from visioncal.stages.validate import validate
 from visioncal.targets import corner_positions
 from visioncal.types import Rejection
