@@ -172,11 +172,11 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
 
 def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -> _Constants:
     """The model's own base, with whatever is on its flange; another base where that is clear."""
-    flange_from_reported = invert(model) @ poses
+    flange_from_reported, of_poses = invert(model) @ poses, invert(poses)
     lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE_M)
     # The most central one, which wrong rows do not move as they would move the mean.
     around = [
-        distances(invert(poses), model, lever, (np.eye(4), invert(it)))
+        distances(of_poses, model, lever, (np.eye(4), invert(it)))
         for it in flange_from_reported
     ]
     same = _Constants(min(around, key=lambda it: float(np.median(it.away))))
