@@ -18,6 +18,7 @@ from slips import (
 
 from visioncal.errors import DataError
 from visioncal.guess.misread import guess_joints
+from visioncal.pipeline.result import result_of
 from visioncal.robot import load_robot, other_convention, placed_at, table_document, with_zeros
 from visioncal.robot.conversion import table_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
@@ -42,6 +43,11 @@ TURN = np.array([0.2, -0.1, 0.4, 0.3, 0.1, -0.2])
 def finished(told, **changes):
     """What is known at the end of the way."""
     return deque(told.known(**changes), maxlen=1).pop()
+
+
+def parameters(known):
+    """The arm's parameters as calibration.json has them."""
+    return result_of(known).stages["kinematics"]["parameters"]
 
 
 def planted(name, *, with_poses, seed=0):
@@ -152,6 +158,10 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     nominal, *others = known.kinematics.levels
     assert nominal.left_out.mm > 10.0
     assert others[-1].left_out.mm < 0.5
+    theta = {it["joint"]: it for it in parameters(known) if it["name"] == "theta_rad"}
+    # Errors of the arm's other parameters are up to a few milliradians.
+    assert theta["elbow_joint"]["nominal"] == pytest.approx(0.0, abs=1e-9)
+    assert theta["elbow_joint"]["change"] == pytest.approx(np.deg2rad(10.0), abs=5e-3)
     # What is seen of the target hardly depends on whose errors the last tenths of a degree are.
     found = known.arm_model.robot.base_from_flange(joints)
     true = IN_HAND.true_base_from_flange

@@ -26,8 +26,9 @@ FEWEST_JOINT_ROWS = 5
 # What an arm may depart from its model, a share of its reach and an angle [rad]: 2 mm and 3 mrad a
 # link add up to half of it. Another arm of the same shape is off by as much again.
 _CLOSES = 0.03
-# Under this there is nothing to be explained: mistakes leave more, unless they change nothing.
-_FITS = 2e-3
+# Under this there is nothing to be explained: controllers print their poses more finely. Cameras do
+# not see better, and what most mistakes leave is more, unless they change nothing.
+_FITS, FITS_SEEN = 3.0 * SCORE_FLOOR, 2e-3
 # Readings this near to the best are as good; of them the one with the fewest mistakes is meant, and
 # of several as simple, the matter stays open between those that are nearer still.
 _ALIKE, _RIVALS = 2.0, 1.5
@@ -127,13 +128,14 @@ class JointGuess:
         return " Or: ".join(it.fix for it in (self.best.reading, *self.rivals))
 
 
-def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
+def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _FITS) -> JointGuess:
     """Tries the common mistakes with joint angles and says which explains the poses.
 
     Args:
         robot: The model that is declared.
         q: (m, n) joint angles as they are told [rad], of `FEWEST_JOINT_ROWS` rows or more.
         poses: (m, 4, 4) `base_from_flange` that belong to them, up to a constant on either side.
+        fits: The score under which the declared reading is right without a look at others.
 
     Returns:
         The reading, and how well it does; the declared one where it is right, where no other is
@@ -142,7 +144,7 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
     declared = declared_reading(robot)
     with one_blas_thread():
         told = _fitted(declared, q, poses, _STARTS)
-        if told.score <= _FITS or is_about_one_axis(poses[:, :3, :3]):
+        if told.score <= fits or is_about_one_axis(poses[:, :3, :3]):
             return JointGuess(told, told)
         few = thinned(np.arange(len(q)), _SCREENED)
         screened = _screened(told, q[few], poses[few])

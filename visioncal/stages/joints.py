@@ -176,8 +176,7 @@ def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -
     lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE_M)
     # The most central one, which wrong rows do not move as they would move the mean.
     around = [
-        distances(of_poses, model, lever, (np.eye(4), invert(it)))
-        for it in flange_from_reported
+        distances(of_poses, model, lever, (np.eye(4), invert(it))) for it in flange_from_reported
     ]
     same = _Constants(min(around, key=lambda it: float(np.median(it.away))))
     if guess is None:

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.errors import DataError
 from visioncal.guess.fit import distances
 from visioncal.guess.joints import JointReading
-from visioncal.guess.misread import FEWEST_JOINT_ROWS, JointGuess, guess_joints
+from visioncal.guess.misread import FEWEST_JOINT_ROWS, FITS_SEEN, JointGuess, guess_joints
 from visioncal.robot import Robot
 from visioncal.stages.joints import Matched, zero_taken
 from visioncal.transforms import invert
@@ -30,7 +30,7 @@ def guess_seen_joints(
     """
     if len(q) < FEWEST_JOINT_ROWS:
         return None
-    return guess_joints(robot, q, _as_flange(cam_from_target, mount))
+    return guess_joints(robot, q, _as_flange(cam_from_target, mount), FITS_SEEN)
 
 
 def contradicted_joints(
