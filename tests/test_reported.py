@@ -76,4 +76,6 @@ def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
     (sentence,) = reported_poses(
         session(CELL.base_from_flange, CELL.joints), load_robot("ur5e")
     ).warnings
-    assert sentence.startswith("Poses and joint angles disagree: through the model of ur5e")
+    assert sentence.startswith("The joint angles were not used: they are misread.")
+    assert "With the arm a ur10e and not a ur5e" in sentence
+    assert 'Write [robot] model = "ur10e" into session.toml.' in sentence

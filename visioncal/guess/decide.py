@@ -9,6 +9,7 @@ from visioncal.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.guess.chain import by_chain, is_half_turned
+from visioncal.guess.fit import is_about_one_axis
 from visioncal.guess.given import (
     CLOSING_SCORE,
     FEWEST_ROWS,
@@ -31,8 +32,6 @@ _ALIKE = 2.0
 _RIVALS = 1.5
 # Views beyond this many typical distances do not agree with the others.
 _AGREES = 5.0
-# Turns about a second axis that are smaller, than the largest or at all, are noise of the poses.
-_SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 _LISTED = 12
 
 
@@ -240,8 +239,4 @@ def _is_poor(recording: Recording, best: Scored) -> bool:
     if not best.is_readable:
         return False
     _, camera = best.hypothesis.chain(recording.robot, recording.camera)
-    rotations = camera[best.rows[best.fit.kept], :3, :3]
-    # Turning about one axis leaves what lies along it in place: the last value vanishes.
-    spread = np.linalg.svd((rotations - rotations.mean(axis=0)).reshape(-1, 3), compute_uv=False)
-    spread /= np.sqrt(len(rotations))
-    return bool(spread[2] < max(_SECOND_AXIS * spread[0], _LEAST_TURN_RAD))
+    return is_about_one_axis(camera[best.rows[best.fit.kept], :3, :3])

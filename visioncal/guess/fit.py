@@ -19,6 +19,8 @@ KEPT_SHARE = 0.7
 _FEWEST_KEPT = 5
 _SUBSET = 4
 _STEPS = 6
+# Turns about a second axis that are smaller, than the largest or at all, are noise of the poses.
+_SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the numbers that a view gives.
 _UNKNOWNS, _PER_VIEW = 12, 6
 
@@ -68,6 +70,14 @@ class Fit:
         if not len(shift):
             return np.inf, np.pi
         return float(np.sqrt(np.mean(shift**2))), float(np.sqrt(np.mean(angle**2)))
+
+
+def is_about_one_axis(rotations: FloatArray) -> bool:
+    """Whether (n, 3, 3) rotations differ by turns about one axis at most: such tell too little."""
+    # Turning about one axis leaves what lies along it in place: the last value vanishes.
+    spread = np.linalg.svd((rotations - rotations.mean(axis=0)).reshape(-1, 3), compute_uv=False)
+    spread /= np.sqrt(len(rotations))
+    return bool(spread[2] < max(_SECOND_AXIS * spread[0], _LEAST_TURN_RAD))
 
 
 def kept_count(rows: int) -> int:

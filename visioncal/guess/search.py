@@ -30,11 +30,11 @@ _PRICE = 0.3
 _STARTS = 12
 
 
-def thinned(rows: IntArray) -> IntArray:
+def thinned(rows: IntArray, most: int = _MOST_ROWS) -> IntArray:
     """At most so many rows as are worth their time, evenly spread."""
-    if len(rows) <= _MOST_ROWS:
+    if len(rows) <= most:
         return rows
-    return np.asarray(rows[np.linspace(0, len(rows) - 1, _MOST_ROWS).round().astype(int)])
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
 
 
 def search(recording: Recording) -> list[Scored]:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.estimator.told import EDGES
+from visioncal.guess.joints import JointReading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
 from visioncal.robot import Robot
@@ -50,7 +51,7 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
     return document | {
         "robot": dict(model.robot.document),
         "convention": telling.convention,
-        "parameters": [_number(it, model.nominal) for it in telling.estimates],
+        "parameters": [_number(it, model.nominal, known.lost_zero) for it in telling.estimates],
         **unseen_views(known, found),
         "workspace_sigma_mm": {
             "median": 1e3 * float(np.median(telling.sigmas_m)),
@@ -103,12 +104,16 @@ def _stops(known: Known, telling: Telling) -> list[dict[str, Any]]:
     return [{"view": view, "worth": worth} for worth, view in ordered]
 
 
-def _number(estimate: Estimate, robot: Robot) -> dict[str, Any]:
+def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> dict[str, Any]:
+    joint, nominal = estimate.parameter.joint, estimate.nominal
+    if lost is not None and estimate.parameter.name == "theta_rad":
+        # The fit starts where the zero was found; what is told starts where it was stated.
+        nominal -= float(robot.chain.functions[joint, 1] * lost.zeros[joint])
     return {
-        "joint": robot.joint_names[estimate.parameter.joint],
+        "joint": robot.joint_names[joint],
         "name": estimate.parameter.name,
-        "nominal": estimate.nominal,
+        "nominal": nominal,
         "identified": estimate.identified,
-        "change": estimate.identified - estimate.nominal,
+        "change": estimate.identified - nominal,
         "sigma": estimate.sigma,
     }

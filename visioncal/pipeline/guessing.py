@@ -56,7 +56,13 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
         DataError: There is nothing to read.
         DegenerateError: Too few views have both poses.
     """
-    seen, chain = _of_one_board(seen), chain_poses(seen.session)
+    seen, matched = replace(seen, poses=seen.poses_of_one_board), seen.matched
+    # Joints that are misread say nothing about the poses.
+    chain = (
+        None
+        if matched is not None and matched.misread
+        else chain_poses(seen.session, seen.zeroed_robot)
+    )
     if robot is None:
         robot = told_or_chained(numbers_in(seen.session, POSE), chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
@@ -75,19 +81,25 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
         DegenerateError: The lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    return _camera_numbers(_of_one_board(_seen(Known(session, "joint", progress))))
+    seen = _seen(Known(session, "joint", progress))
+    return _camera_numbers(replace(seen, poses=seen.poses_of_one_board))
 
 
-def chain_poses(session: Session) -> FloatArray | None:
+def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
     """Computes (n, 4, 4) `base_from_flange` of every view through the robot's model.
+
+    Args:
+        session: The session.
+        robot: The model; the one that the session names where None.
 
     Returns:
         The poses, NaN where there are no joint angles; None where the session names no known
         robot, or no view has as many angles as it has joints.
     """
-    if session.robot_document is None:
+    if robot is None and session.robot_document is not None:
+        robot = Robot.from_document(session.robot_document)
+    if robot is None:
         return None
-    robot = Robot.from_document(session.robot_document)
     poses = np.full((len(session.views), 4, 4), np.nan)
     for at, view in enumerate(session.views):
         joints = view.joints_rad
@@ -141,16 +153,6 @@ def _seen(known: Known) -> Known:
         if stage.name in _SEEING:
             known = stage.run(known)
     return known
-
-
-def _of_one_board(known: Known) -> Known:
-    """Leaves the views of one board, the one with the most: poses of others do not compare."""
-    shown = [it.board for it in known.poses.values()]
-    if len(set(shown)) < 2:
-        return known
-    board = max(sorted(set(shown)), key=shown.count)
-    poses = {view: it for view, it in known.poses.items() if it.board == board}
-    return replace(known, poses=poses)
 
 
 def _seen_ways(seen: Known, robot: PoseNumbers) -> Iterator[PoseNumbers]:

@@ -14,17 +14,20 @@ from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
-from visioncal.robot import Convention, Robot
+from visioncal.guess.joints import JointReading
+from visioncal.robot import Convention, Robot, with_zeros
 from visioncal.session import Session
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult, robot_part
+from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
+from visioncal.transforms import invert
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
 
 # Why a view is in no fit although nothing is wrong with it.
@@ -45,6 +48,8 @@ class Known:
         from_first: (b, 4, 4) where they lie: `target_k_from_target_1`, in that order.
         compared_from_first: The same when levels of the arm's errors were compared.
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
+        matched: The joints beside the reported poses; None without a robot.
+        lost_zero: A joint whose zero is far from where the model has it.
         corners: What was found of the target, by view; those of several are numbered through.
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
@@ -79,6 +84,8 @@ class Known:
     boards: tuple[int, ...] = (0,)
     from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
     compared_from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
+    matched: Matched | None = None
+    lost_zero: JointReading | None = None
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
@@ -108,6 +115,18 @@ class Known:
         reasons = {it.view: it.reason for it in rejections} | dict(self.reasons)
         return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))
 
+    def without_poses(self, rejections: Iterable[Rejection]) -> Self:
+        """Leaves out the robot's side of some views."""
+        known = self.noting(rejected := tuple(rejections))
+        lost, joints = {it.view for it in rejected}, self.joints_rad
+        return replace(
+            known,
+            base_from_flange={it: at for it, at in self.base_from_flange.items() if it not in lost},
+            joints_rad=None
+            if joints is None
+            else {it: q for it, q in joints.items() if it not in lost},
+        )
+
     def agreeing(self, agreed: Agreed) -> Self:
         """Takes the candidates that agree into the fit; the others are rejected."""
         used = tuple(it for it, ok in zip(self.candidates, agreed.mask, strict=True) if ok)
@@ -135,6 +154,39 @@ class Known:
             ]
             given |= {it.view: it for it in remade(single, self.free, self.pixel_px)}
         return replace(self, poses={**self.poses, **given})
+
+    @property
+    def poses_of_one_board(self) -> Mapping[int, ViewPoses]:
+        """The poses of the board that most views show: those of different ones do not compare."""
+        shown = [it.board for it in self.poses.values()]
+        most = max(sorted(set(shown)), key=shown.count, default=0)
+        return {view: it for view, it in self.poses.items() if it.board == most}
+
+    def with_zero(self, zero: JointReading) -> Self:
+        """Takes a joint's zero for where it is, and the poses for those of the arm then."""
+        before, after = self, replace(self, lost_zero=zero)
+        if before.zeroed_robot is None or after.zeroed_robot is None:
+            return self
+        views = tuple(self.base_from_flange)
+        moved = _moved(
+            self.flange_poses(views), self.joints(views), before.zeroed_robot, after.zeroed_robot
+        )
+        return replace(after, base_from_flange=dict(zip(views, moved, strict=True)))
+
+    @property
+    def zeroed_robot(self) -> Robot | None:
+        """The nominal robot with its joints' zeros where the views have them."""
+        if self.robot is None or self.lost_zero is None:
+            return self.robot
+        return with_zeros(self.robot, self.lost_zero.zeros)
+
+    def stated_closure(self, views: Sequence[int]) -> Closure | None:
+        """What `closure` gives with a lost zero where the model has it; None where none is lost."""
+        robot, zeroed = self.robot, self.zeroed_robot
+        if self.lost_zero is None or robot is None or zeroed is None:
+            return None
+        poses = _moved(self.flange_poses(views), self.joints(views), zeroed, robot)
+        return replace(self.closure(views), robot=robot_part(poses, self.session.mount))
 
     @property
     def scene(self) -> Scene | None:
@@ -251,8 +303,9 @@ class Known:
         """How errors of the arm move each view's flange: of its links where these are known."""
         if self.arm_model is not None:
             return self.arm_model.basis(self.joints(views))
-        if self.joints_rad is not None and self.robot is not None:
-            return link_basis(self.robot, np.array([self.joints_rad[view] for view in views]))
+        robot = self.zeroed_robot
+        if self.joints_rad is not None and robot is not None:
+            return link_basis(robot, np.array([self.joints_rad[view] for view in views]))
         return pose_basis(np.array([self.base_from_flange[view] for view in views]))
 
     @property
@@ -305,6 +358,12 @@ class Known:
         if self.hand_eye is None:
             raise RuntimeError("a stage that needs the hand-eye result comes before it")
         return self.hand_eye
+
+
+def _moved(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
+    """Poses (m, 4, 4) of what is on the flange of one model, on that of another."""
+    on_flange = invert(before.base_from_flange(q)) @ poses
+    return np.asarray(after.base_from_flange(q) @ on_flange)
 
 
 def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:

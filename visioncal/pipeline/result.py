@@ -102,7 +102,8 @@ def run(
             # Views that are out of the game are often why the rest does not suffice.
             more = [it for it in known.lost_views if it not in error.culprits]
             raise _with_hint(error.with_culprits(more), seen) from error
-        if stage.name == "pnp":
+        # Joints that are misread explain themselves, and would mislead what is guessed of poses.
+        if stage.name == "joints":
             seen = known
     return Run(result_of(_with_reading(known, seen)), view_evidence(known))
 

@@ -32,7 +32,13 @@ from visioncal.stages.kinematics import check_asked, choose_level, doubts, findi
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
 from visioncal.stages.refine import arm_errors, held, look, refine
-from visioncal.stages.reported import reported_poses, usable_joints
+from visioncal.stages.reported import reported_poses
+from visioncal.stages.seen_joints import (
+    contradicted_joints,
+    guess_seen_joints,
+    lost_zero,
+    misread_joints,
+)
 from visioncal.stages.validate import validate
 from visioncal.types import Rejection
 
@@ -54,11 +60,17 @@ def _read_robot(known: Known) -> Known:
     document = known.session.robot_document
     robot = None if document is None else Robot.from_document(document)
     reported = reported_poses(known.session, robot)
+    matched = reported.matched
+    if matched is not None and matched.misread:
+        check_asked(known.level, can=False, misread=matched.misread)
     known = replace(
         known,
-        robot=robot,
+        robot=robot if matched is None else matched.robot,
         base_from_flange=reported.base_from_flange,
-        joints_rad=usable_joints(known.session, robot, reported.base_from_flange),
+        joints_rad=reported.joints_rad,
+        matched=matched,
+        lost_zero=None if matched is None else matched.zero,
+        notes=(*known.notes, *reported.notes),
     )
     warnings = (*known.session.warnings, *reported.warnings, *_not_used(known.session))
     known = known.noting(reported.rejections, warnings)
@@ -142,6 +154,33 @@ def _nothing_seen(known: Known) -> DataError:
         next_step="Look at an image: is the board in it, and is it the one that the session "
         "declares?",
     )
+
+
+def _joints(known: Known) -> Known:
+    """Refuses joints that only fit what the camera sees where they are read otherwise."""
+    robot, matched = known.zeroed_robot, known.matched
+    poses = known.poses_of_one_board
+    views = [it for it in poses if known.joints_rad and it in known.joints_rad]
+    if robot is None or not views:
+        return known
+    doubted = {} if matched is None else matched.contradicting
+    sound = [it for it in views if it not in doubted and it not in known.held_back]
+    mount = known.session.mount
+    seen = {view: poses[view].cam_from_target[0] for view in views}
+    rows = np.array([seen[view] for view in sound])
+    guess = guess_seen_joints(robot, known.joints(sound), rows, mount)
+    if matched is not None and known.level != "hand-eye":
+        both = {it: (known.base_from_flange[it], seen[it]) for it in views if it in doubted}
+        known = known.without_poses(contradicted_joints(matched, guess, both, mount))
+    if guess is None or not guess.stands_out:
+        return known
+    zero = guess.zero
+    if zero is None:
+        has_poses = any(it.base_from_flange() is not None for it in known.session.views)
+        raise misread_joints(guess, robot, has_poses=has_poses)
+    taken = known.level != "hand-eye" and known.solver == "joint" and known.lost_zero is None
+    known = known.noting((), (lost_zero(guess, zero, taken=taken),))
+    return known.with_zero(zero) if taken else known
 
 
 def _choose(known: Known) -> Known:
@@ -237,7 +276,7 @@ def _arm(known: Known) -> Arm:
 
 def _kinematics(known: Known) -> Known:
     """Chooses which errors of the arm are told, and takes them up as unknowns."""
-    robot, agreed = known.robot, known.agreed
+    robot, agreed = known.zeroed_robot, known.agreed
     can = robot is not None and known.joints_rad is not None and known.solver == "joint"
     check_asked(known.level, can=can)
     if not can or known.level == "hand-eye" or robot is None or agreed is None:
@@ -248,7 +287,9 @@ def _kinematics(known: Known) -> Known:
     model = ArmModel.of(robot, q, stated.flange_poses(known.used))
     bases = {name: model.columns(name, q[first]) for name in BLOCKS}
     data = stated.closure(known.used).merged(known.stops)
-    found = choose_level(data, agreed.edges, bases, known.level)
+    lost = stated.stated_closure(known.used)
+    told = None if lost is None else lost.merged(known.stops)
+    found = choose_level(data, agreed.edges, bases, known.level, told)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
     known = replace(known, compared_from_first=known.from_first)
     known = known.noting((), doubts(found))
@@ -351,6 +392,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("detect", _detect),
     Stage("intrinsics", _intrinsics),
     Stage("pnp", _pnp),
+    Stage("joints", _joints),
     Stage("choose", _choose),
     Stage("look", _look),
     Stage("agree", _agree),

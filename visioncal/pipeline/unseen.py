@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.closure import Edges, distances
+from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.pipeline.known import Known
 from visioncal.stages.kinematics import Kinematics
 from visioncal.types import FloatArray
@@ -37,17 +37,22 @@ def _held_back(
         Twice (m, 2) rotation [rad] and distance [m].
     """
     stated = replace(known, arm=None, arm_model=None, from_first=known.compared_from_first)
+    lost = stated.stated_closure(views)
+    data = (stated.closure(views) if lost is None else lost, known.closure(views))
     edges = (found.fits[0].fit.edges, known.solved.edges)
     before, after = (
-        _distances(one, it, views) for one, it in zip((stated, known), edges, strict=True)
+        _distances(one, two, it, views)
+        for one, two, it in zip((stated, known), data, edges, strict=True)
     )
     return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
 
 
-def _distances(known: Known, edges: Edges, views: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+def _distances(
+    known: Known, data: Closure, edges: Edges, views: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
     """How far (m,) [m] and (m,) [rad] views place their boards from where the edges do."""
     own = known.shown(views).moved(edges.shared).first_from_own
-    placed = known.closure(views).under(edges.shared).placed(edges.x)
+    placed = data.under(edges.shared).placed(edges.x)
     return distances(placed @ own, edges.z @ own)
 
 

@@ -4,7 +4,14 @@ This is the only package that knows Pinocchio, and it imports it where a model i
 """
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain
-from visioncal.robot.conversion import PARALLEL_RAD, convert_table, parallel_axes, table_of
+from visioncal.robot.conversion import (
+    PARALLEL_RAD,
+    convert_table,
+    parallel_axes,
+    placed_at,
+    table_of,
+    with_zeros,
+)
 from visioncal.robot.files import (
     ROBOT_SUFFIXES,
     load_robot,
@@ -13,7 +20,7 @@ from visioncal.robot.files import (
     robot_names,
 )
 from visioncal.robot.model import Robot
-from visioncal.robot.recognising import Recognised, recognised_convention
+from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
     CONVENTIONS,
     Convention,
@@ -44,7 +51,9 @@ __all__ = [
     "corrected_tip",
     "corrected_urdf",
     "load_robot",
+    "other_convention",
     "parallel_axes",
+    "placed_at",
     "read_robot_document",
     "recognised_convention",
     "robot_file",
@@ -57,4 +66,5 @@ __all__ = [
     "unwritten",
     "ur_flange",
     "ur_kinematics_yaml",
+    "with_zeros",
 ]

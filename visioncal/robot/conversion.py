@@ -9,9 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.robot.chain import Chain
+from visioncal.robot.chain import Chain, chain_document
 from visioncal.robot.model import Robot
-from visioncal.robot.tables import Convention, DHTable, about_x, about_z
+from visioncal.robot.tables import (
+    Convention,
+    DHTable,
+    about_x,
+    about_z,
+    table_document,
+    table_from_document,
+)
 from visioncal.transforms import compose, invert, skew
 from visioncal.types import FloatArray, Mask
 
@@ -136,6 +143,49 @@ def table_of(
         functions=np.hstack([np.zeros((count, 1)), chain.functions[:, 1:]]),
     )
     return _with_rows(table, [*rows, last])
+
+
+def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
+    """Builds the same arm as it is seen from another frame than its base.
+
+    Args:
+        robot: The robot; one that is described by a table stays so.
+        parent_from_base: (4, 4) where its base is in that frame [m].
+
+    Returns:
+        The robot, whose base is the other frame.
+    """
+    table = _described(robot)
+    if table is not None:
+        return _of_table(robot, replace(table, base=parent_from_base @ table.base))
+    placements = robot.chain.placements.copy()
+    placements[0] = parent_from_base @ placements[0]
+    chain = replace(robot.chain, placements=placements)
+    return Robot.from_document(chain_document(robot.name, robot.tip, chain))
+
+
+def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
+    """Builds the arm whose joints read zero elsewhere.
+
+    Args:
+        robot: The robot; one that is described by a table stays so.
+        zeros_rad: (n,) what is to be added to the angles that the joints tell [rad].
+    """
+    added = robot.chain.functions[:, 1] * zeros_rad
+    table = _described(robot)
+    if table is not None and not added[table.prismatic].any():
+        return _of_table(robot, replace(table, theta_rad=table.theta_rad + added))
+    return robot.corrected(functions=np.pad(added[:, None], ((0, 0), (0, 3))))
+
+
+def _described(robot: Robot) -> DHTable | None:
+    """The table that describes a robot; None where something else does."""
+    return table_from_document(robot.document) if "convention" in robot.document else None
+
+
+def _of_table(robot: Robot, table: DHTable) -> Robot:
+    source = str(robot.document.get("source", ""))
+    return Robot.from_document(table_document(table, source))
 
 
 def parallel_axes(robot: Robot, parallel_rad: float = PARALLEL_RAD) -> Mask:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.robot.chain import IDENTITY_FUNCTION
+from visioncal.robot.chain import IDENTITY_FUNCTION, chain_document
 from visioncal.robot.kinematics import build_model, flange_poses
-from visioncal.robot.tables import Convention, DHTable, chain_of_table
+from visioncal.robot.model import Robot
+from visioncal.robot.tables import Convention, DHTable, chain_of_table, table_from_document
 from visioncal.transforms import compose, invert, nearest_rotation, rotation_angle
 from visioncal.types import FloatArray
 
@@ -70,6 +71,23 @@ def recognised_convention(
     told = misfit[other] > _CLEARLY * max(misfit[best], _FINEST_M)
     fits = misfit[best] < _FITS * length
     return Recognised(best if told and fits else None, misfit)
+
+
+def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:
+    """The arm that the numbers of a robot's table are in the convention that was not declared.
+
+    Its base and flange may be other constants than the table's.
+
+    Returns:
+        The arm and its convention; None where the robot is not described by a table.
+    """
+    if "convention" not in robot.document:
+        return None
+    declared = table_from_document(robot.document)
+    standard, modified = _readings(declared)
+    other = standard if declared.convention == "modified" else modified
+    document = chain_document(robot.name, robot.tip, chain_of_table(other))
+    return Robot.from_document(document), other.convention
 
 
 def _readings(table: DHTable) -> tuple[DHTable, DHTable]:

@@ -1,19 +1,23 @@
 """Which errors of the arm the data tell: none, offsets of the joints, links, eccentric gears."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.calibration import Rms
 from visioncal.errors import DataError
 from visioncal.estimator.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimator.closure import Closure, Edges
+from visioncal.estimator.closure import Closure, Edges, noise_likelihood
 from visioncal.estimator.kinematics import LEVELS, LevelFit, fit_level
 from visioncal.estimator.linalg import one_blas_thread
+from visioncal.figures import figure
 from visioncal.types import FloatArray
 
 NOMINAL = "nominal"
+# What a zero that was found from the target's poses is still off by, before the corners are asked,
+# and the zeros of the other joints with it [rad].
+_ZERO_SIGMA_RAD = 5e-4
 # What may be asked for: the quick one after a lost encoder, or all that the data tell.
 ASKED: Mapping[str, tuple[str, ...]] = {
     "offsets": ("offsets",),
@@ -61,7 +65,11 @@ class Kinematics:
 
 
 def choose_level(
-    data: Closure, edges: Edges, bases: Mapping[str, FloatArray], asked: str
+    data: Closure,
+    edges: Edges,
+    bases: Mapping[str, FloatArray],
+    asked: str,
+    stated: Closure | None = None,
 ) -> Kinematics:
     """Chooses how much of the arm to free.
 
@@ -73,15 +81,43 @@ def choose_level(
         edges: The answer with the nominal arm.
         bases: (m, 6, p) how each stop's flange moves with the errors of each block.
         asked: A key of `ASKED`.
+        stated: The same views with a lost zero where the model has it, where `data` have it where
+            it is; None where none is lost. Then offsets are what is taken at the least.
     """
     with one_blas_thread():
         fits = {NOMINAL: fit_level(data, edges, bases, ())}
         fits |= {it: fit_level(data, edges, bases, blocks) for it, blocks in LEVELS.items()}
+        if stated is not None:
+            fits = _with_lost_zero(fits, data, stated, edges, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
     levels = tuple(_level(name, fit) for name, fit in found.items())
-    best = _best([it for it in levels if it.name in (NOMINAL, *ASKED[asked])])
+    least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
+    best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
     chosen = found[best.name]
     return Kinematics(best.name, levels, chosen.errors, asked != "auto", (found[NOMINAL], chosen))
+
+
+def _with_lost_zero(
+    fits: Mapping[str, LevelFit | None],
+    data: Closure,
+    stated: Closure,
+    edges: Edges,
+    bases: Mapping[str, FloatArray],
+) -> dict[str, LevelFit | None]:
+    """The levels beside the arm as it was stated, with what the zero explains in all others."""
+    nominal, zeroed = fit_level(stated, edges, bases, ()), fits[NOMINAL]
+    if nominal is None or zeroed is None:
+        return dict(fits)
+    before = noise_likelihood(stated, nominal.fit.edges)[1]
+    gain = 2.0 * (before - noise_likelihood(data, zeroed.fit.edges)[1])
+    found = {
+        name: None if fit is None else replace(fit, gain=fit.gain + gain)
+        for name, fit in fits.items()
+    }
+    if found["offsets"] is None:
+        errors = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
+        found["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
+    return found | {NOMINAL: nominal}
 
 
 def _best(levels: Sequence[Level]) -> Level:
@@ -103,8 +139,13 @@ def _rms(residuals: FloatArray) -> Rms:
     return Rms(mm=1e3 * float(np.sqrt(square[1])), deg=float(np.rad2deg(np.sqrt(square[0]))))
 
 
-def check_asked(asked: str, *, can: bool) -> None:
+def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
     """Refuses a level that the session cannot give.
+
+    Args:
+        asked: The level.
+        can: Whether there are joint angles that belong to the robot's model and poses.
+        misread: What is wrong with those that there are, and what to do.
 
     Raises:
         DataError: There are no joint angles that belong to a known model.
@@ -114,7 +155,7 @@ def check_asked(asked: str, *, can: bool) -> None:
             f"level {asked!r} needs the joint angles of every view and a model of the robot that "
             "they belong to.",
             culprits=["level"],
-            next_step="Record q1_rad ..., and name [robot] model in session.toml.",
+            next_step=misread or "Record q1_rad ..., and name [robot] model in session.toml.",
         )
 
 
@@ -125,8 +166,8 @@ def doubts(kinematics: Kinematics) -> Iterator[str]:
     if best.name != chosen.name:
         yield (
             f"The views speak for more than the arm's {chosen.name}: with its {best.name} stops "
-            f"left out are predicted to {best.left_out.mm:.2g} mm instead of "
-            f"{chosen.left_out.mm:.2g} mm. Leave --level out."
+            f"left out are predicted to {figure(best.left_out.mm)} mm instead of "
+            f"{figure(chosen.left_out.mm)} mm. Leave --level out."
         )
 
 
@@ -142,7 +183,7 @@ def findings(kinematics: Kinematics) -> Iterator[str]:
     if chosen is not nominal:
         yield (
             f"The arm was calibrated along ({chosen.name}): stops left out are predicted to "
-            f"{chosen.left_out.mm:.2g} mm, with the nominal arm to {nominal.left_out.mm:.2g} mm. "
-            "The transforms go with this arm: take its poses (calibration.base_from_flange), not "
-            "the controller's."
+            f"{figure(chosen.left_out.mm)} mm, with the nominal arm to "
+            f"{figure(nominal.left_out.mm)} mm. The transforms go with this arm: take its poses "
+            "(calibration.base_from_flange), not the controller's."
         )
