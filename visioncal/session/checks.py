@@ -18,7 +18,11 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
     """An image says nothing without the target that it shows and the camera that took it."""
     with_image = [view.number for view in views if view.image]
     for field, value, example in (
-        ("target", declaration.target, 'target = "charuco_9x6_30mm"'),
+        (
+            "target",
+            declaration.target or declaration.targets or None,
+            'target = "charuco_9x6_30mm"',
+        ),
         ("camera", declaration.camera, "[camera]"),
     ):
         if with_image and value is None:
@@ -48,10 +52,12 @@ def view_warnings(views: Sequence[View]) -> Iterator[str]:
             f"views.csv: the largest joint angle of a row is {np.median(angles):.4g} rad in the "
             "median. It looks like degrees: multiply q1_rad ... by pi / 180."
         )
-    first: dict[str, int] = {}
+    first: dict[tuple[str, str], int] = {}
     for view in views:
-        if view.image and first.setdefault(view.image, view.number) != view.number:
-            yield f"views.csv: views {first[view.image]} and {view.number} share {view.image}."
+        # One image may show several targets, in a row for each.
+        key = (view.image, view.text.get("target", ""))
+        if view.image and first.setdefault(key, view.number) != view.number:
+            yield f"views.csv: views {first[key]} and {view.number} share {view.image}."
 
 
 def stream_warnings(folder: Path) -> Iterator[str]:

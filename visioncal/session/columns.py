@@ -36,8 +36,8 @@ _TEXTS = frozenset(
     {"view", "stop", "role", "image", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
 )
-# Columns that name one of several cameras, robots, targets or instruments.
-SELECTORS = ("camera", "robot", "target", "instrument")
+# Columns that name one of several cameras, robots or instruments, of which there is one as yet.
+SELECTORS = ("camera", "robot", "instrument")
 
 
 def is_number(column: str) -> bool:

@@ -45,10 +45,21 @@ def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
     kept = dict(document)
     if is_file(kept.get("target")):
         del kept["target"]
+    targets = kept.get("targets")
+    if isinstance(targets, Mapping):
+        kept["targets"] = {name: _target_without_path(entry) for name, entry in targets.items()}
     robot = kept.get("robot")
     if isinstance(robot, Mapping) and is_file(robot.get("model")):
         kept["robot"] = {key: value for key, value in robot.items() if key != "model"}
     return kept
+
+
+def _target_without_path(entry: object) -> object:
+    """One of several targets, in its short form or as a table."""
+    table = {"target": entry} if isinstance(entry, str) else entry
+    if isinstance(table, Mapping) and is_file(table.get("target")):
+        return {key: value for key, value in table.items() if key != "target"}
+    return table
 
 
 def _fact(view: View, column: str) -> float | str:

@@ -1,9 +1,10 @@
 """The fields of session.toml: their types, their ranges, and what is wrong when they are not."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean
@@ -16,7 +17,9 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 PositiveInt = Annotated[int, Field(gt=0)]
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
-_SEVERAL = ("cameras", "robots", "targets", "instruments")
+_SEVERAL = ("cameras", "robots", "instruments")
+# Names become parts of the names of frames: base_from_target_NAME.
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _EDGES = ("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target")
 
 
@@ -68,6 +71,17 @@ class PriorTable(_TableModel):
     sigma_m: Positive
 
 
+class TargetTable(_TableModel):
+    """`[targets.NAME]`, one of several. target: a name in targets/, or the path of a .toml."""
+
+    target: str
+
+
+def _as_table(value: object) -> object:
+    """Takes the short form `floor = "..."` for the table `[targets.floor]`."""
+    return {"target": value} if isinstance(value, str) else value
+
+
 class Declaration(_TableModel):
     """session.toml, typed. Unknown keys stay in `model_extra`."""
 
@@ -75,6 +89,9 @@ class Declaration(_TableModel):
     name: str
     mount: Mount
     target: str | None = None
+    targets: dict[str, Annotated[TargetTable, BeforeValidator(_as_table)]] = Field(
+        default_factory=dict
+    )
     camera: CameraTable | None = None
     robot: RobotTable | None = None
     instrument: InstrumentTable | None = None
@@ -97,7 +114,7 @@ def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
         if plural in document:
             raise DataError(
                 f"{label}: [{plural}.*] declares several {plural}; this version reads one of a "
-                f"kind, as [{plural[:-1]}].".replace("as [target]", 'as target = "..."'),
+                f"kind, as [{plural[:-1]}].",
                 culprits=[f"{label}: {plural}"],
                 next_step=f"Split the session into one for each of the {plural}.",
             )
@@ -157,6 +174,7 @@ _MISSING = {
     "schema": " (schema = 1)",
     "name": ' (name = "...")',
     "mount": ' (mount = "eye-in-hand" or "eye-to-hand")',
+    "target": " (target = a name in targets/, or the path of a .toml)",
     "sigma_m": " (the standard deviation of the measured component)",
 }
 
@@ -166,6 +184,14 @@ def _contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
     camera = declaration.camera
     if camera is not None:
         yield from _camera_contradictions(camera)
+    if declaration.targets and declaration.target is not None:
+        yield (
+            "targets",
+            "is there beside target: give target = ... for one, [targets.NAME] for several",
+        )
+    for name in declaration.targets:
+        if not _NAME.fullmatch(name):
+            yield f"targets.{name}", "is a name of other than letters, digits and _ after a letter"
     for edge, prior in declaration.prior.items():
         if prior.x_m is None and prior.y_m is None and prior.z_m is None:
             yield f"prior.{edge}", "names no component, but must give x_m, y_m or z_m"
@@ -224,6 +250,6 @@ def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
             yield from _unknown_keys(value, f"{path}{name}.", label)
-        elif name == "prior":
-            for edge, prior in cast(Mapping[str, BaseModel], value).items():
-                yield from _unknown_keys(prior, f"{path}prior.{edge}.", label)
+        elif name in ("prior", "targets"):
+            for key, entry in cast(Mapping[str, BaseModel], value).items():
+                yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)

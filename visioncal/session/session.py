@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,12 @@ from visioncal.errors import DataError
 from visioncal.files import parse_toml, read_text, write_atomically
 from visioncal.robot import read_robot_document, robot_file
 from visioncal.session import columns as known
+from visioncal.session.boards import COLUMN, check_targets_named, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, stream_warnings, view_warnings
 from visioncal.session.digest import digest_facts, is_file
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.images import FolderImages, ImageStore, inside_path
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
-from visioncal.targets import load_target, target_from_document
 from visioncal.types import Camera, CameraKind, Mount, Target
 
 
@@ -32,12 +32,13 @@ class Session:
         document: The content of session.toml.
         columns: The columns of views.csv, in its order.
         views: Its rows, in its order.
-        target: The printed target, where the session names one.
-        target_document: The content of the target's `.toml`.
+        target: The printed target, where the session names one; of several, the first.
+        target_document: The content of the target's `.toml`; of several, the contents by name.
         images: Where the images' bytes come from.
         warnings: What is allowed but suspicious, in words for the user.
         robot_document: The robot's model as `Robot.from_document` reads it; None where the session
             names no robot or one that is unknown, which a warning says.
+        targets: Several printed targets by name, in the session's order; empty for one or none.
     """
 
     document: Mapping[str, Any]
@@ -48,6 +49,7 @@ class Session:
     images: ImageStore
     warnings: tuple[str, ...] = ()
     robot_document: Mapping[str, Any] | None = None
+    targets: Mapping[str, Target] = field(default_factory=dict)
 
     @classmethod
     def load(
@@ -59,7 +61,7 @@ class Session:
 
         Args:
             path: The folder or the recording.
-            target_document: Taken in the place of a folder's own target.
+            target_document: Taken in the place of a folder's own target, or targets by name.
 
         Raises:
             DataError: A file is missing, or a field, row or column of one is wrong.
@@ -106,8 +108,8 @@ class Session:
             columns: The columns of views.csv.
             cells: Its rows, one text for each column, as `View.cell` gives them.
             images: Where the images' bytes come from.
-            target_document: The content of the target's `.toml`; needed where `document` names a
-                file rather than a target that comes with visioncal.
+            target_document: The content of the target's `.toml`, of several the contents by name;
+                needed where `document` names a file rather than a target that comes with visioncal.
             robot_document: The robot's model; needed likewise.
 
         Raises:
@@ -185,6 +187,17 @@ class Session:
         return self.declaration.mount
 
     @property
+    def boards(self) -> Mapping[str, Target]:
+        """The printed targets by name; an only one has an empty name."""
+        if self.targets or self.target is None:
+            return self.targets
+        return {"": self.target}
+
+    def board_of(self, view: View) -> str:
+        """Names the target among `boards` that a view shows."""
+        return view.text.get(COLUMN, "").strip() if self.targets else ""
+
+    @property
     def camera(self) -> Camera | None:
         """The camera's intrinsics; None where the session leaves them to be estimated."""
         table = self.declaration.camera
@@ -236,9 +249,8 @@ class Session:
     def _write_into(self, folder: Path) -> None:
         document = dict(self.document)
         texts: dict[str, str] = {}
-        if self.target_document is not None and is_file(self.declaration.target):
-            document["target"] = _place_inside(str(self.declaration.target), "target.toml")
-            texts[document["target"]] = tomli_w.dumps(self.target_document)
+        if self.target_document is not None:
+            texts |= self._place_targets(document, self.target_document)
         if self.robot_document is not None and is_file(self.robot_name):
             name, content = robot_file(self.robot_document, str(self.robot_name))
             model = _place_inside(str(self.robot_name), name)
@@ -251,6 +263,22 @@ class Session:
                 _write_below(folder, path, self.images.read(path))
         for path, text in texts.items():
             _write_below(folder, path, text)
+
+    def _place_targets(
+        self, document: dict[str, Any], contents: Mapping[str, Any]
+    ) -> dict[str, str]:
+        """Names targets that were files by paths in the folder, and returns their texts by path."""
+        if is_file(self.declaration.target):
+            document["target"] = _place_inside(str(self.declaration.target), "target.toml")
+            return {document["target"]: tomli_w.dumps(contents)}
+        texts, several = {}, len(self.declaration.targets) > 1
+        for name, table in self.declaration.targets.items():
+            if is_file(table.target):
+                path = _place_inside(table.target, f"target_{name}.toml")
+                kept = {**table.model_dump(), "target": path}
+                document["targets"] = {**document["targets"], name: kept}
+                texts[path] = tomli_w.dumps(contents[name] if several else contents)
+        return texts
 
 
 def _build(
@@ -270,14 +298,11 @@ def _build(
         *declaration_warnings(declaration, "session.toml"),
         *known.column_warnings(columns, "views.csv"),
         *view_warnings(views),
+        *target_warnings(declaration, views),
     ]
-    target = None
-    if declaration.target is not None:
-        if target_document is None:
-            target, target_document = load_target(declaration.target, folder)
-        else:
-            target = target_from_document(target_document, Path(declaration.target).stem)
+    targets, target_document = read_targets(declaration, folder, target_document)
     check_images_can_be_used(declaration, views)
+    check_targets_named(declaration, views)
     robot = declaration.robot
     if robot is not None and robot_document is None:
         try:
@@ -288,11 +313,12 @@ def _build(
         document,
         columns,
         views,
-        target,
+        next(iter(targets.values()), None),
         target_document,
         images,
         tuple(warnings),
         robot_document,
+        targets if len(targets) > 1 else {},
     )
 
 
