@@ -9,6 +9,7 @@ from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell
+from visioncal.simulation.second import BOARDS
 from visioncal.transforms import invert, log
 
 
@@ -20,13 +21,23 @@ def session_of(cell: Cell) -> Session:
     if options.state_intrinsics:
         table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
     document = {"schema": 1, "name": "cell", "mount": options.mount, "camera": table}
+    views = [View(at, image=f"{at}.png") for at in range(len(cell.corners))]
+    if len(cell.sheets) == 1:
+        columns = ("view", "image")
+        return Session(document, columns, tuple(views), options.target, None, MemoryImages({}))
+    targets = {name: it.target for name, it in zip(BOARDS, cell.sheets, strict=True)}
+    document["targets"] = {name: it.name for name, it in targets.items()}
+    shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards, strict=True)
     return Session(
         document,
-        ("view", "image"),
-        tuple(View(at, image=f"{at}.png") for at in range(len(cell.corners))),
+        ("view", "stop", "target", "image"),
+        tuple(
+            replace(view, stop=stop, text={"target": BOARDS[board]}) for view, stop, board in shown
+        ),
         options.target,
         None,
         MemoryImages({}),
+        targets=targets,
     )
 
 

@@ -10,6 +10,7 @@ from visioncal.simulation.optics import fine_camera, fisheye_camera, project, ra
 from visioncal.simulation.options import (
     CellOptions,
     Motion,
+    Second,
     charuco_target,
     checkerboard_target,
     exact,
@@ -29,6 +30,7 @@ __all__ = [
     "CellOptions",
     "Motion",
     "Scene",
+    "Second",
     "Truth",
     "charuco_target",
     "checkerboard_target",

@@ -1,7 +1,7 @@
 """A simulated robot cell: an arm, a camera and a board, what really is and what is reported."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -22,6 +22,7 @@ from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import mistaken, project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
+from visioncal.simulation.second import Shown, chains, sheets_of, shown_at, with_second
 from visioncal.transforms import compose, exp, invert
 from visioncal.types import Camera, Corners, FloatArray
 
@@ -54,10 +55,11 @@ class Cell:
         options: What was asked for.
         arm: The nominal arm.
         true_arm: The arm as it was built.
-        sheet: The board as it was printed.
+        sheet: The board as it was printed; of two, the first.
         stated_camera: The intrinsics as the session states them.
         transforms: True edges, each (4, 4): `flange_from_cam` and `base_from_target`
-            (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand).
+            (eye-in-hand), or `base_from_cam` and `flange_from_target` (eye-to-hand); of two boards
+            `base_from_target_first`, `base_from_target_second` and the like.
         joints: (m, n) joint angles as reported [rad].
         base_from_flange: (m, 4, 4) poses as reported: the nominal arm at the reported joints.
         true_base_from_flange: (m, 4, 4) where the flange really stood.
@@ -65,6 +67,8 @@ class Cell:
         exact_corners: Where the corners really are in each image.
         corners: The same as a detector with `pixel_sigma_px` would report them.
         wrong_views: Views whose report is wrong, ascending.
+        sheets: All boards as they were printed.
+        shown: Which stop and which board each view is of: a stop that shows two has two views.
     """
 
     options: CellOptions
@@ -80,6 +84,8 @@ class Cell:
     exact_corners: tuple[Corners, ...]
     corners: tuple[Corners, ...]
     wrong_views: tuple[int, ...]
+    sheets: tuple[Sheet, ...]
+    shown: Shown
 
 
 def simulate(options: CellOptions) -> Cell:
@@ -104,31 +110,37 @@ def simulate(options: CellOptions) -> Cell:
         options.ripple_sigma_rad,
     )
     true_arm = disturb(arm, errors, stream(options, Stream.ARM))
-    sheet = Sheet(options.target, options.board_scale, options.board_bow_m)
-    transforms = _mountings(options, arm, sheet)
-    moved = _reachable_joints(options, arm, sheet, transforms)
+    sheets = sheets_of(options)
+    transforms = _mountings(options, arm, sheets[0])
+    if options.second is not None:
+        transforms = with_second(transforms, sheets, options.second)
+    moved = _postures(options, arm, sheets, transforms)
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
     true_base_from_flange = forward(true_arm, moved) @ exp(jitter)
-    joints, wrong_views = _misreport(options, arm, moved)
-    cam_from_target = _cam_from_target(transforms, true_base_from_flange)
-    exact_corners = _see(options, sheet, cam_from_target)
+    joints, wrong_stops = _misreport(options, arm, moved)
+    poses = [_cam_from_target(chain, true_base_from_flange) for chain in chains(transforms)]
+    shown = shown_at(options, sheets, poses)
+    cam_from_target = np.array(poses)[shown.boards, shown.stops]
+    exact_corners = _see(options, [sheets[board] for board in shown.boards], cam_from_target)
     return Cell(
         options=options,
         arm=arm,
         true_arm=true_arm,
-        sheet=sheet,
+        sheet=sheets[0],
         stated_camera=mistaken(
             options.camera, options.lens_mismatch_px, stream(options, Stream.LENS)
         ),
         transforms=transforms,
-        joints=joints,
-        base_from_flange=forward(arm, joints),
-        true_base_from_flange=true_base_from_flange,
+        joints=joints[shown.stops],
+        base_from_flange=forward(arm, joints)[shown.stops],
+        true_base_from_flange=true_base_from_flange[shown.stops],
         cam_from_target=cam_from_target,
         exact_corners=exact_corners,
         corners=_detect(options, exact_corners),
-        wrong_views=wrong_views,
+        wrong_views=tuple(np.flatnonzero(np.isin(shown.stops, wrong_stops)).tolist()),
+        sheets=sheets,
+        shown=shown,
     )
 
 
@@ -191,11 +203,27 @@ def _cam_from_target(
     return invert(transforms["base_from_cam"]) @ base_from_target
 
 
+def _postures(
+    options: CellOptions, arm: Arm, sheets: Sequence[Sheet], transforms: Mapping[str, FloatArray]
+) -> FloatArray:
+    """(s, n) postures of the nominal arm, which look at the boards in turn."""
+    joints = np.zeros((options.views, arm.a.size))
+    for board, (sheet, chain) in enumerate(zip(sheets, chains(transforms), strict=True)):
+        mine = np.arange(board, options.views, len(sheets))
+        part = replace(options, target=sheet.target, views=len(mine), wrong_views=0)
+        rng = stream(options, Stream.POSES, *([board] if board else []))
+        joints[mine] = _reachable_joints(part, arm, sheet, chain, rng)
+    return joints
+
+
 def _reachable_joints(
-    options: CellOptions, arm: Arm, sheet: Sheet, transforms: Mapping[str, FloatArray]
+    options: CellOptions,
+    arm: Arm,
+    sheet: Sheet,
+    transforms: Mapping[str, FloatArray],
+    rng: np.random.Generator,
 ) -> FloatArray:
     """(m, n) postures of the nominal arm that bring the board into the image."""
-    rng = stream(options, Stream.POSES)
     # Nothing of the arm may sink into the table under the board, or under the robot.
     floor = min(0.0, transforms.get("base_from_target", np.eye(4))[2, 3]) + 0.05
     home = _home(options, arm, _flange(transforms, mean_view(options, sheet)[None]), rng)
@@ -265,11 +293,13 @@ def _misreport(
     return joints, tuple(int(view) for view in chosen)
 
 
-def _see(options: CellOptions, sheet: Sheet, cam_from_target: FloatArray) -> tuple[Corners, ...]:
-    """Where the corners are in each image, without the ones outside it."""
-    points = corners_m(sheet)
+def _see(
+    options: CellOptions, sheets: Sequence[Sheet], cam_from_target: FloatArray
+) -> tuple[Corners, ...]:
+    """Where the corners of each view's sheet are in its image, without the ones outside it."""
     seen = []
-    for view, pose in enumerate(cam_from_target):
+    for view, (sheet, pose) in enumerate(zip(sheets, cam_from_target, strict=True)):
+        points = corners_m(sheet)
         points_cam = points @ pose[:3, :3].T + pose[:3, 3]
         ids = np.flatnonzero(sees(options.camera, points_cam, _EDGE_PX))
         px = project(options.camera, points_cam[ids])

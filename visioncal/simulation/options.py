@@ -36,6 +36,26 @@ def checkerboard_target() -> Target:
     )
 
 
+@dataclass(frozen=True)
+class Second:
+    """A second board of a cell. Every other stop looks at it; it is seen wherever it is in view.
+
+    Attributes:
+        target: The board as its file states it.
+        turn_rad: How far around the base it lies from the first (eye-in-hand), or to which side of
+            the flange it leans (eye-to-hand) [rad].
+        tilt_rad: How far it leans: towards the base, or aside [rad].
+        scale: Printed size over stated size.
+        bow_m: How far its corners are bent away from the camera [m].
+    """
+
+    target: Target = field(default_factory=checkerboard_target)
+    turn_rad: float = 1.4
+    tilt_rad: float = 0.3
+    scale: float = 1.0
+    bow_m: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class CellOptions:
     """A simulated cell. The defaults are a well-kept one; `exact` has no error at all.
@@ -75,6 +95,7 @@ class CellOptions:
         wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
         board_scale: Printed size over stated size.
         board_bow_m: How far the board's corners are bent away from the camera [m].
+        second: A second board; None for a cell with one.
         seed: Of everything random. Each source of randomness has a stream of its own, so that a
             change of one option leaves the others' draws as they were.
     """
@@ -107,6 +128,7 @@ class CellOptions:
     wrong_views: int = 0
     board_scale: float = 1.0
     board_bow_m: float = 0.0
+    second: Second | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:

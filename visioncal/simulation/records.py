@@ -1,8 +1,8 @@
 """Simulated cells on disk: the session that calibration reads, and the truth beside it."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import charuco_target, checkerboard_target
 from visioncal.simulation.render import encode, prepare_scene, render
+from visioncal.simulation.second import BOARDS
 from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray, Target
 
@@ -133,10 +134,10 @@ def measured_poses(cell: Cell) -> FloatArray:
         DataError: A view shows too few corners for a pose.
     """
     rng = stream(cell.options, Stream.PAIRS)
-    draws = rng.standard_normal((cell.options.views, 6))
-    points = corners_m(cell.sheet)
+    draws = rng.standard_normal((len(cell.corners), 6))
     measured = cell.cam_from_target.copy()
     for view, pose in enumerate(cell.cam_from_target):
+        points = corners_m(cell.sheets[cell.shown.boards[view]])
         ids = cell.exact_corners[view].ids
         if ids.size < 4:
             raise DataError(f"simulation: view {view} shows {ids.size} corners, a pose needs 4.")
@@ -163,32 +164,17 @@ def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArr
 
 def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | None) -> Session:
     suffix = "png" if cell.options.jpeg_quality is None else "jpg"
-    scene = prepare_scene(cell)
+    scenes = [prepare_scene(cell, board) for board in range(len(cell.sheets))]
     files = {}
-    for view in range(cell.options.views):
-        picture = encode(render(scene, view), cell.options.jpeg_quality)
+    for view, board in enumerate(cell.shown.boards):
+        picture = encode(render(scenes[board], view), cell.options.jpeg_quality)
         files[f"images/{view:03d}.{suffix}"] = picture
         if progress is not None:
-            progress((view + 1.0) / (cell.options.views + 1.0))
-    target = cell.options.target
-    shipped = target in (charuco_target(), checkerboard_target())
-    document = {
-        **_document(cell, name),
-        "target": target.name if shipped else "target.toml",
-        "camera": _camera_table(cell),
-    }
+            progress((view + 1.0) / (len(cell.corners) + 1.0))
+    document = {**_document(cell, name), **_targets(cell), "camera": _camera_table(cell)}
     numbers = list(_report_rows(cell))
-    return Session(
-        document=document,
-        columns=("view", "image", *numbers[0]),
-        views=tuple(
-            View(view, image=path, numbers=numbers[view]) for view, path in enumerate(files)
-        ),
-        target=target,
-        target_document=_target_document(target),
-        images=MemoryImages(files),
-        warnings=(),
-    )
+    views = [View(at, image=path, numbers=numbers[at]) for at, path in enumerate(files)]
+    return _session(cell, document, ("view", "image", *numbers[0]), views, MemoryImages(files))
 
 
 def _pairs(cell: Cell, name: str) -> Session:
@@ -196,15 +182,54 @@ def _pairs(cell: Cell, name: str) -> Session:
         {**row, **{f"cft_{key}": value for key, value in _pose_row(pose).items()}}
         for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
     ]
+    views = [View(view, numbers=row) for view, row in enumerate(numbers)]
+    columns, document = ("view", *numbers[0]), _document(cell, name)
+    if len(cell.sheets) > 1:
+        return _session(cell, document | _targets(cell), columns, views, MemoryImages({}))
+    return Session(document, columns, tuple(views), None, None, MemoryImages({}))
+
+
+def _session(
+    cell: Cell,
+    document: Mapping[str, Any],
+    columns: tuple[str, ...],
+    views: Sequence[View],
+    images: MemoryImages,
+) -> Session:
+    """The session of a cell with its board, or with both of them."""
+    target = cell.sheets[0].target
+    if len(cell.sheets) == 1:
+        return Session(document, columns, tuple(views), target, _target_document(target), images)
+    targets = {name: it.target for name, it in zip(BOARDS, cell.sheets, strict=True)}
+    shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards.tolist(), strict=True)
     return Session(
-        document=_document(cell, name),
-        columns=("view", *numbers[0]),
-        views=tuple(View(view, numbers=row) for view, row in enumerate(numbers)),
-        target=None,
-        target_document=None,
-        images=MemoryImages({}),
-        warnings=(),
+        document,
+        ("view", "stop", "target", *columns[1:]),
+        tuple(
+            replace(view, stop=stop, text={"target": BOARDS[board]}) for view, stop, board in shown
+        ),
+        target,
+        {name: _target_document(it) for name, it in targets.items()},
+        images,
+        targets=targets,
     )
+
+
+def _targets(cell: Cell) -> dict[str, Any]:
+    """What session.toml says of the boards."""
+    if len(cell.sheets) == 1:
+        return {"target": _target_place(cell.sheets[0].target, "target.toml")}
+    return {
+        "targets": {
+            name: {"target": _target_place(it.target, f"target_{name}.toml")}
+            for name, it in zip(BOARDS, cell.sheets, strict=True)
+        }
+    }
+
+
+def _target_place(target: Target, path: str) -> str:
+    """Names a board that comes with visioncal, or the file that is written."""
+    return target.name if target in (charuco_target(), checkerboard_target()) else path
 
 
 def _document(cell: Cell, name: str) -> dict[str, Any]:
@@ -245,7 +270,7 @@ def _target_document(target: Target) -> dict[str, Any]:
 
 def _report_rows(cell: Cell) -> Iterator[dict[str, float]]:
     """The numeric columns of each view: when, with which joints, at which reported pose."""
-    for view in range(cell.options.views):
+    for view in range(len(cell.corners)):
         joints = {f"q{i + 1}_rad": float(q) for i, q in enumerate(cell.joints[view])}
         yield {"stamp_s": _PACE_S * view} | _pose_row(cell.base_from_flange[view]) | joints
 

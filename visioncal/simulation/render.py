@@ -1,6 +1,6 @@
 """Pictures of a simulated board: a ray for each sub-pixel, through the lens, onto the sheet."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -50,7 +50,7 @@ class Backdrop:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What all pictures of one cell share.
+    """What all pictures of one board share.
 
     Attributes:
         cell: The cell.
@@ -63,12 +63,18 @@ class Scene:
     backdrop: Backdrop
 
 
-def prepare_scene(cell: Cell) -> Scene:
+def prepare_scene(cell: Cell, board: int = 0) -> Scene:
     """Draws the textures of a cell, which takes longer than one of its pictures.
+
+    Args:
+        cell: The cell.
+        board: Which of two boards the pictures are to show; they show no other.
 
     Raises:
         DataError: OpenCV does not have the target's dictionary.
     """
+    sheet = cell.sheets[board]
+    cell = replace(cell, sheet=sheet, options=replace(cell.options, target=sheet.target))
     target, camera = cell.options.target, cell.options.camera
     nearest = float(np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1).min())
     samples = _SAMPLES * float(camera.matrix[0]) * target.square_m / max(nearest, 0.05)
@@ -94,7 +100,7 @@ def render_view(cell: Cell, index: int) -> Image:
     Returns:
         (height, width) grey image.
     """
-    return render(prepare_scene(cell), index)
+    return render(prepare_scene(cell, int(cell.shown.boards[index])), index)
 
 
 def render(scene: Scene, index: int) -> Image:
@@ -111,8 +117,9 @@ def render(scene: Scene, index: int) -> Image:
         DataError: There is no such view.
     """
     options = scene.cell.options
-    if not 0 <= index < options.views:
-        raise DataError(f"simulation: there is no view {index} among {options.views}.")
+    count = len(scene.cell.corners)
+    if not 0 <= index < count:
+        raise DataError(f"simulation: there is no view {index} among {count}.")
     # Several BLAS threads on a busy machine wait for one another ten times as long as they work.
     with threadpool_limits(1, user_api="blas"):
         light = _unlit(scene, index)

@@ -1,0 +1,107 @@
+"""A cell's second board: where it is, and which stops of the robot show which board."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.simulation.boards import Sheet, centre_m, corners_m
+from visioncal.simulation.optics import sees
+from visioncal.simulation.options import CellOptions, Second
+from visioncal.transforms import compose
+from visioncal.types import FloatArray, IntArray
+
+# What a session calls the boards where there are two.
+BOARDS = ("first", "second")
+# A board is looked at in a view that shows this share of its corners, not too much from the side.
+_LEAST_SHARE, _LEAST_COSINE = 0.6, 0.5
+_EDGE_PX = 12.0
+# How far aside the flange carries its second board [m].
+_ASIDE_M = 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """The views of a cell, one for each board that a stop of the robot shows.
+
+    Attributes:
+        stops: (m,) the stop of each view, ascending.
+        boards: (m,) the board that it shows.
+    """
+
+    stops: IntArray
+    boards: IntArray
+
+
+def sheets_of(options: CellOptions) -> tuple[Sheet, ...]:
+    """The boards as they were printed."""
+    first = Sheet(options.target, options.board_scale, options.board_bow_m)
+    second = options.second
+    if second is None:
+        return (first,)
+    return first, Sheet(second.target, second.scale, second.bow_m)
+
+
+def with_second(
+    transforms: Mapping[str, FloatArray], sheets: Sequence[Sheet], second: Second
+) -> dict[str, FloatArray]:
+    """Adds the second board to the two edges of a cell, and names both boards' edges."""
+    (x_name, x), (z_name, z) = transforms.items()
+    first, further = (centre_m(it) for it in sheets)
+    middle = z[:3, :3] @ first + z[:3, 3]
+    around = Rotation.from_euler("z", second.turn_rad).as_matrix()
+    if x_name == "flange_from_cam":
+        place = around @ middle
+        lean = np.cross([0.0, 0.0, 1.0], place / np.linalg.norm(place))
+        # The print faces the base, as the arm comes from there.
+        turn = Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ around @ z[:3, :3]
+    else:
+        aside = around @ np.array([1.0, 0.0, 0.0])
+        place = middle + _ASIDE_M * aside
+        lean = np.cross([0.0, 0.0, 1.0], aside)
+        turn = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ z[:3, :3]
+    return {
+        x_name: x,
+        f"{z_name}_{BOARDS[0]}": z,
+        f"{z_name}_{BOARDS[1]}": compose(turn, place - turn @ further),
+    }
+
+
+def chains(transforms: Mapping[str, FloatArray]) -> Iterator[dict[str, FloatArray]]:
+    """Both edges of each board's chain, under the names of a cell with one board."""
+    (x_name, x), *boards = transforms.items()
+    z_name = "base_from_target" if x_name == "flange_from_cam" else "flange_from_target"
+    for _, z in boards:
+        yield {x_name: x, z_name: z}
+
+
+def shown_at(options: CellOptions, sheets: Sequence[Sheet], poses: Sequence[FloatArray]) -> Shown:
+    """Finds which boards each of the stops shows.
+
+    Args:
+        options: The cell.
+        sheets: Its boards.
+        poses: (s, 4, 4) `cam_from_target` of each board at all stops.
+    """
+    count = len(poses[0])
+    if len(sheets) == 1:
+        return Shown(np.arange(count), np.zeros(count, dtype=np.int64))
+    seen = []
+    for sheet, cam_from_target in zip(sheets, poses, strict=True):
+        points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
+        points = points + cam_from_target[:, None, :3, 3]
+        share = sees(options.camera, points, _EDGE_PX).mean(axis=1)
+        towards = cam_from_target[:, :3, 3] / np.linalg.norm(
+            cam_from_target[:, :3, 3], axis=1, keepdims=True
+        )
+        facing = np.einsum("mi,mi->m", towards, cam_from_target[:, :3, 2]) > _LEAST_COSINE
+        seen.append(
+            facing & (share >= (1.0 if sheet.target.kind == "checkerboard" else _LEAST_SHARE))
+        )
+    # What a stop was made for is in view.
+    aimed = np.arange(count) % len(sheets)
+    visible = np.array(seen).T
+    visible[np.arange(count), aimed] = True
+    stops, boards = np.nonzero(visible)
+    return Shown(stops, boards)
