@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.estimator.boards import place
 from visioncal.pipeline.known import Known
+from visioncal.pipeline.layout import numbered_through
 from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
@@ -47,13 +49,14 @@ def known_of(cell: Cell, *, joints: bool = True, **changes) -> Known:
         arm = {"joints_rad": dict(enumerate(cell.joints)), "robot": load_robot(cell.options.robot)}
         changes = arm | changes
     poses = dict(enumerate(cell.base_from_flange))
-    return replace(
+    known = replace(
         Known(session_of(cell), "joint"),
         base_from_flange=poses,
         corners={it.view: it for it in cell.corners},
         resolution=cell.options.camera.resolution,
         **changes,
     )
+    return numbered_through(known)
 
 
 def calibrated(cell: Cell, **changes) -> Known:
@@ -66,7 +69,11 @@ def calibrated(cell: Cell, **changes) -> Known:
 
 
 def error_of(cell: Cell, known: Known) -> np.ndarray:
-    """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
-    x_true, z_true = cell.transforms.values()
-    edges = known.solved.edges
-    return np.concatenate([log(invert(x_true) @ edges.x), log(invert(z_true) @ edges.z)])
+    """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
+    placed = place(known.shown(known.used), known.solved.edges)
+    # The chain ends at the board with the most views.
+    order = sorted(range(len(known.boards)), key=lambda it: known.boards[it])
+    found = [known.solved.edges.x, *placed.z[order]]
+    return np.concatenate(
+        [log(invert(it) @ ours) for it, ours in zip(cell.transforms.values(), found, strict=True)]
+    )

@@ -26,7 +26,7 @@ def estimate(cell, model="brown", coefficients="auto", without=()):
     corners = {it.view: it for it in cell.corners if it.view not in without}
     options = IntrinsicsOptions(coefficients)
     camera = cell.options.camera
-    return estimate_intrinsics(corners, cell.options.target, camera.resolution, model, options)
+    return estimate_intrinsics(corners, [cell.options.target], camera.resolution, model, options)
 
 
 def cell_with(camera, seed, **changes):
@@ -120,7 +120,7 @@ def test_parts_of_the_image_that_were_never_visited_are_named():
     for it in cell.corners:
         inside = (it.px[:, 0] < 0.6 * width) | (it.px[:, 1] < 0.6 * height)
         corners[it.view] = replace(it, ids=it.ids[inside], px=it.px[inside])
-    seen = estimate_intrinsics(corners, cell.options.target, (width, height), "brown")
+    seen = estimate_intrinsics(corners, [cell.options.target], (width, height), "brown")
     assert any("lower right" in it for it in seen.warnings)
     assert not any("lower right" in it for it in estimate(cell).warnings)
 

@@ -27,7 +27,7 @@ def corners_of(cell):
 
 
 def poses_of(cell, corners=None):
-    return estimate_poses(corners or corners_of(cell), cell.options.target, cell.options.camera)
+    return estimate_poses(corners or corners_of(cell), [cell.options.target], cell.options.camera)
 
 
 def test_poses_follow_their_stated_covariance():

@@ -5,7 +5,7 @@ checkerboard inner corner 0, for a single marker its centre; x runs along column
 (down the printed page), and z into the board.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -191,6 +191,17 @@ def corner_positions(target: Target) -> FloatArray:
     rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
     flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
     return np.asarray(side * flat, dtype=float)
+
+
+def numbered_positions(targets: Sequence[Target]) -> FloatArray:
+    """The (c, 3) corners of several targets, numbered through, each in its own target's frame."""
+    return np.concatenate([np.zeros((0, 3)), *map(corner_positions, targets)])
+
+
+def first_corners(targets: Sequence[Target]) -> IntArray:
+    """Numbers (b,) that the first corners of several targets get where all are numbered through."""
+    counts = [len(corner_positions(it)) for it in targets]
+    return np.cumsum([0, *counts], dtype=np.int64)[:-1]
 
 
 def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:

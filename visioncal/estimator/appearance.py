@@ -6,9 +6,11 @@ and third order. What of it is an offset or a tilt belongs to the board's pose a
 that the target's frame is that of the plane which fits the corners best.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimator.closure import Shared
@@ -54,6 +56,12 @@ def board_basis(positions: FloatArray) -> FloatArray:
     return basis
 
 
+def boards_basis(positions: Sequence[FloatArray]) -> FloatArray:
+    """Derivatives of several boards' corners by all of their shapes, (c, 3, 9 b)."""
+    parts = [board_basis(it).reshape(-1, len(BOARD_NAMES)) for it in positions]
+    return np.asarray(block_diag(*parts).reshape(-1, 3, len(BOARD_NAMES) * len(parts)))
+
+
 def board_prior(target: Target, positions: FloatArray) -> FloatArray:
     """Standard deviations (9,) of the board's shape, as they are known beforehand."""
     half = float(np.ptp(positions, axis=0).max()) / 2
@@ -67,7 +75,8 @@ class Appearance:
 
     Attributes:
         camera: The intrinsics.
-        board: (9,) the board's shape, in the order of `BOARD_NAMES`; zero for the stated one.
+        board: (9 b,) the shapes of all boards, each in the order of `BOARD_NAMES`; zero for the
+            stated ones.
     """
 
     camera: Camera
@@ -75,11 +84,11 @@ class Appearance:
 
     @property
     def values(self) -> FloatArray:
-        """(k + 9,) the intrinsics and the board's shape."""
+        """(k + 9 b,) the intrinsics and the boards' shapes."""
         return np.concatenate([intrinsics(self.camera), self.board])
 
     def moved(self, step: FloatArray) -> "Appearance":
-        """Returns the appearance after a (k + 9,) step."""
+        """Returns the appearance after a (k + 9 b,) step."""
         values = self.values + step
         lens = len(values) - len(self.board)
         return Appearance(with_intrinsics(self.camera, values[:lens]), values[lens:])
@@ -91,8 +100,8 @@ class Free:
 
     Attributes:
         appearance: The values that the views' poses were made with.
-        basis: (c, 3, 9) of `board_basis`, by corner number.
-        positions: (c, 3) corners of the flat board [m].
+        basis: (c, 3, 9 b) of `boards_basis`, by corner number.
+        positions: (c, 3) corners of the flat boards, each in its own frame [m].
         columns: (k,) the free ones' places among the appearance's values.
         anchored: (k,) mask of those that stay where they are, and count in the covariance only.
         information: (k, k) on them, from the corners and from what is known beforehand.
@@ -162,8 +171,8 @@ def compress(
     """Compresses corners to normal equations in each view's pose and the shared appearance.
 
     Args:
-        stack: The corners of v views, at their places on the flat board.
-        basis: (c, 3, 9) of `board_basis`, by corner number.
+        stack: The corners of v views, at their places on the flat boards.
+        basis: (c, 3, 9 b) of `boards_basis`, by corner number.
         appearance: Where to linearise.
         starts: (v, 4, 4) `cam_from_target` to start from.
     """
@@ -179,8 +188,9 @@ def compress(
     information = flat.T @ flat + np.einsum("vik,vij->kj", between, answer)
     pull = flat.T @ now.residuals.reshape(-1)
     # A larger board farther away looks the same: what is left is rounding.
-    at = now.by_intrinsics.shape[2] + SCALE
-    information[at] = information[:, at] = pull[at] = 0.0
+    at = np.arange(now.by_intrinsics.shape[2] + SCALE, len(pull), len(BOARD_NAMES))
+    information[at] = information[:, at] = 0.0
+    pull[at] = 0.0
     return Compressed(
         fit.cam_from_target,
         fit.information,

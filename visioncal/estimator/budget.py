@@ -24,8 +24,8 @@ def covariance_by_source(
         data: The views, one a stop.
         edges: The answer.
         noise: Of the flange, or of both together where the camera's is not known.
-        shared: Which of the unknowns that the views share belong to which source; those of no
-            source count for nothing.
+        shared: Which of the unknowns that the views share belong to which source, a new one or one
+            of the others; those of no source count for nothing.
 
     Returns:
         (12, 12) by source: `pixels`, `robot` (or `poses` for both together), and `shared`'s.
@@ -45,7 +45,7 @@ def covariance_by_source(
             share = np.where(np.isin(owned, rows), 0.5, 0.0)
             known = np.zeros_like(fitted)
             known[np.ix_(12 + owned, 12 + owned)] = (share[:, None] + share) * information
-            parts[name] = known
+            parts[name] = parts.get(name, 0.0) + known
     return {name: (fitted @ part @ fitted)[:12, :12] for name, part in parts.items()}
 
 

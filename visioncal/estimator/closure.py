@@ -71,14 +71,29 @@ class Shared:
         """Returns the views of an (m,) mask."""
         return replace(self, by_camera=self.by_camera[chosen], by_flange=self.by_flange[chosen])
 
-    def first(self, count: int) -> "Shared":
-        """Returns the first of these unknowns alone, as if nothing were open about the others."""
+    def only(self, chosen: slice) -> "Shared":
+        """Returns some of these unknowns alone, as if nothing were open about the others."""
         return Shared(
-            self.information[:count, :count],
-            self.pull[:count],
-            self.anchor[:count],
-            self.by_camera[:, :, :count],
-            self.by_flange[:, :, :count],
+            self.information[chosen, chosen],
+            self.pull[chosen],
+            self.anchor[chosen],
+            self.by_camera[:, :, chosen],
+            self.by_flange[:, :, chosen],
+        )
+
+    def told(self, weights: FloatArray, slopes: FloatArray, residuals: FloatArray) -> "Shared":
+        """Returns these unknowns with more knowledge: (m, 6) residuals that move with them.
+
+        Args:
+            weights: (m, 6, 6) information of the residuals.
+            slopes: (m, 6, k) how they move.
+            residuals: (m, 6) as they are now.
+        """
+        weighted = np.swapaxes(slopes, 1, 2) @ weights
+        return replace(
+            self,
+            information=self.information + (weighted @ slopes).sum(axis=0),
+            pull=self.pull + (weighted @ residuals[:, :, None]).sum(axis=0)[:, 0],
         )
 
     def joined(self, other: "Shared") -> "Shared":
@@ -135,13 +150,15 @@ class Closure:
 
     def with_first(self, count: int) -> "Closure":
         """Returns the views with the first of the unknowns that they share, and no others."""
-        return replace(self, shared=None if self.shared is None else self.shared.first(count))
+        return replace(self, shared=None if self.shared is None else self.shared.only(slice(count)))
 
     def merged(self, stops: IntArray) -> "Closure":
         """Makes one view of all that were taken at one stop of the robot.
 
         They share the robot's error, and count once. Their camera poses are averaged with their
-        information, which loses nothing; where that is unknown, evenly.
+        information; what they tell by their differences, of boards that one stop shows or of the
+        lens, stays as knowledge of what is shared. Where the information is unknown, they are
+        averaged evenly.
 
         Args:
             stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
@@ -172,6 +189,7 @@ class Closure:
 
 def _joined(groups: Sequence[Closure]) -> Closure:
     robot, camera, spreads, shifts, arms = [], [], [], [], []
+    shared = groups[0].shared
     for group in groups:
         first = group.camera[0]
         known = group.camera_covariance
@@ -182,10 +200,14 @@ def _joined(groups: Sequence[Closure]) -> Closure:
         robot.append(group.robot[0])
         camera.append(first @ exp(np.einsum("mij,mj->i", shares, away)))
         spreads.append(spread)
-        if group.shared is not None:
-            shifts.append(np.einsum("mij,mjk->ik", shares, group.shared.by_camera))
+        if group.shared is not None and shared is not None:
+            by_camera = group.shared.by_camera
+            shift = np.einsum("mij,mjk->ik", shares, by_camera)
+            shifts.append(shift)
             arms.append(group.shared.by_flange[0])
-    shared = groups[0].shared
+            if known is not None and len(group) > 1:
+                mean = np.einsum("mij,mj->i", shares, away)
+                shared = shared.told(information, by_camera - shift, away - mean)
     return Closure(
         groups[0].mount,
         np.array(robot),
@@ -243,10 +265,10 @@ def deviations(placed: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def distances(placed: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance of each view's target from a place: (m,) [m] and (m,) [rad]."""
+    """Distance of each view's target from a place, or from its own: (m,) [m] and (m,) [rad]."""
     return (
-        np.linalg.norm(placed[:, :3, 3] - z[:3, 3], axis=1),
-        rotation_angle(invert(z)[None] @ placed),
+        np.linalg.norm(placed[:, :3, 3] - z[..., :3, 3], axis=1),
+        rotation_angle(invert(z) @ placed),
     )
 
 

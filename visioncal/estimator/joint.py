@@ -12,19 +12,21 @@ import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.estimator.appearance import (
+    BOARD_NAMES,
     SCALE,
     Appearance,
     Compressed,
     Free,
-    board_basis,
     board_prior,
+    boards_basis,
     compress,
 )
 from visioncal.estimator.arm import ArmErrors
+from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance
-from visioncal.targets import corner_positions
+from visioncal.targets import corner_positions, first_corners, numbered_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
@@ -49,19 +51,21 @@ class Scene:
 
     Attributes:
         mount: Where the camera is.
-        target: What was printed, as stated.
+        targets: What was printed, as stated; the corners of several are numbered through.
         camera: The intrinsics.
         estimated: Whether they were estimated from these corners.
         mode: What to do with given ones: `hold`, `refine` or `auto`.
         matrix_sigma_px: What given fx, fy, cx, cy are known to; None where that is not said.
+        names: What several targets are called.
     """
 
     mount: Mount
-    target: Target
+    targets: tuple[Target, ...]
     camera: Camera
     estimated: bool
     mode: str = "auto"
     matrix_sigma_px: float | None = None
+    names: tuple[str, ...] = ("",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,7 @@ class Arm:
         stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
         basis: (m, 6, p) how its errors move each view's flange.
         of_links: Whether these are errors of its own links.
+        boards: What the views show, where there are several boards.
         errors: Their size, where they are free.
     """
 
@@ -80,6 +85,7 @@ class Arm:
     stops: IntArray
     basis: FloatArray
     of_links: bool
+    boards: Boards
     errors: ArmErrors | None = None
 
 
@@ -90,9 +96,9 @@ class Problem:
     Attributes:
         scene: The scene.
         stack: The corners.
-        positions: (c, 3) corners of the flat board [m].
-        basis: (c, 3, 9) of `board_basis`.
-        prior_sigma: (k + 9,) what lens and board are known to; inf where nothing is known.
+        positions: (c, 3) corners of the flat boards, each in its own frame [m].
+        basis: (c, 3, 9 b) of `boards_basis`.
+        prior_sigma: (k + 9 b,) what lens and boards are known to; inf where nothing is known.
         contested: Whether given intrinsics are held although the corners speak against them.
     """
 
@@ -106,13 +112,14 @@ class Problem:
     @classmethod
     def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "Problem":
         """Puts the problem together from the corners by view."""
-        positions = corner_positions(scene.target)
+        positions = numbered_positions(scene.targets)
+        priors = [board_prior(it, corner_positions(it)) for it in scene.targets]
         return cls(
             scene,
             CornerStack.of(corners, positions),
             positions,
-            board_basis(positions),
-            np.concatenate([_lens_prior(scene), board_prior(scene.target, positions)]),
+            boards_basis([corner_positions(it) for it in scene.targets]),
+            np.concatenate([_lens_prior(scene), *priors]),
         )
 
     def without_prior(self, columns: IntArray) -> "Problem":
@@ -133,13 +140,22 @@ class Problem:
 
     @property
     def scale(self) -> IntArray:
-        """Place of the board's scale."""
-        return np.array([len(self.lens) + SCALE])
+        """Places (b,) of the boards' scales."""
+        return np.arange(len(self.lens) + SCALE, len(self.prior_sigma), len(BOARD_NAMES))
 
     @property
     def shape(self) -> IntArray:
-        """The board's aspect and bend."""
-        return np.arange(len(self.lens) + SCALE + 1, len(self.prior_sigma))
+        """Places of the boards' aspects and bends."""
+        return np.setdiff1d(np.arange(len(self.lens), len(self.prior_sigma)), self.scale)
+
+    def shape_of(self, board: int) -> IntArray:
+        """Places (8,) of one board's aspect and bend."""
+        return np.arange(self.scale[board] + 1, self.scale[board] + len(BOARD_NAMES))
+
+    def corners_of(self, board: int) -> slice:
+        """The rows of one board's corners in `positions`."""
+        starts = [*first_corners(self.scene.targets).tolist(), len(self.positions)]
+        return slice(starts[board], starts[board + 1])
 
     @property
     def has_spare_corners(self) -> bool:
@@ -281,6 +297,7 @@ def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
         floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
         free.shared(seen.compressed.by_shared[:, :, free.columns]),
     )
+    data = arm.boards.brought(data)
     if arm.errors is not None:
         data = data.with_more(arm.errors.shared())
     return data.merged(arm.stops)
@@ -288,14 +305,16 @@ def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
 
 @dataclass(frozen=True)
 class MeasuredScale:
-    """What the chain alone says of the board's scale, as if no size had been stated.
+    """What the chain alone says of a board's scale, as if no size had been stated.
 
     Attributes:
+        board: Which board.
         scale: By which share the board is larger than stated.
         sigma: Its standard deviation.
         stated_sigma: What the stated size is known to.
     """
 
+    board: int
     scale: float
     sigma: float
     stated_sigma: float
@@ -311,20 +330,22 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(problem: Problem, arm: Arm, state: State) -> MeasuredScale:
-    """Measures the board's size by the robot's motion."""
+def measured_scale(problem: Problem, arm: Arm, state: State, board: int = 0) -> MeasuredScale:
+    """Measures a board's size by the robot's motion."""
+    place = problem.scale[board : board + 1]
     data, at_change = _with_free(
-        problem, arm, state, np.union1d(state.moving, problem.scale), ignored=problem.scale
+        problem, arm, state, np.union1d(state.moving, place), ignored=place
     )
     information, gradient = normal_equations(data, at_change, state.fit.noise)
     spread = covariance(information)
-    at = 12 + int(np.searchsorted(state.seen.free.columns, problem.scale[0]))
-    now = state.seen.free.after(state.fit.edges.shared).board[SCALE]
+    at = 12 + int(np.searchsorted(state.seen.free.columns, place[0]))
+    now = float(state.seen.free.after(state.fit.edges.shared).values[place[0]])
     uneven = 1.0 if arm.errors is None else _UNEVEN
     return MeasuredScale(
+        board,
         now - float(spread[at] @ gradient),
         uneven * float(np.sqrt(spread[at, at])),
-        float(board_prior(problem.scene.target, problem.positions)[SCALE]),
+        problem.scene.targets[board].square_sigma_m / problem.scene.targets[board].square_m,
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
+from visioncal.estimator.boards import Boards, place
 from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimator.linalg import Spectrum, covariance, spectrum
 from visioncal.figures import figure
@@ -54,7 +55,9 @@ def edge_names(mount: Mount) -> tuple[str, str]:
     return "base_from_cam", "flange_from_target"
 
 
-def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 0) -> None:
+def check_observability(
+    data: Closure, edges: Edges, noise: Noise, boards: Boards, looks: int = 0
+) -> None:
     """Refuses motion that leaves a direction open.
 
     Views that disagree wildly are no fault of the motion: poses in other units, of other images or
@@ -65,16 +68,21 @@ def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 
         data: The used views.
         edges: The answer.
         noise: Of the residuals.
-        looks: How many of the unknowns that the views share are of lens and board; they come first.
+        boards: The boards, where there are several.
+        looks: How many of the unknowns that the views share are of lens and board, where these have
+            to be told, too; they come first.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
     refuse_too_few(data)
     held, still = replace(data, shared=None), replace(edges, shared=np.zeros(0))
+    if data.shared is not None and boards.unknowns:
+        held = replace(data, shared=data.shared.only(boards.places))
+        still = replace(edges, shared=edges.shared[boards.places])
     spread = spectrum(closure_information(held, still, noise))
     if spread.ratio < _NULL_RATIO:
-        culprit = _null_direction(spread, edges, data.mount)
+        culprit = _null_direction(spread, edges, data.mount, boards)
         verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
             f"hand-eye: {culprit} {verb} not determined at all (information ratio "
@@ -83,11 +91,22 @@ def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 
             next_step=_advice(data.mount),
         )
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
-    _refuse(worst_directions(held, still, plausible), _motion(data), _advice(data.mount))
+    worst = worst_directions(held, still, plausible, replace(boards, begin=0))
+    _refuse(worst[:4], _motion(data), _advice(data.mount))
+    for board, name in enumerate(boards.names[1:], start=1):
+        _refuse(
+            worst[2 + 2 * board : 4 + 2 * board],
+            f"{int(np.sum(boards.shown == board))} used views show it",
+            f"Add views of target {name}, or take it out of the session.",
+        )
     if looks:
+        first = looks + boards.unknowns
         _refuse(
             worst_directions(
-                data.with_first(looks), replace(edges, shared=edges.shared[:looks]), plausible
+                data.with_first(first),
+                replace(edges, shared=edges.shared[:first]),
+                plausible,
+                boards,
             ),
             "the views do not determine lens and board well enough",
             "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
@@ -105,27 +124,35 @@ def _refuse(worst: Sequence[Direction], cause: str, next_step: str) -> None:
         )
 
 
-def worst_directions(data: Closure, edges: Edges, noise: Noise) -> tuple[Direction, ...]:
+def worst_directions(
+    data: Closure, edges: Edges, noise: Noise, boards: Boards
+) -> tuple[Direction, ...]:
     """The worst directions of a fit; see `directions`."""
-    return directions(covariance(closure_information(data, edges, noise)), edges, data.mount)
+    spread = covariance(closure_information(data, edges, noise))
+    return directions(spread, edges, data.mount, boards)
 
 
-def directions(spread: FloatArray, edges: Edges, mount: Mount) -> tuple[Direction, ...]:
-    """The worst direction of each edge, first x's and then z's, offset before rotation.
+def directions(
+    spread: FloatArray, edges: Edges, mount: Mount, boards: Boards
+) -> tuple[Direction, ...]:
+    """The worst direction of each edge, first x's and then each board's, offset before rotation.
 
     Args:
         spread: (12 + k, 12 + k) covariance of x, z and others.
         edges: The answer.
         mount: Where the camera is.
+        boards: The boards, where there are several.
     """
     found = []
-    for edge, transform in enumerate((edges.x, edges.z)):
+    placed = place(boards, edges)
+    spread = placed.covariance(spread)
+    for edge, transform in enumerate((edges.x, *placed.z)):
         for is_rotation in (False, True):
             start = 6 * edge + (0 if is_rotation else 3)
             block = spread[start : start + 3, start : start + 3]
             values, vectors = np.linalg.eigh(block)
             limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
-            words = _words(edge, transform[:3, :3] @ vectors[:, -1], mount, is_rotation)
+            words = _words(edge, transform[:3, :3] @ vectors[:, -1], mount, is_rotation, boards)
             found.append(Direction(words, float(np.sqrt(values[-1])), float(limit), is_rotation))
     return tuple(found)
 
@@ -158,7 +185,7 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     )
 
 
-def _null_direction(spread: Spectrum, edges: Edges, mount: Mount) -> str:
+def _null_direction(spread: Spectrum, edges: Edges, mount: Mount, boards: Boards) -> str:
     """Names what the null directions leave open: of the camera's edge, or else the target's."""
     null = spread.vectors[:, spread.values < _NULL_RATIO * spread.values[-1]]
     for edge, transform in enumerate((edges.x, edges.z)):
@@ -166,7 +193,7 @@ def _null_direction(spread: Spectrum, edges: Edges, mount: Mount) -> str:
             transform[:3, :3] @ null[6 * edge + at : 6 * edge + at + 3] for at in (0, 3)
         )
         parts = [
-            _open_part(edge, directions, mount, is_rotation)
+            _open_part(edge, directions, mount, is_rotation, boards)
             for directions, is_rotation in ((translation, False), (rotation, True))
         ]
         named = [part for part in parts if part]
@@ -175,31 +202,36 @@ def _null_direction(spread: Spectrum, edges: Edges, mount: Mount) -> str:
     return "a combination of both edges"
 
 
-def _open_part(edge: int, directions: FloatArray, mount: Mount, is_rotation: bool) -> str:
+def _open_part(
+    edge: int, directions: FloatArray, mount: Mount, is_rotation: bool, boards: Boards
+) -> str:
     """Names what (3, k) null directions leave open of a rotation or an offset, if anything."""
     vectors, sizes, _ = np.linalg.svd(directions)
     # Null vectors have unit length over all twelve unknowns, a radian counting as a metre.
     rank = int(np.sum(sizes > _PART_OF_NULL))
     if rank == 1:
-        return _words(edge, vectors[:, 0], mount, is_rotation)
+        return _words(edge, vectors[:, 0], mount, is_rotation, boards)
     if rank == 0:
         return ""
-    thing, frame = _names(edge, mount)
+    thing, frame = _names(edge, mount, boards)
     return f"the {thing}'s {'rotation' if is_rotation else 'offset from the ' + frame}"
 
 
-def _words(edge: int, direction: FloatArray, mount: Mount, is_rotation: bool) -> str:
+def _words(
+    edge: int, direction: FloatArray, mount: Mount, is_rotation: bool, boards: Boards
+) -> str:
     """Says which component of which edge a direction in the edge's parent frame is."""
-    thing, frame = _names(edge, mount)
+    thing, frame = _names(edge, mount, boards)
     quantity = "rotation about" if is_rotation else "offset along"
     return f"the {thing}'s {quantity} the {frame}'s {axis_words(direction)}"
 
 
-def _names(edge: int, mount: Mount) -> tuple[str, str]:
+def _names(edge: int, mount: Mount, boards: Boards) -> tuple[str, str]:
     """What an edge places, and the frame that it hangs on."""
     if edge == 0:
         return "camera", _frame(mount)
-    return "target", "base" if mount == "eye-in-hand" else "tool"
+    name = f"target {boards.names[edge - 1]}".strip()
+    return name, "base" if mount == "eye-in-hand" else "tool"
 
 
 def axis_words(direction: FloatArray) -> str:

@@ -148,7 +148,7 @@ def _fitted(
     """The poses, the corners that fit the best of them, and the sum of their squares [px^2]."""
     positions = corner_positions(target)
     for _ in range(_ROUNDS):
-        (poses,) = measure_poses({corners.view: corners}, target, camera, noise_px)
+        (poses,) = measure_poses({corners.view: corners}, [target], camera, noise_px)
         stack = CornerStack.of({corners.view: corners}, positions)
         residuals = _compressed(camera, stack, target, poses.cam_from_target[:1]).residuals
         passed = gate(stack, residuals)

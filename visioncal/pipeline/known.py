@@ -11,6 +11,7 @@ from visioncal.calibration import CameraResult, Rms, Verdict
 from visioncal.estimator.appearance import Free
 from visioncal.estimator.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
 from visioncal.robot import Convention, Robot
@@ -40,6 +41,8 @@ class Known:
         progress: Told of long work.
         robot: The nominal robot, where the session names a known one.
         base_from_flange: (4, 4) by view, as the robot reported it.
+        boards: Which of the session's boards the chain holds: the one it ends at, and others.
+        from_first: (b, 4, 4) where they lie: `target_k_from_target_1`, in that order.
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         corners: What was found of the target, by view.
         resolution: Size of the images [px].
@@ -72,6 +75,8 @@ class Known:
     robot: Robot | None = None
     base_from_flange: Mapping[int, FloatArray] = field(default_factory=dict)
     joints_rad: Mapping[int, FloatArray] | None = None
+    boards: tuple[int, ...] = (0,)
+    from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
@@ -133,17 +138,18 @@ class Known:
     def scene(self) -> Scene | None:
         """What is looked at, and with what; None where there are no corners."""
         session, camera = self.session, self.camera
-        if camera is None or session.target is None or self.pixel_px is None:
+        if camera is None or not session.boards or self.pixel_px is None:
             return None
         table = session.declaration.camera
         sigma_px = None if table is None else table.matrix_sigma_px
         return Scene(
             session.mount,
-            session.target,
+            tuple(session.boards.values()),
             camera.camera,
             camera.estimated,
             session.intrinsics_mode,
             sigma_px,
+            tuple(session.boards),
         )
 
     @property
@@ -173,10 +179,27 @@ class Known:
                 camera_covariance=np.array([pose.covariance[0] for pose in poses]),
                 shared=None if self.free is None else self.free.shared(np.array(shift)),
             )
+        elif self.free is not None and len(self.free.columns):
+            # Poses that others have measured do not move with lens and board.
+            still = np.zeros((len(poses), 6, len(self.free.columns)))
+            data = replace(data, shared=self.free.shared(still))
+        data = self.shown(views).brought(data)
         if self.arm is not None and self.arm.is_estimated and poses:
             errors = replace(self.arm, basis=self.arm_basis(views))
             data = data.with_more(errors.shared(self.arm_values))
         return data
+
+    def shown(self, views: Sequence[int]) -> Boards:
+        """The boards of some views, all of which the chain holds."""
+        names = tuple(self.session.boards) or ("",)
+        shown = [self.boards.index(self.poses[view].board) for view in views]
+        looks = 0 if self.free is None else len(self.free.columns)
+        return Boards(
+            tuple(names[it] for it in self.boards),
+            np.array(shown, dtype=np.int64),
+            self.from_first,
+            looks,
+        )
 
     def flange_poses(self, views: Sequence[int]) -> FloatArray:
         """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""
@@ -230,11 +253,12 @@ class Known:
         """(m,) which stop of the robot each view was taken at, numbered from 0.
 
         Views of one stop share the robot's error. Where the session does not number its stops,
-        views with the same reported pose are of one.
+        views with the same reported pose are of one. Poses that were measured by others are not
+        told apart from the robot's: of several boards, each has stops of its own then.
         """
         declared = {view.number: view.stop for view in self.session.views}
         keys: dict[object, int] = {}
-        return np.array(
+        stops = np.array(
             [
                 keys.setdefault(
                     self.base_from_flange[view].tobytes()
@@ -246,6 +270,8 @@ class Known:
             ],
             dtype=np.int64,
         )
+        measured = any(self.poses[view].corners is None for view in views)
+        return self.shown(views).units(stops) if measured and len(self.boards) > 1 else stops
 
     def seen(self, views: Sequence[int]) -> list[Corners | None]:
         """The corners of some views that their poses were made from."""
@@ -282,10 +308,13 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
 
 
 def rms_of(away_m: FloatArray, away_rad: FloatArray, rms_px: FloatArray) -> Rms:
-    """Root mean squares over views [m, rad, px]; views without corners have NaN pixels."""
+    """Root mean squares over views [m, rad, px].
+
+    Views without corners have NaN pixels, and those that cannot be predicted nothing but NaN.
+    """
     seen = rms_px[np.isfinite(rms_px)]
     return Rms(
-        mm=float(1e3 * np.sqrt(np.mean(away_m**2))),
-        deg=float(np.rad2deg(np.sqrt(np.mean(away_rad**2)))),
+        mm=float(1e3 * np.sqrt(np.nanmean(away_m**2))),
+        deg=float(np.rad2deg(np.sqrt(np.nanmean(away_rad**2)))),
         px=float(np.sqrt(np.mean(seen**2))) if len(seen) else None,
     )

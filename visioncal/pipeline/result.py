@@ -11,6 +11,7 @@ from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult,
 from visioncal.errors import DataError, VisioncalError
 from visioncal.estimator.appearance import BOARD_NAMES, Free
 from visioncal.estimator.arm import LEVER_M
+from visioncal.estimator.boards import Placed, place
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.arm import kinematics_document
@@ -23,6 +24,7 @@ from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES
 from visioncal.stages.kinematics import ASKED
+from visioncal.targets import first_corners
 from visioncal.types import Progress, SolverName
 
 _LEVELS = (*ASKED, "hand-eye")
@@ -135,21 +137,21 @@ def result_of(known: Known) -> Calibration:
     if held is None or findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
     session, result = known.session, known.solved
-    x_name, z_name = edge_names(session.mount)
-    spread = result.covariance
+    names, placed = _edges_in_order(known)
+    spread = placed.covariance(result.covariance)
     return Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         mount=session.mount,
         edges={
-            x_name: Edge(result.edges.x, spread[:6, :6]),
-            z_name: Edge(result.edges.z, spread[6:12, 6:12]),
+            name: Edge(edge, spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
+            for at, (name, edge) in enumerate(zip(names, [result.edges.x, *placed.z], strict=True))
         },
-        joint_covariance=spread[:12, :12],
+        joint_covariance=spread,
         solvers={
             name: SolverResult(
-                {x_name: it.x, z_name: it.z},
+                dict(zip(names, [it.x, *placed.seen_with(it.z)], strict=True)),
                 1e3 * it.rms_m,
                 float(np.rad2deg(it.rms_rad)),
             )
@@ -166,11 +168,25 @@ def result_of(known: Known) -> Calibration:
     )
 
 
+def _edges_in_order(known: Known) -> tuple[tuple[str, ...], Placed]:
+    """The edges' names, and all boards in the order in which the session names them."""
+    x_name, z_name = edge_names(known.session.mount)
+    placed = place(known.shown(known.used), known.solved.edges)
+    order = sorted(range(len(known.boards)), key=lambda it: known.boards[it])
+    names = [f"{z_name}_{placed.names[it]}" if placed.names[it] else z_name for it in order]
+    return (x_name, *names), placed.sorted(order)
+
+
 def _further(known: Known) -> dict[str, dict[str, Any]]:
     """What was refined beside the edges, and where the uncertainty comes from."""
     documents = {}
-    if known.free is not None:
-        documents["board"] = _board(known, known.free)
+    if known.free is not None and not known.session.targets:
+        documents["board"] = _board(known, known.free, 0)
+    elif known.free is not None:
+        names = tuple(known.session.targets)
+        documents["boards"] = {
+            names[it]: _board(known, known.free, it) for it in sorted(known.boards)
+        }
     if known.arm is not None:
         documents["arm_errors"] = {
             "sigma_mm": 1e3 * LEVER_M * known.arm.sigma,
@@ -186,13 +202,17 @@ def _further(known: Known) -> dict[str, dict[str, Any]]:
     return documents
 
 
-def _board(known: Known, free: Free) -> dict[str, Any]:
-    """The board as it was found to be, and how well that is known."""
-    board = free.columns >= free.lens_count
-    shape = free.after(known.solved.edges.shared).board
-    bend = free.corners_after(known.solved.edges.shared)[:, 2]
+def _board(known: Known, free: Free, place: int) -> dict[str, Any]:
+    """A board as it was found to be, and how well that is known."""
+    size = len(BOARD_NAMES)
+    begin = free.lens_count + size * place
+    board = (free.columns >= begin) & (free.columns < begin + size)
+    shape = free.after(known.solved.edges.shared).board[size * place : size * (place + 1)]
+    starts = first_corners(tuple(known.session.boards.values()))
+    ends = [*starts[1:].tolist(), len(free.positions)]
+    bend = free.corners_after(known.solved.edges.shared)[starts[place] : ends[place], 2]
     sigmas = np.sqrt(np.diag(known.solved.covariance))[12 : 12 + len(free.columns)][board]
-    names = [BOARD_NAMES[at - free.lens_count] for at in free.columns[board]]
+    names = [BOARD_NAMES[at - begin] for at in free.columns[board]]
     return {
         "shape": dict(zip(BOARD_NAMES, shape.tolist(), strict=True)),
         "sigma": dict(zip(names, sigmas.tolist(), strict=True)),
@@ -231,9 +251,10 @@ def _camera(known: Known) -> CameraResult | None:
     if not len(columns):
         return known.camera
     rows = 12 + np.searchsorted(free.columns, columns)
-    spread, shared = np.zeros((free.lens_count,) * 2), np.zeros((free.lens_count, 12))
+    slope = _edges_in_order(known)[1].slope
+    spread, shared = np.zeros((free.lens_count,) * 2), np.zeros((free.lens_count, len(slope)))
     spread[np.ix_(columns, columns)] = result.covariance[np.ix_(rows, rows)]
-    shared[columns] = result.covariance[rows, :12]
+    shared[columns] = result.covariance[rows] @ slope.T
     return CameraResult(
         free.after(result.edges.shared).camera,
         estimated=known.camera.estimated or free.lens_is_free,

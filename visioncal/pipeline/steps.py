@@ -17,22 +17,23 @@ from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.known import Known, rms_of
+from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.stages.agree import agree
-from visioncal.stages.choose import choose_by, choose_poses
+from visioncal.stages.choose import choose_by
 from visioncal.stages.detect import detect
 from visioncal.stages.diagnose import diagnose
-from visioncal.stages.handeye import solve_hand_eye
+from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
-from visioncal.stages.pnp import estimate_poses, given_poses, measure_poses
+from visioncal.stages.place import lay_out
+from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses, usable_joints
 from visioncal.stages.validate import validate
-from visioncal.targets import corner_positions
 from visioncal.types import Rejection
 
 # Views move in and out of the fit at most so often; they settle after one or two, as does the
@@ -87,31 +88,31 @@ def _detect(known: Known) -> Known:
         return known
     found = detect(known.session, progress=known.progress)
     known = replace(known, corners=found.corners, resolution=found.resolution)
-    return known.noting(found.rejections)
+    return numbered_through(known).noting(found.rejections)
 
 
 def _intrinsics(known: Known) -> Known:
-    session, target = known.session, known.session.target
+    session, targets = known.session, tuple(known.session.boards.values())
     fitted = {view: it for view, it in known.corners.items() if view not in known.held_back}
-    if not fitted or target is None or known.resolution is None:
+    if not fitted or not targets or known.resolution is None:
         return known
     if session.camera is not None:
         return replace(known, camera=CameraResult(session.camera, estimated=False))
-    result = estimate_intrinsics(fitted, target, known.resolution, session.camera_model)
+    result = estimate_intrinsics(fitted, targets, known.resolution, session.camera_model)
     camera = CameraResult(result.camera, estimated=True, covariance=result.covariance)
     return replace(known, camera=camera).noting(result.rejections, result.warnings)
 
 
 def _pnp(known: Known) -> Known:
-    target, poses = known.session.target, given_poses(known.session)
+    targets, poses = tuple(known.session.boards.values()), given_poses(known.session)
     corners = {view: it for view, it in known.corners.items() if view not in known.reasons}
     fitted = {view: it for view, it in corners.items() if view not in known.held_back}
-    if fitted and target is not None and known.camera is not None:
+    if fitted and targets and known.camera is not None:
         unknowns = 0 if known.camera.covariance is None else len(known.camera.covariance)
-        result = estimate_poses(fitted, target, known.camera.camera, unknowns)
+        result = estimate_poses(fitted, targets, known.camera.camera, unknowns)
         rest = {view: it for view, it in corners.items() if view in known.held_back}
         # What is held back neither sets the noise of the others nor is it left out for its own.
-        held = measure_poses(rest, target, known.camera.camera, result.sigma_px)
+        held = measure_poses(rest, targets, known.camera.camera, result.sigma_px)
         seen = {view.view: view for view in (*result.views, *held)}
         known = replace(known, pixel_px=result.sigma_px).noting(result.rejections)
         poses = poses | seen
@@ -151,14 +152,24 @@ def _choose(known: Known) -> Known:
         and view.number in known.base_from_flange
         and view.number not in known.held_back
     ]
-    choice = choose_poses(
-        [known.poses[view] for view in views], known.closure(views).robot, known.session.target
+    layout = lay_out(
+        [known.poses[view] for view in views],
+        robot_part(known.flange_poses(views), known.session.mount),
+        known.session.mount,
+        known.session.boards,
     )
+    choice = layout.choice
+    known = replace(known, boards=layout.boards, from_first=layout.from_first)
     poses = {**known.poses, **{view.view: view for view in choice.views}}
     used = tuple(view.view for view in choice.views)
     # A view whose image failed may still be used by the pose that the session gives.
     reasons = {view: reason for view, reason in known.reasons.items() if view not in used}
-    return replace(known, poses=poses, used=used, reasons=reasons).noting(choice.rejections)
+    known = replace(known, poses=poses, used=used, reasons=reasons).noting(choice.rejections)
+    names = tuple(known.session.boards) if known.session.targets else ()
+    unseen = [name for at, name in enumerate(names) if at not in known.boards]
+    return known.noting(
+        (), [f"No usable view shows target {name}: it has no place." for name in unseen]
+    )
 
 
 def _look(known: Known) -> Known:
@@ -171,15 +182,26 @@ def _look(known: Known) -> Known:
 
 
 def _agree(known: Known) -> Known:
-    target = known.session.target
     data = known.closure(known.used)
     refuse_too_few(data.merged(known.stops), len(data))
-    agreed = agree(data, known.used, known.stops)
-    poses = [
-        choose_by(known.poses[view], known.closure([view]).robot[0], agreed.edges, target)
-        for view in known.held_back & known.poses.keys() & known.base_from_flange.keys()
-    ]
-    return replace(known.posed(poses), candidates=known.used).agreeing(agreed)
+    agreed = agree(data, known.used, known.stops, boards=known.shown(known.used))
+    known = relaid(known, agreed.edges.shared)
+    known = without_lost_boards(replace(known, candidates=known.used).agreeing(agreed))
+    return known.posed(_held_back_poses(known))
+
+
+def _held_back_poses(known: Known) -> Iterator[ViewPoses]:
+    """Chooses the poses of views that no fit may use by the edges of the others."""
+    targets, mount, agreed = tuple(known.session.boards.values()), known.session.mount, known.agreed
+    if agreed is None:
+        return
+    for view in known.held_back & known.poses.keys() & known.base_from_flange.keys():
+        poses = known.poses[view]
+        if poses.board in known.boards:
+            robot = robot_part(known.flange_poses([view]), mount)[0]
+            z = agreed.edges.z @ known.shown([view]).first_from_own[0]
+            at = replace(agreed.edges, z=z)
+            yield choose_by(poses, robot, at, targets[poses.board] if targets else None)
 
 
 def _refine(known: Known) -> Known:
@@ -195,10 +217,12 @@ def _refine(known: Known) -> Known:
         result = refine(scene, views, _arm(known), agreed.edges)
         known = known.seeing(result)
         before, all_of = agreed.mask, known.candidates
-        agreed = agree(known.closure(all_of), all_of, known.stops_of(all_of), agreed)
-        known = known.agreeing(agreed)
+        boards = known.shown(all_of)
+        agreed = agree(known.closure(all_of), all_of, known.stops_of(all_of), agreed, boards)
+        known = without_lost_boards(relaid(known.agreeing(agreed), agreed.edges.shared))
         if np.array_equal(before, agreed.mask):
             break
+        agreed = known.agreed or agreed
     return known.noting((), result.warnings)
 
 
@@ -208,6 +232,7 @@ def _arm(known: Known) -> Arm:
         known.stops,
         known.arm_basis(known.used),
         known.joints_rad is not None,
+        known.shown(known.used),
     )
 
 
@@ -233,19 +258,21 @@ def _kinematics(known: Known) -> Known:
 
 
 def _hand_eye(known: Known) -> Known:
-    """Solves for both edges, with the arm's errors linearised anew until they stay."""
+    """Solves for both edges, with arm and further boards linearised anew until they stay."""
     for _ in range(_ROUNDS):
         known = known.with_arm_errors()
+        boards = known.shown(known.used)
         data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
-        result = solve_hand_eye(data, known.solver, arm, known.estimated_looks)
+        result = solve_hand_eye(data, known.solver, arm, known.estimated_looks, boards)
         known = replace(known, hand_eye=result)
-        model = known.arm_model
-        if model is None:
+        model, shared = known.arm_model, result.edges.shared
+        step = shared[len(shared) - (0 if model is None else len(model.values)) :]
+        moved = np.abs(np.concatenate([[0.0], step, shared[boards.places]]))
+        if moved.max() < _ARM_AT_REST_RAD:
             break
-        step = result.edges.shared[len(result.edges.shared) - len(model.values) :]
-        if np.abs(step).max() < _ARM_AT_REST_RAD:
-            break
-        known = replace(known, arm_model=model.moved(step))
+        known = relaid(known, shared)
+        if model is not None:
+            known = replace(known, arm_model=model.moved(step))
     return known
 
 
@@ -258,18 +285,18 @@ def _arm_by_stop(known: Known) -> ArmErrors | None:
 
 def _diagnose(known: Known) -> Known:
     data, result = known.closure(known.used).merged(known.stops), known.solved
-    target = known.session.target
-    middle = np.zeros(3) if target is None else corner_positions(target).mean(axis=0)
+    first, boards = np.unique(known.stops, return_index=True)[1], known.shown(known.used)
     diagnosis = diagnose(
         data,
         result,
         known.free,
         _arm_by_stop(known),
-        middle,
+        middles(known)[first],
+        boards,
         calibrated=known.arm_model is not None,
     )
     spread = diagnosis.inflation * result.covariance
-    worst = directions(spread, result.edges, data.mount)
+    worst = directions(spread, result.edges, data.mount, boards)
     wider = replace(result, covariance=spread, worst=worst)
     known = replace(known, hand_eye=wider, diagnosis=diagnosis)
     return known.noting((), diagnosis.warnings)
@@ -278,7 +305,8 @@ def _diagnose(known: Known) -> Known:
 def _validate(known: Known) -> Known:
     result, data = known.solved, known.closure(known.used)
     seen = known.seen(known.used)
-    held_out = validate(data, known.stops, result, known.solver, seen, known.free)
+    boards = known.shown(known.used)
+    held_out = validate(data, known.stops, result, known.solver, seen, known.free, boards)
     return replace(known, held_out=held_out)
 
 

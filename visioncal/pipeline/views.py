@@ -1,5 +1,6 @@
 """What became of each view: its figures for the result, and its evidence for people."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import distances
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import HELD_BACK, Known, rms_of
+from visioncal.pipeline.layout import own_numbers
 from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import mean_transform
 from visioncal.types import Corners, FloatArray
@@ -53,16 +55,34 @@ def view_evidence(known: Known) -> tuple[ViewEvidence, ...]:
 
 def _measurable(known: Known) -> list[int]:
     """The views whose chain can be closed: used ones, those left out, and those held back."""
-    held = known.held_back & known.poses.keys() & known.base_from_flange.keys()
+    held = {
+        view
+        for view in known.held_back & known.poses.keys() & known.base_from_flange.keys()
+        if known.poses[view].board in known.boards
+    }
     return [it.number for it in known.session.views if it.number in {*known.candidates, *held}]
 
 
 def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Deviations (m,) [m], [rad] from the used views' mean, and through the chain [px]."""
-    edges, data = known.solved.edges, known.closure(views)
-    centre = mean_transform(known.closure(known.used).under(edges.shared).placed(edges.x))
-    rms_px = chain_rms_px(data, edges, known.seen(views), known.free)
-    return (*distances(data.under(edges.shared).placed(edges.x), centre), rms_px)
+    """Deviations (m,) [m], [rad] from the used views' mean, and through the chain [px].
+
+    Each view's place of its board is compared with the mean of those that show the same one.
+    """
+    edges, data, shown = known.solved.edges, known.closure(views), known.shown(views)
+    own = shown.moved(edges.shared).first_from_own
+    rms_px = chain_rms_px(data, edges, known.seen(views), known.free, own)
+    means = np.array([mean_transform(it) for it in _placed_by_board(known)])
+    placed = data.under(edges.shared).placed(edges.x) @ own
+    return (*distances(placed, means[shown.shown]), rms_px)
+
+
+def _placed_by_board(known: Known) -> Iterator[FloatArray]:
+    """Where the used views of each board place it, (k, 4, 4)."""
+    edges, shown = known.solved.edges, known.shown(known.used)
+    placed = known.closure(known.used).under(edges.shared).placed(edges.x)
+    placed = placed @ shown.moved(edges.shared).first_from_own
+    for board in range(len(known.boards)):
+        yield placed[shown.shown == board]
 
 
 def _reason(known: Known, view: int) -> str:
@@ -84,15 +104,17 @@ def _evidence(known: Known, view: int) -> ViewEvidence:
     reported = known.base_from_flange.get(view)
     base_from_flange = None if reported is None else known.flange_poses([view])[0]
     predicted = cam_from_target = None
-    if poses is not None and reported is not None:
+    if poses is not None and reported is not None and poses.board in known.boards:
         data = known.closure([view]).under(edges.shared)
-        cam_from_target = data.camera[0]
+        own = known.shown([view]).moved(edges.shared).first_from_own[0]
+        cam_from_target = data.camera[0] @ own
         # Of several poses that were never chosen from, the corners' numbering is not known.
         if corners is not None and len(poses.cam_from_target) == 1:
-            predicted = _predicted(known, data.predicted_camera(edges.x, edges.z)[0], corners)
+            where = data.predicted_camera(edges.x, edges.z)[0] @ own
+            predicted = _predicted(known, where, corners)
     return ViewEvidence(
         view=view,
-        corners=corners,
+        corners=None if corners is None else own_numbers(known, corners),
         predicted_px=predicted,
         base_from_flange=base_from_flange,
         cam_from_target=cam_from_target,

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.consensus import agreeing_views, whole_units
 from visioncal.estimator.linalg import one_blas_thread
@@ -28,7 +29,11 @@ class Agreed:
 
 
 def agree(
-    data: Closure, views: Sequence[int], stops: IntArray, start: Agreed | None = None
+    data: Closure,
+    views: Sequence[int],
+    stops: IntArray,
+    start: Agreed | None = None,
+    boards: Boards | None = None,
 ) -> Agreed:
     """Finds the views whose robot pose and image belong together.
 
@@ -37,17 +42,23 @@ def agree(
         views: The views' numbers.
         stops: (m,) which stop of the robot each was taken at. A stop is right or wrong as a whole,
             unless its own images contradict each other: then each is compared with the other stops.
+            So are its views of several boards.
         start: What was found of the same views before; None for a search without any idea.
+        boards: What the views show, where there are several boards.
 
     Returns:
         The views that agree with each other, and why the others do not.
     """
     with one_blas_thread():
-        units = whole_units(data, stops)
+        units = whole_units(data, stops if boards is None else boards.units(stops))
         thought = None if start is None else np.bincount(units, start.mask) > 0
         found = agreeing_views(data.merged(units), thought)
     mask, edges = found.agrees[units], found.fit.edges
-    away_m, away_rad = distances(data.under(edges.shared).placed(edges.x), edges.z)
+    placed, z = data.under(edges.shared).placed(edges.x), edges.z[None]
+    if boards is not None:
+        own = boards.moved(edges.shared).first_from_own
+        placed, z = placed @ own, z @ own
+    away_m, away_rad = distances(placed, z)
     surprise = np.sqrt(found.surprise[units] / 6.0)
     limit = float(np.sqrt(found.limit / 6.0))
     return Agreed(

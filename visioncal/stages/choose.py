@@ -16,7 +16,7 @@ from visioncal.transforms import invert, rotation_angle
 from visioncal.types import Corners, FloatArray, IntArray, Mask, Rejection, Target
 
 # A rival that closes the chain within this many times the chosen one's distance is as likely.
-_CLEAR_RATIO = 3.0
+CLEAR_RATIO = 3.0
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.
 _TRIPLES = 40
@@ -33,8 +33,8 @@ class Choice:
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Padded (m, k, 4, 4) candidates and their (m, k) validity."""
+class Candidates:
+    """Padded (m, k, 4, 4) candidates of m views, and their (m, k) validity."""
 
     poses: FloatArray
     valid: Mask
@@ -60,7 +60,7 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
     """
     if all(len(view.cam_from_target) == 1 for view in views) or len(views) < 3:
         return Choice(tuple(_chosen(view, 0, target) for view in views), ())
-    candidates = _pad(views)
+    candidates = padded(views)
     turns = len(set(views[0].turns))
     picks = _as_the_first(_assign(robot, candidates, views), turns)
     distance = _distances(robot, candidates, picks)
@@ -68,9 +68,9 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
     others = distance.copy()
     others[np.arange(len(views)), picks] = np.inf
     typical = np.median(best)
-    unclear = others.min(axis=1) < _CLEAR_RATIO * np.maximum(best, typical)
+    unclear = others.min(axis=1) < CLEAR_RATIO * np.maximum(best, typical)
     # A view far from all others with any of its poses is wrong, which is for the verdict to say.
-    unclear &= best < _CLEAR_RATIO**2 * typical
+    unclear &= best < CLEAR_RATIO**2 * typical
     if unclear.sum() > len(views) / 2:
         raise DegenerateError(
             f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
@@ -102,11 +102,12 @@ def choose_by(view: ViewPoses, robot: FloatArray, edges: Edges, target: Target |
         edges: Both edges.
         target: What was seen, for its symmetries.
     """
-    pick = _nearest(robot[None], _pad([view]), edges.x, edges.z)[0].argmin()
+    pick = distances_to(robot[None], padded([view]), edges.x, edges.z)[0].argmin()
     return _chosen(view, int(pick), target)
 
 
-def _pad(views: Sequence[ViewPoses]) -> _Candidates:
+def padded(views: Sequence[ViewPoses]) -> Candidates:
+    """Puts the candidates of m views into one array."""
     most = max(len(view.cam_from_target) for view in views)
     valid = np.array([np.arange(most) < len(view.cam_from_target) for view in views])
     poses = np.array(
@@ -115,13 +116,13 @@ def _pad(views: Sequence[ViewPoses]) -> _Candidates:
             for view in views
         ]
     )
-    return _Candidates(poses, valid)
+    return Candidates(poses, valid)
 
 
-def _assign(robot: FloatArray, candidates: _Candidates, views: Sequence[ViewPoses]) -> IntArray:
+def _assign(robot: FloatArray, candidates: Candidates, views: Sequence[ViewPoses]) -> IntArray:
     """Finds the assignment under which the views agree best, from the best of many starts."""
     picked = [
-        _nearest(robot, candidates, *_solve(robot[rows], candidates.poses[rows, picks]))
+        distances_to(robot, candidates, *_solve(robot[rows], candidates.poses[rows, picks]))
         for rows, picks in _starts(candidates, views)
     ]
     picked.sort(key=_score)
@@ -142,7 +143,7 @@ def _score(distance: FloatArray) -> float:
     return float(np.median(distance.min(axis=1)))
 
 
-def _settle(robot: FloatArray, candidates: _Candidates, picks: IntArray) -> IntArray:
+def _settle(robot: FloatArray, candidates: Candidates, picks: IntArray) -> IntArray:
     """Solves from all views and picks anew, until nothing changes."""
     for _ in range(_ROUNDS):
         before, picks = picks, _distances(robot, candidates, picks).argmin(axis=1)
@@ -152,7 +153,7 @@ def _settle(robot: FloatArray, candidates: _Candidates, picks: IntArray) -> IntA
 
 
 def _starts(
-    candidates: _Candidates, views: Sequence[ViewPoses]
+    candidates: Candidates, views: Sequence[ViewPoses]
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yields rows and picks to solve from: all views' best by image, then triples of views."""
     yield np.arange(len(views)), np.zeros(len(views), dtype=np.int64)
@@ -174,14 +175,14 @@ def _solve(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArra
     return solution.x, solution.z
 
 
-def _distances(robot: FloatArray, candidates: _Candidates, picks: IntArray) -> FloatArray:
+def _distances(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
     """Distances under the solution of an assignment, (m, k)."""
     x, z = _solve(robot, candidates.poses[np.arange(len(robot)), picks])
-    return _nearest(robot, candidates, x, z)
+    return distances_to(robot, candidates, x, z)
 
 
-def _nearest(
-    robot: FloatArray, candidates: _Candidates, x: FloatArray, z: FloatArray
+def distances_to(
+    robot: FloatArray, candidates: Candidates, x: FloatArray, z: FloatArray
 ) -> FloatArray:
     """Distance (m, k) [m] between where each candidate places the target, and z."""
     placed = robot[:, None] @ x @ candidates.poses

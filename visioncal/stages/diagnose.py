@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.chance import chi2_limit
 from visioncal.estimator.appearance import Free
 from visioncal.estimator.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
+from visioncal.estimator.boards import Boards
 from visioncal.estimator.budget import covariance_by_source, point_covariance
 from visioncal.estimator.closure import Closure, fit_closure
 from visioncal.estimator.intervals import noise_intervals
@@ -54,6 +55,7 @@ def diagnose(
     free: Free | None,
     arm: ArmErrors | None,
     middle: FloatArray,
+    boards: Boards,
     *,
     calibrated: bool = False,
 ) -> Diagnosis:
@@ -64,7 +66,9 @@ def diagnose(
         result: The answer.
         free: Lens and board, where there are corners.
         arm: Errors that follow the arm's posture, at the same views.
-        middle: (3,) of the target, in its frame [m].
+        middle: (3,) of the target, in its frame [m]; or (m, 3) of the one that each stop shows, in
+            the frame of the first.
+        boards: What the views show, where there are several boards.
         calibrated: Whether the arm's errors are part of the answer, and no reason for doubt.
     """
     edges, noise = result.edges, result.noise
@@ -75,7 +79,7 @@ def diagnose(
             rest = fit_closure(data, edges)
             alike = neighbours(data, rest.edges, rest.noise)
             moved = drift(data, rest.edges, rest.noise)
-        parts = covariance_by_source(data, edges, noise, _owners(free, arm))
+        parts = covariance_by_source(data, edges, noise, _owners(free, arm, boards))
         if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
         if result.held.any():
@@ -85,7 +89,8 @@ def diagnose(
     if inflation > 1.0:
         parts["misfit"] = (inflation - 1.0) * sum(parts.values(), np.zeros((12, 12)))
     camera = data.under(edges.shared).camera
-    point = (camera[:, :3, :3] @ middle + camera[:, :3, 3]).mean(axis=0)
+    seen = (camera[:, :3, :3] @ np.atleast_2d(middle)[:, :, None])[:, :, 0] + camera[:, :3, 3]
+    point = seen.mean(axis=0)
     at_work = {name: point_covariance(edges.x, it[:6, :6], point) for name, it in parts.items()}
     at_work["total"] = sum(at_work.values(), np.zeros((3, 3)))
     return Diagnosis(
@@ -100,9 +105,12 @@ def diagnose(
     )
 
 
-def _owners(free: Free | None, arm: ArmErrors | None) -> dict[str, IntArray]:
+def _owners(free: Free | None, arm: ArmErrors | None, boards: Boards) -> dict[str, IntArray]:
     """Which of the unknowns that all views share are whose."""
     owners: dict[str, IntArray] = {}
+    if boards.unknowns:
+        # All that is known of where boards are beside the chain is from images that show several.
+        owners["pixels"] = np.arange(boards.begin, boards.begin + boards.unknowns)
     looks = 0 if free is None else len(free.columns)
     if free is not None:
         is_lens = free.columns < free.lens_count
@@ -110,7 +118,7 @@ def _owners(free: Free | None, arm: ArmErrors | None) -> dict[str, IntArray]:
             if mask.any():
                 owners[name] = np.flatnonzero(mask)
     if arm is not None and arm.is_estimated:
-        owners["arm"] = looks + np.arange(arm.basis.shape[2])
+        owners["arm"] = looks + boards.unknowns + np.arange(arm.basis.shape[2])
     return owners
 
 

@@ -27,19 +27,21 @@ def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
         arm: The robot's side.
         state: The answer.
     """
-    yield from _scale_finding(problem, arm, state)
-    yield from _bend_finding(problem, state)
+    for board in range(len(problem.scale)):
+        yield from _scale_finding(problem, arm, state, board)
+        yield from _bend_finding(problem, state, board)
     yield from _lens_finding(problem, state)
 
 
 def remarks(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
     """Says what was found that is no reason for doubt; as `findings`."""
-    measured = _measured(problem, arm, state)
-    if measured is not None and not measured.contradicts:
-        yield (
-            f"{_sized(problem, measured)}, which what is stated allows (to within "
-            f"{100 * measured.stated_sigma:.1g} %). The result goes by both."
-        )
+    for board in range(len(problem.scale)):
+        measured = _measured(problem, arm, state, board)
+        if measured is not None and not measured.contradicts:
+            yield (
+                f"{_sized(problem, measured)}, which what is stated allows (to within "
+                f"{100 * measured.stated_sigma:.1g} %). The result goes by both."
+            )
     if _lens_moved(problem, state) and not _is_doubtful(problem, state):
         yield (
             "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
@@ -47,9 +49,9 @@ def remarks(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
         )
 
 
-def _scale_finding(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
+def _scale_finding(problem: Problem, arm: Arm, state: State, board: int) -> Iterator[str]:
     """Whether the robot measures another size of the squares than the file states."""
-    measured = _measured(problem, arm, state)
+    measured = _measured(problem, arm, state, board)
     if measured is not None and measured.contradicts:
         yield (
             f"{_sized(problem, measured)}, which is not what is stated (to within "
@@ -59,29 +61,37 @@ def _scale_finding(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
         )
 
 
-def _measured(problem: Problem, arm: Arm, state: State) -> MeasuredScale | None:
+def _measured(problem: Problem, arm: Arm, state: State, board: int) -> MeasuredScale | None:
     """What the robot measures, where the fit has taken it up."""
-    return measured_scale(problem, arm, state) if _moves(state, problem.scale) else None
+    taken = _moves(state, problem.scale[board : board + 1])
+    return measured_scale(problem, arm, state, board) if taken else None
+
+
+def _board(problem: Problem, board: int) -> str:
+    """What a board is called: by its name where there are several."""
+    return f"board {problem.scene.names[board]}".strip()
 
 
 def _sized(problem: Problem, measured: MeasuredScale) -> str:
-    side = 1e3 * problem.scene.target.square_m
+    side = 1e3 * problem.scene.targets[measured.board].square_m
     return (
-        f"By the robot's motion the board is {100 * abs(measured.scale):.2g} % "
+        f"By the robot's motion the {_board(problem, measured.board)} is "
+        f"{100 * abs(measured.scale):.2g} % "
         f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
         f"{100 * measured.sigma:.1g} %): squares of {side * (1 + measured.scale):.4g} mm, not of "
         f"{side:.4g} mm"
     )
 
 
-def _bend_finding(problem: Problem, state: State) -> Iterator[str]:
-    if not _moved(problem, state, problem.shape):
+def _bend_finding(problem: Problem, state: State, board: int) -> Iterator[str]:
+    if not _moved(problem, state, problem.shape_of(board)):
         return
     shift = state.seen.free.corners_after(state.fit.edges.shared) - problem.positions
-    bend_mm = 1e3 * float(np.ptp(shift[:, 2]))
+    bend_mm = 1e3 * float(np.ptp(shift[problem.corners_of(board), 2]))
     yield (
-        f"The board is not flat: its corners lie within {bend_mm:.2g} mm of depth. Its shape was "
-        "estimated with the rest; a board on a stiff, flat plate makes a better result."
+        f"The {_board(problem, board)} is not flat: its corners lie within {bend_mm:.2g} mm of "
+        "depth. Its shape was estimated with the rest; a board on a stiff, flat plate makes a "
+        "better result."
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.errors import ConvergenceError
 from visioncal.estimator.arm import ArmErrors, misfit_covariance
+from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import (
     Closure,
     ClosureFit,
@@ -57,7 +58,7 @@ class HandEyeResult:
         covariance: (12 + k, 12 + k) of x, z (right perturbations) and of what the views share.
         noise: Of the flange, or of both together.
         solutions: Every solver's edges by name, the answer's own among them.
-        worst: The worst directions of each edge.
+        worst: The worst directions of each edge, those of further boards behind the others.
         held: (12 + k,) how far the answer would move if what is held moved as well; its square is
             in the covariance.
     """
@@ -80,6 +81,7 @@ def solve_hand_eye(
     solver: SolverName = "joint",
     arm: ArmErrors | None = None,
     looks: int = 0,
+    boards: Boards | None = None,
 ) -> HandEyeResult:
     """Solves for both unknown edges.
 
@@ -92,6 +94,7 @@ def solve_hand_eye(
         arm: Errors that follow the arm's posture, at the same views. Those of its links are among
             what the views share; others are noise to the fit and count in the covariance.
         looks: How many of the unknowns that the views share are of lens and board; they come first.
+        boards: What the views show, where there are several boards.
 
     Returns:
         The answer with its covariance.
@@ -100,6 +103,7 @@ def solve_hand_eye(
         DegenerateError: The motion leaves a direction of an edge open.
         ConvergenceError: The joint fit does not come to rest on motion that should allow it.
     """
+    boards = boards or Boards.one(len(data))
     with one_blas_thread():
         refuse_too_few(data)
         closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
@@ -109,7 +113,7 @@ def solve_hand_eye(
             fit = fit_closure(data, edges)
         else:
             fit = ClosureFit(edges, estimate_noise(data, edges))
-        check_observability(data, fit.edges, fit.noise, looks)
+        check_observability(data, fit.edges, fit.noise, boards, looks)
         # Away from its rest a closed form is pulled by more than what is held.
         shift = held_shift(data, fit.edges, fit.noise) * float(solver == "joint")
         spread = covariance(closure_information(data, fit.edges, fit.noise))
@@ -125,7 +129,7 @@ def solve_hand_eye(
     solutions |= {
         name: _solution(data, Edges(it.x, it.z, data.unchanged)) for name, it in closed.items()
     }
-    worst = directions(spread, fit.edges, data.mount)
+    worst = directions(spread, fit.edges, data.mount, boards)
     return HandEyeResult(fit.edges, spread, fit.noise, solutions, worst, shift)
 
 

@@ -1,6 +1,6 @@
 """The camera's intrinsics, where the session gives none."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -14,7 +14,7 @@ from visioncal.estimator.gating import gate
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.planar import planar_poses
 from visioncal.estimator.poses import fit_poses
-from visioncal.targets import corner_positions
+from visioncal.targets import numbered_positions
 from visioncal.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
 
 Coefficients: TypeAlias = Literal["auto", 5, 8]
@@ -66,7 +66,7 @@ class Intrinsics:
 
 def estimate_intrinsics(
     corners: Mapping[int, Corners],
-    target: Target,
+    targets: Sequence[Target],
     resolution: tuple[int, int],
     model: CameraKind,
     options: IntrinsicsOptions | None = None,
@@ -75,7 +75,7 @@ def estimate_intrinsics(
 
     Args:
         corners: The corners by view.
-        target: What was seen.
+        targets: What was seen; the corners of several are numbered through.
         resolution: (width, height) [px].
         model: `brown` or `fisheye`.
         options: How to estimate.
@@ -95,7 +95,7 @@ def estimate_intrinsics(
             "needed.",
             next_step="Add views, or give matrix and distortion in [camera].",
         )
-    stack = CornerStack.of(corners, corner_positions(target))
+    stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
         coefficients = 4 if model == "fisheye" else 8 if options.coefficients == 8 else 5
         fit = _first_fit(stack, model, resolution, coefficients)

@@ -1,6 +1,6 @@
 """The pose of the target in each view, with covariance and with its rivals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.planar import planar_poses
 from visioncal.estimator.poses import PoseFit, fit_poses
 from visioncal.session import Session
-from visioncal.targets import corner_positions, rotation_transforms
+from visioncal.targets import first_corners, numbered_positions, rotation_transforms
 from visioncal.transforms import adjoint, invert
 from visioncal.types import Camera, Corners, FloatArray, Mask, Rejection, Target
 
@@ -45,6 +45,7 @@ class ViewPoses:
             the pose itself.
         by_shared: (c, 6, k) how each candidate moves with the unknowns that all views share, once
             it is known which these are; k = 0 before.
+        board: Which of several targets it is.
     """
 
     view: int
@@ -53,6 +54,7 @@ class ViewPoses:
     turns: tuple[int, ...]
     covariance: FloatArray
     by_shared: FloatArray
+    board: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,10 @@ class Poses:
 
 
 def estimate_poses(
-    corners: Mapping[int, Corners], target: Target, camera: Camera, lens_unknowns: int = 0
+    corners: Mapping[int, Corners],
+    targets: Sequence[Target],
+    camera: Camera,
+    lens_unknowns: int = 0,
 ) -> Poses:
     """Estimates `cam_from_target` of each view.
 
@@ -74,7 +79,7 @@ def estimate_poses(
 
     Args:
         corners: The corners by view; at least one view.
-        target: What was seen.
+        targets: What was seen; the corners of several are numbered through.
         camera: The intrinsics.
         lens_unknowns: How many intrinsics were estimated from these same corners.
 
@@ -84,7 +89,7 @@ def estimate_poses(
     Raises:
         DataError: The lens's distortion cannot be inverted at any view's corners.
     """
-    positions = corner_positions(target)
+    positions = numbered_positions(targets)
     reasons: dict[int, str] = {}
     with one_blas_thread():
         stack, starts = _started(CornerStack.of(corners, positions), camera, reasons)
@@ -98,22 +103,22 @@ def estimate_poses(
             fit = fit_poses(stack, camera, starts[0])
         freedom = 2 * len(stack.px) - 6 * len(stack.views) - lens_unknowns
         sigma_px = float(np.sqrt(np.sum(fit.residuals**2) / max(freedom, 1)))
-        views = _with_rivals(stack, camera, fit, starts[1], sigma_px, target)
+        views = _with_rivals(stack, camera, fit, starts[1], sigma_px, targets)
     return Poses(views, tuple(Rejection(*item) for item in reasons.items()), sigma_px)
 
 
 def measure_poses(
-    corners: Mapping[int, Corners], target: Target, camera: Camera, sigma_px: float
+    corners: Mapping[int, Corners], targets: Sequence[Target], camera: Camera, sigma_px: float
 ) -> tuple[ViewPoses, ...]:
     """Poses of views that are only to be looked at: by a noise that others have set, ungated."""
     if not corners:
         return ()
     with one_blas_thread():
         stack, starts = _started(
-            CornerStack.of(corners, corner_positions(target)), camera, reasons={}
+            CornerStack.of(corners, numbered_positions(targets)), camera, reasons={}
         )
         fit = fit_poses(stack, camera, starts[0])
-        return _with_rivals(stack, camera, fit, starts[1], sigma_px, target)
+        return _with_rivals(stack, camera, fit, starts[1], sigma_px, targets)
 
 
 def _started(
@@ -141,16 +146,18 @@ def _with_rivals(
     fit: PoseFit,
     mirrored: FloatArray,
     sigma_px: float,
-    target: Target,
+    targets: Sequence[Target],
 ) -> tuple[ViewPoses, ...]:
     """Gives each view its candidates: the planar solutions that rival, in all of its turns."""
     best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, mirrored))
     mean_squares = [mean_square_by_view(stack, it.residuals) for it in (best, other)]
-    turns = rotation_transforms(target)
-    turned = adjoint(invert(turns))
+    turns_of = [rotation_transforms(it) for it in targets]
+    boards = np.searchsorted(first_corners(targets), stack.ids[stack.starts], side="right") - 1
     spreads = [floored_sigma_px(sigma_px) ** 2 * covariance(it.information) for it in (best, other)]
     views = []
-    for at, view in enumerate(stack.views):
+    for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
+        turns = turns_of[board]
+        turned = adjoint(invert(turns))
         rival = _is_rival(mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px)
         fits = (best, other) if rival else (best,)
         spread = [turned @ it[at] @ np.swapaxes(turned, 1, 2) for it in spreads[: len(fits)]]
@@ -162,6 +169,7 @@ def _with_rivals(
                 tuple(range(len(turns))) * len(fits),
                 np.concatenate(spread),
                 np.zeros((len(turns) * len(fits), 6, 0)),
+                board,
             )
         )
     return tuple(views)
@@ -169,6 +177,7 @@ def _with_rivals(
 
 def given_poses(session: Session) -> dict[int, ViewPoses]:
     """Collects the poses that the session gives itself (`cft_` columns), by view."""
+    boards = {name: at for at, name in enumerate(session.boards)}
     given = ((view, view.cam_from_target()) for view in session.views)
     return {
         view.number: ViewPoses(
@@ -178,6 +187,7 @@ def given_poses(session: Session) -> dict[int, ViewPoses]:
             (0,),
             np.zeros((1, 6, 6)),
             np.zeros((1, 6, 0)),
+            boards.get(session.board_of(view), 0),
         )
         for view, pose in given
         if pose is not None

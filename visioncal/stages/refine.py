@@ -10,7 +10,7 @@ from visioncal.estimator.appearance import (
     Appearance,
     Compressed,
     Free,
-    board_basis,
+    boards_basis,
     compress,
 )
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
@@ -34,7 +34,7 @@ from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.observability import worst_directions
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
-from visioncal.targets import corner_positions
+from visioncal.targets import corner_positions, numbered_positions
 from visioncal.types import Corners, IntArray
 
 
@@ -166,7 +166,7 @@ def _chosen(problem: Problem, arm: Arm, state: State) -> _Answer:
     answer = _Answer(problem, state)
     for moving in _shapes(problem, arm, state):
         wider = _freed(problem, arm, moving, state)
-        if _is_determined(wider.state) and not _predicts_worse(wider.state, state):
+        if _is_determined(wider.state, arm) and not _predicts_worse(wider.state, state):
             answer = wider
             break
     if not np.isin(problem.lens, answer.state.moving).all() and _speaks_against_lens(answer, arm):
@@ -186,24 +186,26 @@ def _freed(problem: Problem, arm: Arm, moving: IntArray, state: State) -> _Answe
 
 
 def _resized(answer: _Answer, arm: Arm) -> _Answer:
-    """Sets the board's scale free where the robot measures another than is stated."""
+    """Sets the boards' scales free where the robot measures others than are stated."""
     problem, state = answer.problem, answer.state
-    measured = measured_scale(problem, arm, state)
+    measured = [measured_scale(problem, arm, state, it) for it in range(len(problem.scale))]
     # An arm whose links may all be too long is hard to tell from a board that is too large.
-    if not (measured.is_another if arm.errors is None else measured.contradicts):
+    other = [it for it in measured if (it.is_another if arm.errors is None else it.contradicts)]
+    if not other:
         return answer
-    if measured.contradicts:
-        problem = problem.without_prior(problem.scale)
-    moving = np.union1d(state.moving, problem.scale)
+    contradicted = problem.scale[[it.board for it in other if it.contradicts]]
+    problem = problem.without_prior(contradicted)
+    moving = np.union1d(state.moving, problem.scale[[it.board for it in other]])
     resized = _Answer(problem, settle(problem, arm, moving, state.again()))
-    return resized if _is_determined(resized.state) else answer
+    return resized if _is_determined(resized.state, arm) else answer
 
 
-def _is_determined(state: State) -> bool:
+def _is_determined(state: State, arm: Arm) -> bool:
     """Whether the views still determine both edges to what is accepted, errors of the arm aside."""
-    looks = len(state.seen.free.columns)
-    edges = replace(state.fit.edges, shared=state.fit.edges.shared[:looks])
-    worst = worst_directions(state.data.with_first(looks), edges, state.fit.noise)
+    boards = replace(arm.boards, begin=len(state.seen.free.columns))
+    kept = boards.begin + boards.unknowns
+    edges = replace(state.fit.edges, shared=state.fit.edges.shared[:kept])
+    worst = worst_directions(state.data.with_first(kept), edges, state.fit.noise, boards)
     return all(it.sigma < it.limit for it in worst)
 
 
@@ -220,12 +222,11 @@ def _speaks_against_lens(answer: _Answer, arm: Arm) -> bool:
 
 def held(scene: Scene) -> Free:
     """Lens and board as they are stated, with nothing free."""
-    positions = corner_positions(scene.target)
     nothing = np.zeros(0)
     return Free(
-        Appearance(scene.camera, np.zeros(len(BOARD_NAMES))),
-        board_basis(positions),
-        positions,
+        Appearance(scene.camera, np.zeros(len(BOARD_NAMES) * len(scene.targets))),
+        boards_basis([corner_positions(it) for it in scene.targets]),
+        numbered_positions(scene.targets),
         nothing.astype(np.int64),
         nothing.astype(bool),
         np.zeros((0, 0)),

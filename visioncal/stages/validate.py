@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.camera import project
 from visioncal.estimator.appearance import Free
+from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.stages.handeye import HandEyeResult, refit
@@ -41,6 +42,7 @@ def validate(
     solver: SolverName,
     corners: Sequence[Corners | None],
     free: Free | None,
+    boards: Boards,
 ) -> HeldOut:
     """Leaves stops out, one by one or in ten groups, and predicts their views from the others.
 
@@ -51,6 +53,8 @@ def validate(
         solver: The solver to fit again with.
         corners: Each view's corners, if any.
         free: Lens and board, if there are corners.
+        boards: What the views show, where there are several boards. A view that alone shows its
+            board cannot be predicted by the others: its residuals are NaN.
 
     Returns:
         The residuals.
@@ -65,11 +69,12 @@ def validate(
             held = fold == left_out
             rest = data.subset(~held).merged(_renumbered(stops[~held]))
             edges = refit(rest, result, solver)
-            left = data.subset(held)
+            held &= np.isin(boards.shown, boards.shown[~held])
+            left, own = data.subset(held), boards.moved(edges.shared).first_from_own[held]
             placed = left.under(edges.shared).placed(edges.x)
-            away_m[held], away_rad[held] = distances(placed, edges.z)
+            away_m[held], away_rad[held] = distances(placed @ own, edges.z @ own)
             seen = [corners[int(at)] for at in np.flatnonzero(held)]
-            rms_px[held] = chain_rms_px(left, edges, seen, free)
+            rms_px[held] = chain_rms_px(left, edges, seen, free, own)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(data) else "stops of the robot"
     return HeldOut(f"{method} over {unit}, of the hand-eye fit", away_m, away_rad, rms_px)
@@ -80,17 +85,22 @@ def _renumbered(stops: IntArray) -> IntArray:
 
 
 def chain_rms_px(
-    data: Closure, edges: Edges, corners: Sequence[Corners | None], free: Free | None
+    data: Closure,
+    edges: Edges,
+    corners: Sequence[Corners | None],
+    free: Free | None,
+    first_from_own: FloatArray,
 ) -> FloatArray:
     """Reprojection error of each view through the whole chain, (m,) [px]; NaN where unseen.
 
     Lens and board are those that the views' poses were made with; the edges carry their change.
+    `first_from_own` (m, 4, 4) is each view's board in the frame of the first.
     """
     rms = np.full(len(data), np.nan)
     if free is None:
         return rms
     camera, positions = free.after(edges.shared).camera, free.corners_after(edges.shared)
-    poses = data.under(edges.shared).predicted_camera(edges.x, edges.z)
+    poses = data.under(edges.shared).predicted_camera(edges.x, edges.z) @ first_from_own
     for at, (pose, seen) in enumerate(zip(poses, corners, strict=True)):
         if seen is not None:
             away = predict_corners(camera, pose, positions[seen.ids]) - seen.px

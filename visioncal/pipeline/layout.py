@@ -1,0 +1,83 @@
+"""Where the boards of a session are, stage after stage."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.pipeline.known import Known
+from visioncal.targets import corner_positions, first_corners
+from visioncal.transforms import invert
+from visioncal.types import Corners, FloatArray, IntArray, Rejection
+
+
+def numbered_through(known: Known) -> Known:
+    """Numbers the corners of several boards through, as all stages from here on have them."""
+    session = known.session
+    starts = dict(zip(session.boards, _starts(known).tolist(), strict=True))
+    if len(starts) < 2:
+        return known
+    board_of = {view.number: session.board_of(view) for view in session.views}
+    corners = {view: _shifted(it, starts[board_of[view]]) for view, it in known.corners.items()}
+    return replace(known, corners=corners)
+
+
+def own_numbers(known: Known, corners: Corners) -> Corners:
+    """The corners of a view by their numbers on its own board, again."""
+    if len(known.session.boards) < 2 or not len(corners.ids):
+        return corners
+    starts = _starts(known)
+    return _shifted(corners, -int(starts[starts <= corners.ids[0]][-1]))
+
+
+def _starts(known: Known) -> IntArray:
+    return first_corners(tuple(known.session.boards.values()))
+
+
+def _shifted(corners: Corners, by: int) -> Corners:
+    return replace(corners, ids=corners.ids + by)
+
+
+def relaid(known: Known, shared: FloatArray) -> Known:
+    """Takes over where the boards were found to be, by (k,) of what the used views share."""
+    if len(known.boards) < 2:
+        return known
+    return replace(known, from_first=known.shown(known.used).moved(shared).from_first)
+
+
+def without_lost_boards(known: Known) -> Known:
+    """Leaves boards out of the chain of which no used view is left.
+
+    Where that is the one that the chain ends at, it ends at the next.
+    """
+    agreed = known.agreed
+    seen = {known.poses[view].board for view in known.used}
+    kept = [at for at, board in enumerate(known.boards) if board in seen]
+    if agreed is None or len(kept) == len(known.boards) or not kept:
+        return known
+    names, boards = tuple(known.session.boards), [known.boards[at] for at in kept]
+    lost = [it for it in known.boards if it not in seen]
+    gone = [it for it in known.candidates if known.poses[it].board in lost]
+    mask = np.array([known.poses[it].board in seen for it in known.candidates])
+    next_from_first = known.from_first[kept[0]]
+    edges = replace(agreed.edges, z=agreed.edges.z @ invert(next_from_first))
+    why = {it: f"no view of target {names[known.poses[it].board]} is left" for it in gone}
+    known = replace(
+        known,
+        boards=tuple(boards),
+        from_first=known.from_first[kept] @ invert(next_from_first),
+        agreed=replace(agreed, mask=agreed.mask[mask], edges=edges),
+        candidates=tuple(it for it in known.candidates if it not in gone),
+    )
+    doubts = [f"No usable view shows target {names[it]}: it has no place." for it in lost]
+    return known.noting([Rejection(*it) for it in why.items()], doubts)
+
+
+def middles(known: Known) -> FloatArray:
+    """(m, 3) middle of the board that each used view shows, in the frame of the first [m]."""
+    shown, targets = known.shown(known.used), tuple(known.session.boards.values())
+    if not targets:
+        return np.zeros((len(known.used), 3))
+    means = [corner_positions(targets[it]).mean(axis=0) for it in known.boards]
+    own = shown.first_from_own
+    points = np.array(means)[shown.shown]
+    return np.asarray((own[:, :3, :3] @ points[:, :, None])[:, :, 0] + own[:, :3, 3])
