@@ -82,18 +82,18 @@ class Shared:
         )
 
     def told(self, weights: FloatArray, slopes: FloatArray, residuals: FloatArray) -> "Shared":
-        """Returns these unknowns with more knowledge: (m, 6) residuals that move with them.
+        """Returns these unknowns with what residuals (m, d) tell of them that have no other ones.
 
         Args:
-            weights: (m, 6, 6) information of the residuals.
-            slopes: (m, 6, k) how they move.
-            residuals: (m, 6) as they are now.
+            weights: (m, d, d) inverse covariances of the residuals.
+            slopes: (m, d, k) their derivatives.
+            residuals: (m, d) where the camera poses were made.
         """
         weighted = np.swapaxes(slopes, 1, 2) @ weights
         return replace(
             self,
-            information=self.information + (weighted @ slopes).sum(axis=0),
-            pull=self.pull + (weighted @ residuals[:, :, None]).sum(axis=0)[:, 0],
+            information=self.information + np.sum(weighted @ slopes, axis=0),
+            pull=self.pull + np.einsum("mij,mj->i", weighted, residuals),
         )
 
     def joined(self, other: "Shared") -> "Shared":
@@ -156,9 +156,8 @@ class Closure:
         """Makes one view of all that were taken at one stop of the robot.
 
         They share the robot's error, and count once. Their camera poses are averaged with their
-        information; what they tell by their differences, of boards that one stop shows or of the
-        lens, stays as knowledge of what is shared. Where the information is unknown, they are
-        averaged evenly.
+        information, and by how much they disagree they tell of what is shared: nothing is lost.
+        Where the information is unknown, they are averaged evenly.
 
         Args:
             stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
@@ -198,16 +197,16 @@ def _joined(groups: Sequence[Closure]) -> Closure:
         shares = spread @ information
         away = log(invert(first) @ group.camera)
         robot.append(group.robot[0])
-        camera.append(first @ exp(np.einsum("mij,mj->i", shares, away)))
+        mean = np.einsum("mij,mj->i", shares, away)
+        camera.append(first @ exp(mean))
         spreads.append(spread)
-        if group.shared is not None and shared is not None:
-            by_camera = group.shared.by_camera
-            shift = np.einsum("mij,mjk->ik", shares, by_camera)
-            shifts.append(shift)
-            arms.append(group.shared.by_flange[0])
-            if known is not None and len(group) > 1:
-                mean = np.einsum("mij,mj->i", shares, away)
-                shared = shared.told(information, by_camera - shift, away - mean)
+        if group.shared is None or shared is None:
+            continue
+        shift = np.einsum("mij,mjk->ik", shares, group.shared.by_camera)
+        shifts.append(shift)
+        arms.append(group.shared.by_flange[0])
+        if known is not None and len(group) > 1:
+            shared = shared.told(information, group.shared.by_camera - shift, away - mean)
     return Closure(
         groups[0].mount,
         np.array(robot),
