@@ -116,7 +116,7 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
         _replace(cells, corrected, MEASURED_CAM_POSE)
     document = {**session.document, "mount": taken.mount}
     target = session.target_document
-    if target is not None and candidate.board_scale != 1.0:
+    if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
         document["target"] = "target.toml"
     reread = Session.assemble(

@@ -196,6 +196,13 @@ def _checked(session: Session, calibration: Calibration) -> Target:
             culprits=["session.toml: target"],
             next_step='Add target = "charuco_9x6_30mm", or what the images show.',
         )
+    if session.targets:
+        names = ", ".join(session.targets)
+        raise DataError(
+            f"session {session.name!r} has several targets ({names}); one is looked for at a time.",
+            culprits=["session.toml: targets"],
+            next_step="Make a session with the rows of the one that is meant.",
+        )
     return session.target
 
 

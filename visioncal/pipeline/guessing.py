@@ -56,7 +56,7 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
         DataError: There is nothing to read.
         DegenerateError: Too few views have both poses.
     """
-    chain = chain_poses(seen.session)
+    seen, chain = _of_one_board(seen), chain_poses(seen.session)
     if robot is None:
         robot = told_or_chained(numbers_in(seen.session, POSE), chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
@@ -75,7 +75,7 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
         DegenerateError: The lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    return _camera_numbers(_seen(Known(session, "joint", progress)))
+    return _camera_numbers(_of_one_board(_seen(Known(session, "joint", progress))))
 
 
 def chain_poses(session: Session) -> FloatArray | None:
@@ -143,6 +143,16 @@ def _seen(known: Known) -> Known:
     return known
 
 
+def _of_one_board(known: Known) -> Known:
+    """Leaves the views of one board, the one with the most: poses of others do not compare."""
+    shown = [it.board for it in known.poses.values()]
+    if len(set(shown)) < 2:
+        return known
+    board = max(sorted(set(shown)), key=shown.count)
+    poses = {view: it for view, it in known.poses.items() if it.board == board}
+    return replace(known, poses=poses)
+
+
 def _seen_ways(seen: Known, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     """The camera's poses as the declared robot would have them, and then by the images alone.
 
@@ -164,14 +174,21 @@ def _chosen(seen: Known, robot: PoseNumbers) -> Known:
     part = robot_part(
         np.array([base_from_flange[it.view] for it in both]).reshape(-1, 4, 4), seen.session.mount
     )
-    choice = choose_poses(both, part, seen.session.target)
+    targets = list(seen.session.boards.values())
+    choice = choose_poses(both, part, targets[both[0].board] if targets and both else None)
     return replace(seen, poses={it.view: it for it in choice.views})
 
 
 def _camera_numbers(seen: Known) -> PoseNumbers:
     """The target's poses, of each view the best by its image, or as the session gives them."""
     if not seen.corners:
-        return numbers_in(seen.session, MEASURED_CAM_POSE)
+        numbers = numbers_in(seen.session, MEASURED_CAM_POSE)
+        shown = np.array([view.number in seen.poses for view in seen.session.views])
+        return replace(
+            numbers,
+            positions=np.where(shown[:, None], numbers.positions, np.nan),
+            rotations=np.where(shown[:, None], numbers.rotations, np.nan),
+        )
     poses = np.full((len(seen.session.views), 4, 4), np.nan)
     for at, view in enumerate(seen.session.views):
         if view.number in seen.poses:

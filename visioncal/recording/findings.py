@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.estimator.appearance import BOARD_NAMES, board_basis
+from visioncal.session import Session
 from visioncal.targets import corner_positions
 from visioncal.types import FloatArray, Target
 
@@ -107,9 +108,15 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What there is of the three; older calibrations have none."""
+    """What there is of the three; older calibrations have none.
 
-    board: Board | None
+    Attributes:
+        boards: By the name of the target, which is empty where there is one.
+        arm: Errors of the arm.
+        uncertainty: Of the result.
+    """
+
+    boards: Mapping[str, Board]
     arm: Arm | None
     uncertainty: Uncertainty | None
 
@@ -121,7 +128,7 @@ class Findings:
             DataError: One of them is not what this version writes.
         """
         return cls(
-            read_stage(calibration, "board", _board),
+            _boards(calibration),
             read_stage(calibration, "arm_errors", _arm),
             read_stage(calibration, "uncertainty", _uncertainty),
         )
@@ -145,6 +152,28 @@ def read_stage(
             f"calibration of {calibration.session_name!r}: {name} cannot be read: {error!r}.",
             next_step="Calibrate the session again.",
         ) from error
+
+
+def _boards(calibration: Calibration) -> dict[str, Board]:
+    only = read_stage(calibration, "board", _board)
+    if only is not None:
+        return {"": only}
+    several = read_stage(
+        calibration, "boards", lambda them: {str(it): _board(them[it]) for it in them}
+    )
+    return {} if several is None else several
+
+
+def target_frames(calibration: Calibration, session: Session | None) -> dict[int, str]:
+    """The frame of the target that each view shows, where the calibration places it."""
+    placed = {name.rpartition("_from_")[2] for name in calibration.edges}
+    if session is None:
+        return {}
+    frames = {
+        view.number: f"target_{name}" if (name := session.board_of(view)) else "target"
+        for view in session.views
+    }
+    return {view: frame for view, frame in frames.items() if frame in placed}
 
 
 def _board(document: Mapping[str, Any]) -> Board:

@@ -157,8 +157,9 @@ def _findings_lines(found: Findings) -> Iterator[str]:
             label = plain(SOURCES.get(name, name))
             yield f"| {label} | {value:.2g} | {known.percent(name)} |"
         yield f"| total | {known.total_mm:.2g} | |"
-    if found.board is not None and found.board.sigma:
-        yield from ("", "# Board", "", _board_line(found.board))
+    for name, board in found.boards.items():
+        if board.sigma:
+            yield from ("", f"# Board {plain(name)}".strip(), "", _board_line(board))
     if found.arm is not None:
         yield from ("", "# Arm", "", _arm_line(found.arm))
 

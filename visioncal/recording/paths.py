@@ -28,6 +28,8 @@ FLANGE = "/flange"
 STOPS = "/stops"
 CAMERA = "/camera"
 TARGET = "/target"
+# Of several targets, by their names.
+TARGETS = "/targets"
 FRAMES = "/frames"
 SEEN_TARGET = "/target_as_this_view_sees_it"
 
@@ -64,7 +66,9 @@ BEYOND = "rejected_beyond_the_scale"
 
 
 def entity_of(frame: str) -> str:
-    """The entity of a frame of the calibration: the camera's, the target's, a tool's."""
+    """The entity of a frame of the calibration: the camera's, a target's, a tool's."""
+    if frame.startswith(f"{TARGET_FRAME}_"):
+        return f"{TARGETS}/{frame.removeprefix(f'{TARGET_FRAME}_')}"
     return {CAM_FRAME: CAMERA, TARGET_FRAME: TARGET}.get(frame, f"{FRAMES}/{frame}")
 
 

@@ -12,10 +12,11 @@ from visioncal.evidence import ViewEvidence
 from visioncal.recording import board, colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.charts import Charts
+from visioncal.recording.findings import target_frames
 from visioncal.recording.uncertainty import Uncertainty
 from visioncal.recording.workspace import ArmPicture
 from visioncal.session import Session, View
-from visioncal.types import Camera, FloatArray
+from visioncal.types import Camera, FloatArray, Target
 
 # Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
@@ -70,7 +71,7 @@ class Scene:
             calibration,
             poses,
             size_m,
-            Uncertainty.of(calibration, evidence, size_m),
+            Uncertainty.of(calibration, evidence, size_m, target_frames(calibration, session)),
             Charts.of(session, calibration, evidence),
             ArmPicture.of(session, calibration, size_m),
         )
@@ -91,15 +92,13 @@ class Scene:
         if self.calibration is None:
             self._log_stops(stream)
             return
-        self._log_axes(stream, paths.CAMERA, paths.CAM_FRAME, 0.7)
-        self._log_axes(stream, paths.TARGET, paths.TARGET_FRAME, 0.7)
+        for end in self._ends:
+            self._log_axes(stream, paths.entity_of(end), end, 0.7)
         if self.calibration.camera is not None:
             self._log_frustum(stream, self.calibration.camera.camera)
-        if self.session.target is not None:
-            frame = rr.CoordinateFrame(paths.TARGET_FRAME)
-            stream.log(
-                f"{paths.TARGET}/sheet", frame, board.sheet(self.session.target), static=True
-            )
+        for end, target in self._boards.items():
+            frame, sheet = rr.CoordinateFrame(end), board.sheet(target)
+            stream.log(f"{paths.entity_of(end)}/sheet", frame, sheet, static=True)
         self._log_mount(stream)
         self._log_frames(stream, self.calibration)
         self._log_stops(stream)
@@ -117,17 +116,29 @@ class Scene:
         self._log_arm(stream, view)
         if self.calibration is None:
             return
-        base_from_cam = self._base_from("cam", base_from_flange)
-        base_from_target = self._base_from("target", base_from_flange)
-        _log_pose(stream, paths.CAMERA, paths.CAM_FRAME, base_from_cam)
-        _log_pose(stream, paths.TARGET, paths.TARGET_FRAME, base_from_target)
-        self._log_seen_target(stream, base_from_cam, seen)
+        for end in self._ends:
+            base_from_end = self._base_from(end, base_from_flange)
+            _log_pose(stream, paths.entity_of(end), end, base_from_end)
+        self._log_seen_target(stream, self._base_from("cam", base_from_flange), view, seen)
         if self.uncertainty is not None:
             self.uncertainty.log_view(stream, view.number)
         if self.charts is not None:
             self.charts.log_view(stream, view.number)
         if self.arm is not None:
             self.arm.log_view(stream, view.number)
+
+    @property
+    def _ends(self) -> list[str]:
+        """The frames that the calibration places: camera and targets."""
+        edges = {} if self.calibration is None else self.calibration.edges
+        return [name.rpartition("_from_")[2] for name in edges]
+
+    @property
+    def _boards(self) -> dict[str, Target]:
+        """The targets by their frames, as far as the calibration places them."""
+        boards = self.session.boards.items()
+        frames = {f"target_{name}" if name else paths.TARGET_FRAME: it for name, it in boards}
+        return {frame: it for frame, it in frames.items() if frame in self._ends}
 
     def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
         """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""
@@ -195,19 +206,22 @@ class Scene:
                 stream.log(f"{paths.STOPS}/{name}/carried", frame, lines, static=True)
 
     def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
-        """What the flange carries at one stop, as (k, 3) lines in the base: camera or board."""
+        """What the flange carries at one stop, as (k, 3) lines in the base: camera or boards."""
         if self.calibration is None:
             return []
         if self.calibration.mount == "eye-in-hand":
-            camera, end = self.calibration.camera, "cam"
-            shapes = [] if camera is None else _frustum(camera.camera, _SMALL_FRUSTUM * self.size_m)
+            camera = self.calibration.camera
+            frustum = (
+                [] if camera is None else _frustum(camera.camera, _SMALL_FRUSTUM * self.size_m)
+            )
+            shapes = [("cam", it) for it in frustum]
         else:
-            target, end = self.session.target, "target"
-            shapes = [] if target is None else [board.closed_outline(target)]
-        base_from_end = self._base_from(end, base_from_flange)
-        if base_from_end is None:
-            return []
-        return [shape @ base_from_end[:3, :3].T + base_from_end[:3, 3] for shape in shapes]
+            shapes = [(end, board.closed_outline(it)) for end, it in self._boards.items()]
+        return [
+            shape @ base_from_end[:3, :3].T + base_from_end[:3, 3]
+            for end, shape in shapes
+            if (base_from_end := self._base_from(end, base_from_flange)) is not None
+        ]
 
     def _log_frustum(self, stream: rr.RecordingStream, camera: Camera) -> None:
         matrix = matrix_3x3(camera)
@@ -240,10 +254,15 @@ class Scene:
             stream.log(f"{paths.ROBOT}/reach", line)
 
     def _log_seen_target(
-        self, stream: rr.RecordingStream, base_from_cam: FloatArray | None, seen: ViewEvidence
+        self,
+        stream: rr.RecordingStream,
+        base_from_cam: FloatArray | None,
+        view: View,
+        seen: ViewEvidence,
     ) -> None:
         """Draws the target's outline where this view alone sees it."""
-        if self.session.target is None:
+        target = self.session.boards.get(self.session.board_of(view))
+        if target is None:
             return
         rejected = self.calibration is not None and any(
             it.view == seen.view and not it.used for it in self.calibration.views
@@ -251,7 +270,7 @@ class Scene:
         strips = []
         if seen.cam_from_target is not None and base_from_cam is not None:
             base_from_target = base_from_cam @ seen.cam_from_target
-            corners = board.closed_outline(self.session.target)
+            corners = board.closed_outline(target)
             strips.append(corners @ base_from_target[:3, :3].T + base_from_target[:3, 3])
         # Without strips, this takes those of the view before off the screen.
         colour = colours.REJECTED if rejected else colours.DETECTED

@@ -4,7 +4,7 @@ Both are far too small to be seen at their true size, so both are drawn larger b
 which their names tell.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +33,8 @@ class Uncertainty:
 
     Attributes:
         edges: The edges that have a covariance, by name; tools and fixtures among them.
-        scatter_m: By view, how far from the mean it puts the target: (3,) in the target's frame.
+        scatter_m: By view, how far from the mean it puts its target: (3,) in the target's frame.
+        frames: By view, the frame of its target.
         used: The views that the fit used.
         factor: How many times larger than it is everything is drawn.
         size_m: The cell's size [m].
@@ -41,22 +42,39 @@ class Uncertainty:
 
     edges: Mapping[str, Edge]
     scatter_m: Mapping[int, FloatArray]
+    frames: Mapping[int, str]
     used: frozenset[int]
     factor: int
     size_m: float
 
     @classmethod
     def of(
-        cls, calibration: Calibration, evidence: Mapping[int, ViewEvidence], size_m: float
+        cls,
+        calibration: Calibration,
+        evidence: Mapping[int, ViewEvidence],
+        size_m: float,
+        frames: Mapping[int, str] | None = None,
     ) -> "Uncertainty":
-        """Collects the placements and chooses the factor by the used views."""
+        """Collects the placements and chooses the factor by the used views.
+
+        Args:
+            calibration: The result.
+            evidence: What each view shows.
+            size_m: The cell's size [m].
+            frames: By view, the frame of its target; the only one's where None.
+        """
         used = frozenset(view.view for view in calibration.views if view.used)
-        scatter_m = _scatter_m(calibration, evidence, used)
+        if frames is None:
+            frames = dict.fromkeys(evidence, paths.TARGET_FRAME)
+        scatter_m: dict[int, FloatArray] = {}
+        for frame in sorted(set(frames.values())):
+            some = {view: it for view, it in evidence.items() if frames.get(view) == frame}
+            scatter_m |= _scatter_m(calibration, some, used)
         edges = {name: it for name, it in calibration.placed.items() if it.covariance.any()}
         sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
         factor = round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
-        return cls(edges, scatter_m, used, factor, size_m)
+        return cls(edges, scatter_m, frames, used, factor, size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Draws the ellipsoids, and all views' placements of the target."""
@@ -66,10 +84,14 @@ class Uncertainty:
             (paths.USED, colours.USED, True),
             (paths.REJECTED, colours.REJECTED, False),
         ):
-            some = [it for view, it in self.scatter_m.items() if (view in self.used) is wanted]
-            if some:
-                self._log_scatter(stream, name, some, colour, static=True)
-        self._log_beyond(stream)
+            some = [view for view in self.scatter_m if (view in self.used) is wanted]
+            for frame in self._frames_of(some):
+                self._log_scatter(stream, name, frame, some, colour, static=True)
+        for frame in self._frames_of(self.scatter_m):
+            self._log_beyond(stream, frame)
+
+    def _frames_of(self, views: Iterable[int]) -> list[str]:
+        return sorted({self.frames[view] for view in views})
 
     def _log_ellipsoid(self, stream: rr.RecordingStream, name: str, edge: Edge) -> None:
         child = name.rpartition("_from_")[2]
@@ -83,7 +105,7 @@ class Uncertainty:
             line_radii=_LINE * self.size_m,
         )
         stream.log(entity, frame, ellipsoid, static=True)
-        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME):
+        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME, *self.frames.values()):
             # All are drawn alike, and tools are close to the camera: more labels would hide them.
             return
         # Above the camera and beside the board, clear of the name of the frame.
@@ -98,29 +120,41 @@ class Uncertainty:
 
     def log_view(self, stream: rr.RecordingStream, view: int) -> None:
         """Marks one view's placement of the target, at the stream's current time."""
-        some = [self.scatter_m[view]] if view in self.scatter_m else []
-        self._log_scatter(stream, paths.THIS_VIEW, some, colours.THIS_VIEW, static=False)
+        some = [view] if view in self.scatter_m else []
+        # Of the other targets, this takes the mark of the view before off the screen.
+        for frame in self._frames_of(self.scatter_m):
+            self._log_scatter(stream, paths.THIS_VIEW, frame, some, colours.THIS_VIEW, static=False)
 
     def _log_scatter(
         self,
         stream: rr.RecordingStream,
         name: str,
-        scatter_m: list[FloatArray],
+        frame: str,
+        views: Sequence[int],
         colour: tuple[int, int, int],
         *,
         static: bool,
     ) -> None:
         positions_m = np.reshape(
-            [self._within_reach(self.factor * it) for it in scatter_m], (-1, 3)
+            [
+                self._within_reach(self.factor * self.scatter_m[view])
+                for view in views
+                if self.frames[view] == frame
+            ],
+            (-1, 3),
         )
         larger = 1.5 if name == paths.THIS_VIEW else 1.0
         points = rr.Points3D(positions_m, colors=colour, radii=larger * _POINT * self.size_m)
-        entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{name}"
-        stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), points, static=static)
+        entity = f"{self._placements(frame)}/{name}"
+        stream.log(entity, rr.CoordinateFrame(frame), points, static=static)
 
-    def _log_beyond(self, stream: rr.RecordingStream) -> None:
+    def _placements(self, frame: str) -> str:
+        return f"{paths.entity_of(frame)}/placements_magnified_{self.factor}x"
+
+    def _log_beyond(self, stream: rr.RecordingStream, frame: str) -> None:
         """Arrows towards the placements that lie too far out to be drawn."""
-        drawn_m = [self.factor * it for it in self.scatter_m.values()]
+        mine = [it for view, it in self.scatter_m.items() if self.frames[view] == frame]
+        drawn_m = [self.factor * it for it in mine]
         far = [it for it in drawn_m if np.linalg.norm(it) > _REACH * self.size_m]
         if far:
             arrows = rr.Arrows3D(
@@ -129,8 +163,8 @@ class Uncertainty:
                 colors=colours.REJECTED,
                 radii=_LINE * self.size_m,
             )
-            entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{paths.BEYOND}"
-            stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), arrows, static=True)
+            entity = f"{self._placements(frame)}/{paths.BEYOND}"
+            stream.log(entity, rr.CoordinateFrame(frame), arrows, static=True)
 
     def _within_reach(self, drawn_m: FloatArray) -> FloatArray:
         reach_m = _REACH * self.size_m

@@ -1,7 +1,7 @@
 """Puts the report together and writes it."""
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -19,6 +19,7 @@ from visioncal.report import advice, arm, armplots, content, plots, sources, too
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
+from visioncal.types import Target
 from visioncal.version import __version__
 
 _MAX_REJECTED_PICTURES = 4
@@ -98,18 +99,36 @@ def _words(calibration: Calibration) -> dict[str, object]:
 
 def _uncertainty(calibration: Calibration, session: Session | None) -> dict[str, object]:
     found = Findings.of(calibration)
-    board, arm, known = found.board, found.arm, found.uncertainty
-    target = None if session is None else session.target
+    arm, known = found.arm, found.uncertainty
+    boards = _board_cards(calibration, found, {} if session is None else session.boards)
     return {
         "uncertainty": () if known is None else uncertainty.summary(calibration, known),
         "noise": uncertainty.noise_facts(calibration, known),
-        "board": () if board is None else uncertainty.board_facts(calibration, board, target),
+        "boards": tuple(boards),
         "arm": () if arm is None else uncertainty.arm_facts(arm),
         "arm_is_estimated": arm is not None and arm.estimated,
         "budget_plot": "" if known is None else sources.budget(known),
         "spectrum_plot": "" if known is None else sources.directions(known),
-        "board_plot": "" if not (board and target) else sources.board_shape(board, target),
     }
+
+
+@dataclass(frozen=True)
+class _BoardCard:
+    title: str
+    facts: tuple[content.Fact, ...]
+    plot: str
+
+
+def _board_cards(
+    calibration: Calibration, found: Findings, targets: Mapping[str, Target]
+) -> Iterator[_BoardCard]:
+    """What was found of each board; nothing of one of which nothing was looked for."""
+    for name, board in found.boards.items():
+        target = targets.get(name)
+        facts = uncertainty.board_facts(calibration, board, target)
+        if facts:
+            plot = "" if target is None else sources.board_shape(board, target, name)
+            yield _BoardCard(f"Board {name}".strip(), facts, plot)
 
 
 def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str, object]:

@@ -77,8 +77,8 @@ def directions(found: Uncertainty) -> Markup:
         )
 
 
-def board_shape(board: Board, target: Target) -> Markup:
-    """How far each place of the board lies behind its mean plane; empty for a flat one."""
+def board_shape(board: Board, target: Target, name: str = "") -> Markup:
+    """How far each place of a board lies behind its mean plane; empty for a flat one."""
     x_mm, y_mm, depth_mm = 1e3 * board.corners(target).T
     reach = float(np.abs(depth_mm).max())
     if not board.is_bent or reach < _LEAST_DEPTH_MM:
@@ -103,4 +103,5 @@ def board_shape(board: Board, target: Target) -> Markup:
         axes.grid(visible=False)
         axes.set_xlabel("target x [mm]")
         axes.set_ylabel("target y [mm]")
-        return svg.inline(figure, "board", "Depth of the board over its plane")
+        slug = f"board_{name}".removesuffix("_")
+        return svg.inline(figure, slug, f"Depth of the board {name}".strip() + " over its plane")

@@ -9,6 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from visioncal.calibration import Calibration
 from visioncal.evidence import ViewEvidence
+from visioncal.recording.findings import target_frames
 from visioncal.report import svg
 from visioncal.session import Session
 from visioncal.transforms import invert, log
@@ -43,12 +44,13 @@ def residuals_over_joints(
         return Markup("")
     joints_rad = {view.number: view.joints_rad for view in session.views}
     shown = {it.view for it in calibration.views if it.used and it.view not in outlying}
+    frames = target_frames(calibration, session)
     pairs = [
         (joints, residual)
         for it in evidence
         if it.view in shown
         and (joints := joints_rad.get(it.view)) is not None
-        and (residual := twist_of(calibration, it)) is not None
+        and (residual := twist_of(calibration, it, frames.get(it.view, "target"))) is not None
     ]
     if len(pairs) < 3:
         return Markup("")
@@ -57,17 +59,25 @@ def residuals_over_joints(
     return _figure(joints_deg, 1e3 * twists[:, 3:], np.rad2deg(twists[:, :3]))
 
 
-def twist_of(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
-    """Where a view places the target against where the result does.
+def twist_of(
+    calibration: Calibration, seen: ViewEvidence, frame: str = "target"
+) -> FloatArray | None:
+    """Where a view places its target against where the result does.
+
+    Args:
+        calibration: The result.
+        seen: The view's poses.
+        frame: The frame of the target that it shows.
 
     Returns:
         (6,) of (rotation [rad], translation [m]) in the target's frame; None without poses.
     """
     if seen.base_from_flange is None or seen.cam_from_target is None:
         return None
-    # The camera's edge is the first, the target's the second.
-    x, z = (edge.matrix for edge in list(calibration.edges.values())[:2])
+    # The camera's edge is the first, targets' follow.
+    x, *_ = (edge.matrix for edge in calibration.edges.values())
     eye_in_hand = calibration.mount == "eye-in-hand"
+    z = calibration.edges[f"{'base' if eye_in_hand else 'flange'}_from_{frame}"].matrix
     robot = seen.base_from_flange if eye_in_hand else invert(seen.base_from_flange)
     return log(invert(z) @ robot @ x @ seen.cam_from_target)
 

@@ -61,7 +61,7 @@ def detect(
     *,
     among: Sequence[View] | None = None,
 ) -> Detections:
-    """Finds the session's target in all its images.
+    """Finds in each image of a session the target that its row is said to show.
 
     Args:
         session: A session with a target; its views without images are passed over.
@@ -77,8 +77,7 @@ def detect(
             board that was printed has another layout than the one declared.
     """
     options = options or DetectOptions()
-    target = session.target
-    if target is None:
+    if not session.boards:
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
     views = [view for view in (session.views if among is None else among) if view.image]
     looks: list[_Look] = []
@@ -86,12 +85,13 @@ def detect(
         _single_threaded_opencv(),
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
-        for look in pool.map(lambda view: _look(session, view, target, options), views):
+        for look in pool.map(lambda view: _look(session, view, options), views):
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
     resolution = _common_resolution(session, views, looks)
-    _check_layout(session, target, views, looks)
+    for name in session.boards:
+        _check_layout(session, name, views, looks)
     found = [look.found for look in looks]
     return Detections(
         {it.view: it for it in found if isinstance(it, Corners)},
@@ -119,7 +119,9 @@ def image_of(session: Session, view: View) -> Image | Rejection:
     return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
 
 
-def _look(session: Session, view: View, target: Target, options: DetectOptions) -> _Look:
+def _look(session: Session, view: View, options: DetectOptions) -> _Look:
+    name = session.board_of(view)
+    target = session.boards[name]
     image = image_of(session, view)
     if isinstance(image, Rejection):
         return _Look(image, None)
@@ -128,6 +130,7 @@ def _look(session: Session, view: View, target: Target, options: DetectOptions) 
     if isinstance(seen, NotFound):
         cause = why_hard_to_see(image, options.max_blur_px)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
+        reason = f"{reason} (looked for target {name})" if name else reason
         return _Look(Rejection(view.number, reason), resolution, seen.misfit)
     blur = blur_at_corners(image, seen.px)
     trouble = _trouble(target, seen.ids, blur, options)
@@ -183,11 +186,13 @@ def _rejections(looks: Sequence[_Look]) -> list[Rejection]:
 
 
 def _check_layout(
-    session: Session, target: Target, views: Sequence[View], looks: Sequence[_Look]
+    session: Session, name: str, views: Sequence[View], looks: Sequence[_Look]
 ) -> None:
     """Refuses a board whose markers lie otherwise than declared in most views that show it."""
-    misfits = [view for view, look in zip(views, looks, strict=True) if look.misfit]
-    shown = sum(isinstance(look.found, Corners) for look in looks)
+    target, board_of = session.boards[name], session.board_of
+    mine = [it for it in zip(views, looks, strict=True) if board_of(it[0]) == name]
+    misfits = [view for view, look in mine if look.misfit]
+    shown = sum(isinstance(look.found, Corners) for _, look in mine)
     if not misfits or len(misfits) <= shown:
         return
     images = [decode_image(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]

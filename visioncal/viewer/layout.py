@@ -231,6 +231,7 @@ def _cell_contents(contents: _Contents) -> list[str]:
         paths.STOPS,
         paths.CAMERA,
         paths.TARGET,
+        paths.TARGETS,
         paths.FRAMES,
         paths.SEEN_TARGET,
     ]
