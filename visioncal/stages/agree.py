@@ -51,8 +51,12 @@ def agree(
     """
     with one_blas_thread():
         units = whole_units(data, stops if boards is None else boards.units(stops))
-        thought = None if start is None else np.bincount(units, start.mask) > 0
-        found = agreeing_views(data.merged(units), thought)
+        merged, thought = data.merged(units), None
+        if start is not None:
+            thought = np.bincount(units, start.mask) > 0
+        elif boards is not None and boards.unknowns:
+            thought = _board_by_board(merged, units, boards)
+        found = agreeing_views(merged, thought)
     mask, edges = found.agrees[units], found.fit.edges
     placed, z = data.under(edges.shared).placed(edges.x), edges.z[None]
     if boards is not None:
@@ -74,6 +78,21 @@ def agree(
             for at in np.flatnonzero(~mask).tolist()
         ),
     )
+
+
+def _board_by_board(merged: Closure, units: IntArray, boards: Boards) -> Mask:
+    """Which units agree with the others of their board.
+
+    An arm that errs and a board of another size look like noise from each board alone, as both
+    edges make up for them, and like a wrong board from another one.
+    """
+    own = boards.shown[np.unique(units, return_index=True)[1]]
+    agrees = np.zeros(len(merged), dtype=bool)
+    for board in range(len(boards.names)):
+        mine = own == board
+        if mine.any():
+            agrees[mine] = agreeing_views(merged.subset(mine).with_first(boards.begin)).agrees
+    return agrees
 
 
 def _cause(views: Sequence[int], agreeing_mates: Mask) -> str:

@@ -18,6 +18,7 @@ from visioncal.estimator.closure import Closure, Edges, fit_closure, left_out_re
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.joint import (
     Arm,
+    MeasuredScale,
     Problem,
     Scene,
     Seen,
@@ -186,18 +187,34 @@ def _freed(problem: Problem, arm: Arm, moving: IntArray, state: State) -> _Answe
 
 
 def _resized(answer: _Answer, arm: Arm) -> _Answer:
-    """Sets the boards' scales free where the robot measures others than are stated."""
+    """Sets the boards' scales free where the robot measures others than are stated.
+
+    One after the other: a board that is off misleads about the others, too.
+    """
+    for _ in answer.problem.scale:
+        other = _wrongly_sized(answer, arm)
+        if other is None:
+            return answer
+        problem, state = answer.problem, answer.state
+        place = problem.scale[[other.board]]
+        if other.contradicts:
+            problem = problem.without_prior(place)
+        moving = np.union1d(state.moving, place)
+        resized = _Answer(problem, settle(problem, arm, moving, state.again()))
+        if not _is_determined(resized.state, arm):
+            return answer
+        answer = resized
+    return answer
+
+
+def _wrongly_sized(answer: _Answer, arm: Arm) -> MeasuredScale | None:
+    """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     problem, state = answer.problem, answer.state
-    measured = [measured_scale(problem, arm, state, it) for it in range(len(problem.scale))]
+    held = np.flatnonzero(~np.isin(problem.scale, state.moving)).tolist()
+    measured = [measured_scale(problem, arm, state, board) for board in held]
     # An arm whose links may all be too long is hard to tell from a board that is too large.
     other = [it for it in measured if (it.is_another if arm.errors is None else it.contradicts)]
-    if not other:
-        return answer
-    contradicted = problem.scale[[it.board for it in other if it.contradicts]]
-    problem = problem.without_prior(contradicted)
-    moving = np.union1d(state.moving, problem.scale[[it.board for it in other]])
-    resized = _Answer(problem, settle(problem, arm, moving, state.again()))
-    return resized if _is_determined(resized.state, arm) else answer
+    return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)
 
 
 def _is_determined(state: State, arm: Arm) -> bool:

@@ -1,0 +1,220 @@
+"""Several boards in one chain: where they are, what they tell together, and what is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cells import calibrated, error_of, known_of
+from scipy.stats import chi2
+
+from visioncal.errors import DegenerateError
+from visioncal.estimator.boards import Boards, place
+from visioncal.estimator.closure import Noise, closure_information
+from visioncal.estimator.workspace import postures
+from visioncal.pipeline.result import result_of
+from visioncal.pipeline.steps import STAGES
+from visioncal.simulation import CellOptions, Second, charuco_target, fine_camera, forward, simulate
+from visioncal.transforms import exp, invert, log
+
+# The second board is out of sight from where the first is looked at, unless it is turned less.
+NEAR = Second(turn_rad=0.6, tilt_rad=0.2)
+TWO = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second())
+WRONG_LINKS = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def known_before(cell, name):
+    """What is known before a stage."""
+    known = known_of(cell)
+    for stage in STAGES:
+        if stage.name == name:
+            return known
+        if stage.name not in ("robot", "detect"):
+            known = stage.run(known)
+    raise AssertionError(name)
+
+
+def without(cell, views):
+    """A cell that lacks some views."""
+    kept = np.array([at for at in range(len(cell.corners)) if at not in views])
+    shown = replace(cell.shown, stops=cell.shown.stops[kept], boards=cell.shown.boards[kept])
+    corners = tuple(replace(cell.corners[at], view=now) for now, at in enumerate(kept))
+    return replace(
+        cell,
+        corners=corners,
+        shown=shown,
+        joints=cell.joints[kept],
+        base_from_flange=cell.base_from_flange[kept],
+    )
+
+
+def test_all_boards_are_placed_as_well_as_their_sigmas_say():
+    """Ten cells, each with boards whose sizes are off by what their files allow."""
+    squares, count = 0.0, 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        first, further = 1.0 + 1e-3 * rng.standard_normal(2)
+        second = replace(NEAR if seed % 4 < 2 else Second(), scale=further)
+        cell = simulate(
+            replace(TWO, mount=MOUNTS[seed % 2], board_scale=first, second=second, seed=seed)
+        )
+        known = calibrated(cell, joints=False)
+        assert len(known.used) == len(cell.corners)
+        error, spread = error_of(cell, known), result_of(known).joint_covariance
+        assert error.shape == (18,)
+        squares += float(error @ np.linalg.solve(spread, error))
+        count += len(error)
+    # Both tails at one in ten thousand.
+    assert chi2.ppf(1e-4, count) < squares < chi2.ppf(1.0 - 1e-4, count)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_boards_have_names_and_a_common_covariance(mount):
+    cell = simulate(replace(TWO, mount=mount, seed=3))
+    known = calibrated(cell)
+    result = result_of(known)
+    assert list(result.edges) == list(cell.transforms)
+    assert result.joint_covariance.shape == (18, 18)
+    for at, edge in enumerate(result.edges.values()):
+        rows = slice(6 * at, 6 * at + 6)
+        assert np.array_equal(edge.covariance, result.joint_covariance[rows, rows])
+    # The boards hang together by the camera's edge.
+    assert np.abs(result.joint_covariance[6:12, 12:]).max() > 0.0
+    assert np.linalg.eigvalsh(result.joint_covariance).min() > 0.0
+    assert set(result.stages["boards"]) == {"first", "second"}
+    for solver in result.solvers.values():
+        assert list(solver.matrices) == list(cell.transforms)
+    park = result.solvers["park"].matrices
+    for name, true in cell.transforms.items():
+        # Closed forms are off by a few tenths of a millimetre.
+        assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
+
+
+def test_edges_move_with_the_chain_as_their_slopes_say():
+    known = calibrated(simulate(replace(TWO, seed=1)))
+    edges, boards = known.solved.edges, known.shown(known.used)
+    placed, step = place(boards, edges), 1e-6
+    for at in (0, 4, 7, 11, *range(12 + boards.begin, 18 + boards.begin)):
+        change = np.zeros(12 + len(edges.shared))
+        change[at] = step
+        ends = [place(boards, edges.moved(it)).z for it in (change, -change)]
+        moved = log(invert(ends[1]) @ ends[0]).ravel() / (2 * step)
+        # Central differences of steps this small are exact to nine digits.
+        assert moved == pytest.approx(placed.slope[6:, at], abs=1e-7)
+
+
+def test_merging_what_one_stop_shows_of_two_boards_loses_nothing():
+    """Where the robot has no noise of its own, stops make no difference."""
+    cell = simulate(replace(TWO, second=NEAR, seed=2))
+    assert len(cell.corners) > cell.options.views
+    known = calibrated(cell)
+    data, edges = known.closure(known.used), known.solved.edges
+    noise = Noise(1e-9, 1e-9)
+    whole = closure_information(data, edges, noise)
+    merged = closure_information(data.merged(known.stops), edges, noise)
+    scale = np.sqrt(np.diag(whole))
+    # The chain does not close exactly, and slopes are taken where each of both closes.
+    assert merged / np.outer(scale, scale) == pytest.approx(
+        whole / np.outer(scale, scale), abs=1e-4
+    )
+
+
+def test_two_boards_tell_more_of_an_arm_than_one():
+    """The same number of views, and the tool's place all over the workspace."""
+    ratios = []
+    for seed in range(3):
+        options = replace(TWO, **WRONG_LINKS, views=30, seed=seed)
+        errors = []
+        for second in (None, Second(target=charuco_target())):
+            cell = simulate(replace(options, second=second))
+            errors.append(error_m(cell, calibrated(cell)))
+        ratios.append(errors[1] / errors[0])
+    assert np.median(ratios) < 0.9
+
+
+def error_m(cell, known):
+    """Root mean square error of the camera's place, seen from the first board [m]."""
+    robot = known.arm_model.robot
+    q = postures(robot)
+    x, z, *_ = cell.transforms.values()
+    board = place(known.shown(known.used), known.solved.edges).z[known.boards.index(0)]
+    true = invert(z) @ forward(cell.true_arm, q) @ x
+    ours = invert(board) @ robot.base_from_flange(q) @ known.solved.edges.x
+    return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
+
+
+def test_a_wrong_view_of_one_board_is_named():
+    cell = simulate(replace(TWO, seed=4))
+    corners = list(cell.corners)
+    # One view of the second board shows it shifted by two squares.
+    slipped = next(at for at in np.flatnonzero(cell.shown.boards == 1) if len(corners[at].ids) > 40)
+    pose = cell.cam_from_target[slipped] @ exp(np.array([0, 0, 0.02, 0.03, 0.0, 0.0]))
+    turned = replace(cell.exact_corners[slipped], view=int(slipped))
+    from visioncal.simulation.boards import corners_m
+    from visioncal.simulation.optics import project
+
+    points = corners_m(cell.sheets[1])[turned.ids] @ pose[:3, :3].T + pose[:3, 3]
+    corners[slipped] = replace(turned, px=project(cell.options.camera, points))
+    known = calibrated(replace(cell, corners=tuple(corners)))
+    assert set(range(len(corners))) - set(known.used) == {slipped}
+    assert "disagrees with the other views" in known.reasons[slipped]
+    assert any(f"View {slipped} was left out" in it for it in known.verdict.reasons)
+
+
+def test_a_board_of_another_size_is_named():
+    known = calibrated(simulate(replace(TWO, second=Second(scale=1.01), seed=5)))
+    told = [it for it in known.verdict.reasons if "By the robot's motion" in it]
+    assert len(told) == 1
+    assert "the board second is 1 % larger than stated" in told[0]
+    shapes = result_of(known).stages["boards"]
+    # The robot measures a size to some hundredths of a percent.
+    assert shapes["second"]["shape"]["scale"] == pytest.approx(0.01, abs=1e-3)
+    assert shapes["first"]["shape"]["scale"] == 0.0
+
+
+def test_one_view_places_a_board():
+    cell = simulate(replace(TWO, second=replace(Second(), target=charuco_target()), seed=6))
+    further = np.flatnonzero(cell.shown.boards == 1)
+    known = calibrated(without(cell, set(further[1:].tolist())))
+    result = result_of(known)
+    edges = result.edges
+    assert edges["base_from_target_second"].sigma_mm > edges["base_from_target_first"].sigma_mm
+    true = cell.transforms["base_from_target_second"]
+    away = log(invert(true) @ edges["base_from_target_second"].matrix)
+    spread = edges["base_from_target_second"].covariance
+    # One draw of chi-square with six degrees of freedom, at one in ten thousand.
+    assert away @ np.linalg.solve(spread, away) < chi2.ppf(1.0 - 1e-4, 6)
+    # Without that view nothing places the board: it has no part in what is held out.
+    assert np.isnan(known.held_out.away_m).sum() == 1
+    assert np.isfinite(known.findings.held_out.mm)
+
+
+def test_a_board_that_is_told_too_badly_is_refused():
+    cell = simulate(replace(TWO, pixel_sigma_px=0.5, robot_sigma_m=7e-3, seed=7))
+    further = np.flatnonzero(cell.shown.boards == 1)
+    with pytest.raises(DegenerateError, match=r"target second.* has a predicted sigma"):
+        calibrated(without(cell, set(further[1:].tolist())), joints=False)
+
+
+def test_a_board_that_is_never_seen_is_told():
+    cell = simulate(replace(TWO, seed=8))
+    further = set(np.flatnonzero(cell.shown.boards == 1).tolist())
+    known = calibrated(without(cell, further))
+    assert list(result_of(known).edges) == ["flange_from_cam", "base_from_target_first"]
+    assert any("No usable view shows target second" in it for it in known.verdict.reasons)
+
+
+def test_too_few_views_of_any_board_are_refused():
+    cell = simulate(replace(TWO, seed=9))
+    kept = {
+        *np.flatnonzero(cell.shown.boards == 0)[:2],
+        *np.flatnonzero(cell.shown.boards == 1)[:2],
+    }
+    with pytest.raises(DegenerateError, match="first in 2, second in 2"):
+        calibrated(without(cell, set(range(len(cell.corners))) - kept))
+
+
+def test_an_only_board_is_brought_nowhere():
+    cell = simulate(replace(TWO, second=None, views=5))
+    data = known_before(cell, "agree").closure(range(5))
+    assert Boards.one(5).brought(data) is data
