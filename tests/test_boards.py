@@ -11,9 +11,24 @@ from visioncal.errors import DegenerateError
 from visioncal.estimator.boards import Boards, place
 from visioncal.estimator.closure import Noise, closure_information
 from visioncal.estimator.workspace import postures
-from visioncal.pipeline.result import result_of
+from visioncal.pipeline.guessing import guess_session
+from visioncal.pipeline.result import result_of, run
 from visioncal.pipeline.steps import STAGES
-from visioncal.simulation import CellOptions, Second, charuco_target, fine_camera, forward, simulate
+from visioncal.session import Session
+from visioncal.simulation import (
+    CellOptions,
+    Second,
+    charuco_target,
+    checkerboard_target,
+    fine_camera,
+    forward,
+    simulate,
+    wide_camera,
+    write_session,
+)
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.optics import project
+from visioncal.stages.detect import detect
 from visioncal.transforms import exp, invert, log
 
 # The second board is out of sight from where the first is looked at, unless it is turned less.
@@ -123,23 +138,26 @@ def test_two_boards_tell_more_of_an_arm_than_one():
     """The same number of views, and the tool's place all over the workspace."""
     ratios = []
     for seed in range(3):
-        options = replace(TWO, **WRONG_LINKS, views=30, seed=seed)
+        options = replace(TWO, **WRONG_LINKS, mount="eye-to-hand", views=24, seed=seed)
         errors = []
         for second in (None, Second(target=charuco_target())):
             cell = simulate(replace(options, second=second))
-            errors.append(error_m(cell, calibrated(cell)))
+            known = calibrated(cell)
+            assert known.kinematics.level == "geometry"
+            errors.append(error_m(cell, known))
         ratios.append(errors[1] / errors[0])
-    assert np.median(ratios) < 0.9
+    # Both boards are seen by most stops: 0.55 in the median of five cells.
+    assert np.median(ratios) < 0.8
 
 
 def error_m(cell, known):
-    """Root mean square error of the camera's place, seen from the first board [m]."""
+    """Root mean square error of the first board's place, seen from the camera [m]."""
     robot = known.arm_model.robot
     q = postures(robot)
     x, z, *_ = cell.transforms.values()
     board = place(known.shown(known.used), known.solved.edges).z[known.boards.index(0)]
-    true = invert(z) @ forward(cell.true_arm, q) @ x
-    ours = invert(board) @ robot.base_from_flange(q) @ known.solved.edges.x
+    true = invert(x) @ forward(cell.true_arm, q) @ z
+    ours = invert(known.solved.edges.x) @ robot.base_from_flange(q) @ board
     return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
 
 
@@ -150,9 +168,6 @@ def test_a_wrong_view_of_one_board_is_named():
     slipped = next(at for at in np.flatnonzero(cell.shown.boards == 1) if len(corners[at].ids) > 40)
     pose = cell.cam_from_target[slipped] @ exp(np.array([0, 0, 0.02, 0.03, 0.0, 0.0]))
     turned = replace(cell.exact_corners[slipped], view=int(slipped))
-    from visioncal.simulation.boards import corners_m
-    from visioncal.simulation.optics import project
-
     points = corners_m(cell.sheets[1])[turned.ids] @ pose[:3, :3].T + pose[:3, 3]
     corners[slipped] = replace(turned, px=project(cell.options.camera, points))
     known = calibrated(replace(cell, corners=tuple(corners)))
@@ -218,3 +233,52 @@ def test_an_only_board_is_brought_nowhere():
     cell = simulate(replace(TWO, second=None, views=5))
     data = known_before(cell, "agree").closure(range(5))
     assert Boards.one(5).brought(data) is data
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_measured_poses_of_two_boards_will_do(tmp_path, mount):
+    cell = simulate(replace(TWO, mount=mount, second=NEAR, seed=10))
+    session = Session.load(write_session(cell, tmp_path / "pairs", images=False))
+    result = run(session).calibration
+    assert list(result.edges) == list(cell.transforms)
+    for name, true in cell.transforms.items():
+        away = log(invert(true) @ result.edges[name].matrix)
+        spread = result.edges[name].covariance
+        # Chi-square with six degrees of freedom at one in ten thousand; the noise is estimated.
+        assert away @ np.linalg.solve(spread, away) < 1.5 * chi2.ppf(1.0 - 1e-4, 6)
+
+
+def test_each_image_is_searched_for_its_own_board(tmp_path):
+    cell = simulate(replace(TWO, camera=wide_camera(), views=4, seed=11))
+    session = Session.load(write_session(cell, tmp_path / "session"))
+    found = detect(session)
+    assert sorted(found.corners) == [0, 1, 2, 3]
+    views = list(session.views)
+    views[1] = replace(views[1], text={"target": "first"})
+    wrong = detect(replace(session, views=tuple(views)))
+    assert sorted(wrong.corners) == [0, 2, 3]
+    (lost,) = wrong.rejections
+    assert (lost.view, lost.reason.endswith("(looked for target first)")) == (1, True)
+
+
+def test_the_turn_of_a_symmetric_board_is_told_by_its_other_views():
+    """Eight by six corners look the same after half a turn."""
+    even = replace(checkerboard_target(), name="even", columns=8)
+    cell = simulate(replace(TWO, second=Second(target=even), seed=13))
+    known = calibrated(cell)
+    assert len(known.used) == len(cell.corners)
+    away = error_of(cell, known)[12:]
+    # The board's frame is that of the first view's numbering, which need not be ours.
+    turned = np.linalg.norm(away[:3]) > 1.0
+    assert np.linalg.norm(away[3:]) < (0.5 if turned else 2e-4)
+    assert known.findings.held_out.mm < 0.5
+
+
+def test_inverse_poses_are_told_by_the_views_of_one_board(tmp_path):
+    cell = simulate(replace(TWO, seed=14))
+    inverse = replace(cell, base_from_flange=invert(cell.base_from_flange))
+    session = Session.load(write_session(inverse, tmp_path / "pairs", images=False))
+    guess = guess_session(session)
+    assert not guess.declared.closes
+    assert guess.stands_out
+    assert guess.best.closes

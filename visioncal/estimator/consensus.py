@@ -42,7 +42,7 @@ _UNEVEN = 3.0
 # Where fewer than this share of the views agree, nothing tells which of them are right.
 _LEAST_SHARE = 0.5
 # Views that agree, at the least: with fewer, wrong ones cannot be told from noise.
-_LEAST_VIEWS = 5
+LEAST_VIEWS = 5
 # Distances are compared with the limit once more, without the view's own say in the noise, when
 # they come this near.
 _SUSPECT_SHARE = 0.4
@@ -78,10 +78,10 @@ def agreeing_views(data: Closure, start: Mask | None = None) -> Agreement:
         result may be off, nothing tells which are right: all stay.
     """
     everything = np.ones(len(data), dtype=bool)
-    if len(data) > _LEAST_VIEWS:
+    if len(data) > LEAST_VIEWS:
         agrees, fit = _widened(data, *_core(data)) if start is None else _fitted(data, start)
         agrees, fit = _settled(data, agrees, fit)
-        if agrees.sum() >= max(_LEAST_SHARE * len(data), _LEAST_VIEWS) and _is_noise(fit.noise):
+        if agrees.sum() >= max(_LEAST_SHARE * len(data), LEAST_VIEWS) and _is_noise(fit.noise):
             return _kept(data, agrees, fit)
     return _kept(data, *_fitted(data, everything))
 
@@ -218,7 +218,7 @@ def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]
         surprise = surprises(data, agrees, fit)
         scale = max(float(np.median(surprise)) / typical, 1.0)
         before, agrees = agrees, surprise < allowed * scale
-        if np.array_equal(before, agrees) or agrees.sum() < _LEAST_VIEWS:
+        if np.array_equal(before, agrees) or agrees.sum() < LEAST_VIEWS:
             break
         fit = fit_closure(data.subset(agrees), fit.edges)
     return agrees, fit
@@ -227,7 +227,7 @@ def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]
 def _settled(data: Closure, agrees: Mask, fit: ClosureFit) -> tuple[Mask, ClosureFit]:
     """Takes views in and out one at a time, with the noise estimated anew, until none moves."""
     for _ in range(len(data)):
-        if agrees.sum() < _LEAST_VIEWS:
+        if agrees.sum() < LEAST_VIEWS:
             break
         surprise, limit = surprises(data, agrees, fit), _limit(data, agrees)
         outside = np.flatnonzero(~agrees & (surprise < limit))
@@ -248,7 +248,7 @@ def _without_the_worst(
 ) -> tuple[Mask, ClosureFit] | None:
     """Leaves the worst view out where noise that it has no say in does not explain it."""
     worst = int(np.where(agrees, surprise, -1.0).argmax())
-    if surprise[worst] < _SUSPECT_SHARE * limit or agrees.sum() <= _LEAST_VIEWS:
+    if surprise[worst] < _SUSPECT_SHARE * limit or agrees.sum() <= LEAST_VIEWS:
         return None
     fewer = agrees.copy()
     fewer[worst] = False

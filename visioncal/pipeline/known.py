@@ -43,6 +43,7 @@ class Known:
         base_from_flange: (4, 4) by view, as the robot reported it.
         boards: Which of the session's boards the chain holds: the one it ends at, and others.
         from_first: (b, 4, 4) where they lie: `target_k_from_target_1`, in that order.
+        compared_from_first: The same when levels of the arm's errors were compared.
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         corners: What was found of the target, by view.
         resolution: Size of the images [px].
@@ -77,6 +78,7 @@ class Known:
     joints_rad: Mapping[int, FloatArray] | None = None
     boards: tuple[int, ...] = (0,)
     from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
+    compared_from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
@@ -162,6 +164,15 @@ class Known:
     def held_back(self) -> frozenset[int]:
         """The views that the session keeps from every fit (`role = holdout`)."""
         return frozenset(view.number for view in self.session.views if view.holdout)
+
+    @property
+    def measurable_held_back(self) -> frozenset[int]:
+        """Those of them whose chain can be closed."""
+        return frozenset(
+            view
+            for view in self.held_back & self.poses.keys() & self.base_from_flange.keys()
+            if self.poses[view].board in self.boards
+        )
 
     def closure(self, views: Sequence[int]) -> Closure:
         """The chain's known parts for some views, each with its first or chosen pose."""

@@ -195,13 +195,12 @@ def _held_back_poses(known: Known) -> Iterator[ViewPoses]:
     targets, mount, agreed = tuple(known.session.boards.values()), known.session.mount, known.agreed
     if agreed is None:
         return
-    for view in known.held_back & known.poses.keys() & known.base_from_flange.keys():
+    for view in known.measurable_held_back:
         poses = known.poses[view]
-        if poses.board in known.boards:
-            robot = robot_part(known.flange_poses([view]), mount)[0]
-            z = agreed.edges.z @ known.shown([view]).first_from_own[0]
-            at = replace(agreed.edges, z=z)
-            yield choose_by(poses, robot, at, targets[poses.board] if targets else None)
+        robot = robot_part(known.flange_poses([view]), mount)[0]
+        z = agreed.edges.z @ known.shown([view]).first_from_own[0]
+        at = replace(agreed.edges, z=z)
+        yield choose_by(poses, robot, at, targets[poses.board] if targets else None)
 
 
 def _refine(known: Known) -> Known:
@@ -251,6 +250,7 @@ def _kinematics(known: Known) -> Known:
     data = stated.closure(known.used).merged(known.stops)
     found = choose_level(data, agreed.edges, bases, known.level)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
+    known = replace(known, compared_from_first=known.from_first)
     known = known.noting((), doubts(found))
     if not found.errors:
         return known

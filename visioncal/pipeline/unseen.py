@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.closure import distances
+from visioncal.estimator.closure import Edges, distances
 from visioncal.pipeline.known import Known
 from visioncal.stages.kinematics import Kinematics
 from visioncal.types import FloatArray
@@ -21,9 +21,8 @@ def unseen_views(known: Known, found: Kinematics) -> dict[str, list[dict[str, An
     first = np.unique(known.stops, return_index=True)[1]
     left_out = [known.used[int(at)] for at in first]
     documents = {"left_out": list(_rows(left_out, before, after))}
-    held = known.held_back & known.poses.keys() & known.base_from_flange.keys()
-    if held:
-        views = sorted(held)
+    views = sorted(known.measurable_held_back)
+    if views:
         before, after = _held_back(known, found, views)
         documents["holdout"] = list(_rows(views, before, after))
     return documents
@@ -37,13 +36,19 @@ def _held_back(
     Returns:
         Twice (m, 2) rotation [rad] and distance [m].
     """
-    stated = replace(known, arm=None, arm_model=None)
+    stated = replace(known, arm=None, arm_model=None, from_first=known.compared_from_first)
     edges = (found.fits[0].fit.edges, known.solved.edges)
     before, after = (
-        distances(one.closure(views).under(it.shared).placed(it.x), it.z)
-        for one, it in zip((stated, known), edges, strict=True)
+        _distances(one, it, views) for one, it in zip((stated, known), edges, strict=True)
     )
     return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
+
+
+def _distances(known: Known, edges: Edges, views: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """How far (m,) [m] and (m,) [rad] views place their boards from where the edges do."""
+    own = known.shown(views).moved(edges.shared).first_from_own
+    placed = known.closure(views).under(edges.shared).placed(edges.x)
+    return distances(placed @ own, edges.z @ own)
 
 
 def _lengths(twists: FloatArray) -> FloatArray:

@@ -55,12 +55,8 @@ def view_evidence(known: Known) -> tuple[ViewEvidence, ...]:
 
 def _measurable(known: Known) -> list[int]:
     """The views whose chain can be closed: used ones, those left out, and those held back."""
-    held = {
-        view
-        for view in known.held_back & known.poses.keys() & known.base_from_flange.keys()
-        if known.poses[view].board in known.boards
-    }
-    return [it.number for it in known.session.views if it.number in {*known.candidates, *held}]
+    views = {*known.candidates, *known.measurable_held_back}
+    return [it.number for it in known.session.views if it.number in views]
 
 
 def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:

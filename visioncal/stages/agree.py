@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Edges, distances
-from visioncal.estimator.consensus import agreeing_views, whole_units
+from visioncal.estimator.consensus import LEAST_VIEWS, agreeing_views, whole_units
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.figures import figure
 from visioncal.types import IntArray, Mask, Rejection
@@ -84,13 +84,14 @@ def _board_by_board(merged: Closure, units: IntArray, boards: Boards) -> Mask:
     """Which units agree with the others of their board.
 
     An arm that errs and a board of another size look like noise from each board alone, as both
-    edges make up for them, and like a wrong board from another one.
+    edges make up for them, and like a wrong board from another one. A board with few views is
+    left to the others to judge.
     """
     own = boards.shown[np.unique(units, return_index=True)[1]]
-    agrees = np.zeros(len(merged), dtype=bool)
+    agrees = np.ones(len(merged), dtype=bool)
     for board in range(len(boards.names)):
         mine = own == board
-        if mine.any():
+        if mine.sum() > LEAST_VIEWS:
             agrees[mine] = agreeing_views(merged.subset(mine).with_first(boards.begin)).agrees
     return agrees
 
