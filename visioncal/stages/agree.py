@@ -63,6 +63,13 @@ def agree(
         own = boards.moved(edges.shared).first_from_own
         placed, z = placed @ own, z @ own
     away_m, away_rad = distances(placed, z)
+
+    def cause(at: int) -> str:
+        others = np.zeros(len(views), dtype=bool)
+        if boards is not None and boards.unknowns:
+            others = (boards.shown == boards.shown[at]) & mask
+        return _cause(views, (stops == stops[at]) & mask, others)
+
     surprise = np.sqrt(found.surprise[units] / 6.0)
     limit = float(np.sqrt(found.limit / 6.0))
     return Agreed(
@@ -73,7 +80,7 @@ def agree(
                 views[at],
                 f"disagrees with the other views: it places the target {figure(1e3 * away_m[at])} "
                 f"mm and {figure(np.rad2deg(away_rad[at]))} deg away, {figure(surprise[at])} times "
-                f"the noise (limit {figure(limit)}); {_cause(views, (stops == stops[at]) & mask)}",
+                f"the noise (limit {figure(limit)}); {cause(at)}",
             )
             for at in np.flatnonzero(~mask).tolist()
         ),
@@ -96,8 +103,11 @@ def _board_by_board(merged: Closure, units: IntArray, boards: Boards) -> Mask:
     return agrees
 
 
-def _cause(views: Sequence[int], agreeing_mates: Mask) -> str:
-    """What is wrong with a view, by the views of its stop that agree with all others."""
+def _cause(views: Sequence[int], agreeing_mates: Mask, of_its_board: Mask) -> str:
+    """What is wrong with a view, by those of its stop and its board that agree with all others."""
+    if of_its_board.sum() == 1:
+        other = views[int(np.flatnonzero(of_its_board)[0])]
+        return f"it and view {other} alone show this target, and either may be wrong"
     mates = np.flatnonzero(agreeing_mates)
     if len(mates):
         return (
