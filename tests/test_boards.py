@@ -150,6 +150,19 @@ def test_two_boards_tell_more_of_an_arm_than_one():
     assert np.median(ratios) < 0.8
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_each_board_adds_six_values_that_are_told(mount):
+    """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
+    cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))
+    known = calibrated(cell)
+    told = known.telling.told
+    assert known.kinematics.level == "geometry"
+    assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
+    # The first board alone tells thirty.
+    one = calibrated(without(cell, set(np.flatnonzero(cell.shown.boards == 1).tolist())))
+    assert (one.telling.told.columns, one.telling.told.identifiable) == (48, 30)
+
+
 def error_m(cell, known):
     """Root mean square error of the first board's place, seen from the camera [m]."""
     robot = known.arm_model.robot

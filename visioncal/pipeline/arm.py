@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.estimator.told import EDGES
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
 from visioncal.robot import Robot
@@ -20,15 +21,17 @@ def telling_of(known: Known) -> Telling | None:
     found, model = known.kinematics, known.arm_model
     if found is None or model is None:
         return None
-    target = known.session.target
+    targets, boards = tuple(known.session.boards.values()), known.shown(known.used)
     first = np.unique(known.stops, return_index=True)[1]
+    further = 12 + np.arange(boards.begin, boards.begin + boards.unknowns)
     seen = ArmData(
         known.closure(known.used).merged(known.stops),
         known.solved,
         model,
         next(iter(found.errors.values())).sigma,
         known.joints(known.used)[first],
-        np.zeros(3) if target is None else corner_positions(target).mean(axis=0),
+        corner_positions(targets[known.boards[0]]).mean(axis=0) if targets else np.zeros(3),
+        np.concatenate([EDGES, further]),
     )
     return tell(seen, known.convention)
 
