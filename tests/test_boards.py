@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of, known_of
+from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
-from visioncal.errors import DegenerateError
+from visioncal.errors import DataError, DegenerateError
 from visioncal.estimator.boards import Boards, place
 from visioncal.estimator.closure import Noise, closure_information
 from visioncal.estimator.workspace import postures
+from visioncal.frames.sighting import sighting
+from visioncal.outputs import write_outputs
 from visioncal.pipeline.guessing import guess_session
 from visioncal.pipeline.result import result_of, run
 from visioncal.pipeline.steps import STAGES
@@ -295,3 +298,26 @@ def test_inverse_poses_are_told_by_the_views_of_one_board(tmp_path):
     assert not guess.declared.closes
     assert guess.stands_out
     assert guess.best.closes
+
+
+def test_every_output_shows_all_boards(tmp_path):
+    cell = simulate(replace(TWO, seed=10))
+    session = Session.load(write_session(cell, tmp_path / "pairs", images=False))
+    written = run(session)
+    write_outputs(tmp_path / "out", session, written)
+    file = tmp_path / "out" / "recording.rrd"
+    assert Session.load(file).digest() == session.digest()
+    again = run(Session.load(file)).calibration
+    for name, edge in written.calibration.edges.items():
+        assert np.array_equal(again.edges[name].matrix, edge.matrix)
+        assert np.array_equal(again.edges[name].covariance, edge.covariance)
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "base_from_target_first" in report
+    assert "base_from_target_second" in report
+    logged = {str(it.entity_path) for it in RrdReader(file).stream()}
+    placements = [it for it in logged if "placements_magnified" in it and it.endswith("/used")]
+    for name in ("first", "second"):
+        assert f"/targets/{name}/sheet" in logged
+        assert any(it.startswith(f"/targets/{name}/") for it in placements)
+    with pytest.raises(DataError, match=r"several targets \(first, second\)"):
+        sighting(session, written.calibration, "base")
