@@ -78,7 +78,8 @@ class Corners:
 
     Attributes:
         view: The view's number.
-        ids: (n,) corner numbers, ascending, in the target's numbering.
+        ids: (n,) corner numbers, ascending, in the target's numbering; where a session has several
+            targets, the calibration numbers their corners through.
         px: (n, 2) corner positions [px], pixel centres at integers.
         blur_px: Width of the edges that were seen, as a Gaussian's sigma [px].
     """

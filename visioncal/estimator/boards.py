@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.closure import Closure, Edges, Shared
+from visioncal.estimator.closure import Closure, Edges, Shared, deviations
 from visioncal.transforms import adjoint, exp, invert
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import FloatArray, IntArray
 
 # Where a board lies is known to so much without any view [rad and m]: nothing, for a fit, but
 # enough to keep a board in its place that has no view in a part of the data.
@@ -51,10 +51,6 @@ class Boards:
     def unknowns(self) -> int:
         """How many unknowns it takes to place the boards behind the first."""
         return 6 * (len(self.names) - 1)
-
-    def subset(self, chosen: Mask) -> "Boards":
-        """Returns the views of an (m,) mask."""
-        return replace(self, shown=self.shown[chosen])
 
     def brought(self, data: Closure) -> Closure:
         """Brings views to the first board, and adds the unknowns by which they come there.
@@ -99,6 +95,21 @@ class Boards:
     def first_from_own(self) -> FloatArray:
         """(m, 4, 4) each view's board, in the frame of the first."""
         return invert(self.from_first)[self.shown]
+
+    def deviations(self, placed: FloatArray, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deviation of each view's board from its mean over the views: (m,) [m] and (m,) [rad].
+
+        Args:
+            placed: (m, 4, 4) where each view places the first board.
+            shared: (k,) change of what the views share.
+        """
+        own = placed @ self.moved(shared).first_from_own
+        away = np.zeros((2, len(placed)))
+        for board in range(len(self.names)):
+            mine = self.shown == board
+            if mine.any():
+                away[:, mine] = deviations(own[mine])
+        return away[0], away[1]
 
     def units(self, stops: IntArray) -> IntArray:
         """Numbers what is seen of one board at one stop, from 0 in the order of appearance.

@@ -96,7 +96,7 @@ def check_observability(
     for board, name in enumerate(boards.names[1:], start=1):
         _refuse(
             worst[2 + 2 * board : 4 + 2 * board],
-            f"{int(np.sum(boards.shown == board))} used views show it",
+            "the views that show it are too few or too poor",
             f"Add views of target {name}, or take it out of the session.",
         )
     if looks:

@@ -45,7 +45,7 @@ class Known:
         from_first: (b, 4, 4) where they lie: `target_k_from_target_1`, in that order.
         compared_from_first: The same when levels of the arm's errors were compared.
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
-        corners: What was found of the target, by view.
+        corners: What was found of the target, by view; those of several are numbered through.
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
         poses: The target's pose by view; several candidates until they are chosen from.

@@ -263,7 +263,9 @@ def _hand_eye(known: Known) -> Known:
         known = known.with_arm_errors()
         boards = known.shown(known.used)
         data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
-        result = solve_hand_eye(data, known.solver, arm, known.estimated_looks, boards)
+        first = np.unique(known.stops, return_index=True)[1]
+        by_stop = replace(boards, shown=boards.shown[first])
+        result = solve_hand_eye(data, known.solver, arm, known.estimated_looks, by_stop)
         known = replace(known, hand_eye=result)
         model, shared = known.arm_model, result.edges.shared
         step = shared[len(shared) - (0 if model is None else len(model.values)) :]

@@ -15,7 +15,6 @@ from visioncal.estimator.closure import (
     Edges,
     Noise,
     closure_information,
-    deviations,
     estimate_noise,
     fit_closure,
     held_shift,
@@ -94,7 +93,8 @@ def solve_hand_eye(
         arm: Errors that follow the arm's posture, at the same views. Those of its links are among
             what the views share; others are noise to the fit and count in the covariance.
         looks: How many of the unknowns that the views share are of lens and board; they come first.
-        boards: What the views show, where there are several boards.
+        boards: What the views show, where there are several boards; of a stop that shows several,
+            one of them.
 
     Returns:
         The answer with its covariance.
@@ -125,9 +125,10 @@ def solve_hand_eye(
             f"hand-eye: the joint fit of {len(data)} views does not come to rest.",
             next_step="Take another solver with --solver, and look at the worst views.",
         )
-    solutions = {"joint": _solution(data, fit.edges)} if solver == "joint" else {}
+    solutions = {"joint": _solution(data, fit.edges, boards)} if solver == "joint" else {}
     solutions |= {
-        name: _solution(data, Edges(it.x, it.z, data.unchanged)) for name, it in closed.items()
+        name: _solution(data, Edges(it.x, it.z, data.unchanged), boards)
+        for name, it in closed.items()
     }
     worst = directions(spread, fit.edges, data.mount, boards)
     return HandEyeResult(fit.edges, spread, fit.noise, solutions, worst, shift)
@@ -141,8 +142,9 @@ def refit(data: Closure, result: HandEyeResult, solver: SolverName) -> Edges:
     return Edges(again.x, again.z, data.unchanged)
 
 
-def _solution(data: Closure, edges: Edges) -> Solution:
-    away_m, away_rad = deviations(data.under(edges.shared).placed(edges.x))
+def _solution(data: Closure, edges: Edges, boards: Boards) -> Solution:
+    placed = data.under(edges.shared).placed(edges.x)
+    away_m, away_rad = boards.deviations(placed, edges.shared)
     return Solution(
         edges.x,
         edges.z,
