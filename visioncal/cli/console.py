@@ -92,7 +92,9 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     held = calibration.validation.held_out
     console.print(
         f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
-        f"{held.mm:.2g} mm, {held.deg:.2g} deg" + (f", {held.px:.2g} px" if held.px else "")
+        f"{held.mm:.2g} mm"
+        + ("" if held.deg is None else f", {held.deg:.2g} deg")
+        + (f", {held.px:.2g} px" if held.px else "")
     )
     for view in calibration.views:
         if not view.used:
@@ -110,5 +112,6 @@ def _solver_table(calibration: Calibration) -> Table:
             for it, edge in calibration.edges.items()
         ]
         cells = [f"{mm:.3f} mm, {deg:.4f} deg" for mm, deg in away]
-        table.add_row(name, f"{result.rms_mm:.3f}", f"{result.rms_deg:.4f}", *cells)
+        deg = "" if result.rms_deg is None else f"{result.rms_deg:.4f}"
+        table.add_row(name, f"{result.rms_mm:.3f}", deg, *cells)
     return table

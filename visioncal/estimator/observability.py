@@ -49,9 +49,16 @@ class Direction:
 
 def edge_names(mount: Mount) -> tuple[str, str]:
     """Names of the two unknown edges, in the order x, z."""
+    if mount == "instrument":
+        return "base_from_instrument", "flange_from_probe"
     if mount == "eye-in-hand":
         return "flange_from_cam", "base_from_target"
     return "base_from_cam", "flange_from_target"
+
+
+def title(mount: Mount) -> str:
+    """What messages about both edges begin with."""
+    return "instrument" if mount == "instrument" else "hand-eye"
 
 
 def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 0) -> None:
@@ -77,15 +84,17 @@ def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 
         culprit = _null_direction(spread, edges, data.mount)
         verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
-            f"hand-eye: {culprit} {verb} not determined at all (information ratio "
+            f"{title(data.mount)}: {culprit} {verb} not determined at all (information ratio "
             f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data)}.",
             culprits=[culprit],
             next_step=_advice(data.mount),
         )
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
-    _refuse(worst_directions(held, still, plausible), _motion(data), _advice(data.mount))
+    worst = worst_directions(held, still, plausible)
+    _refuse(data.mount, worst, _motion(data), _advice(data.mount))
     if looks:
         _refuse(
+            data.mount,
             worst_directions(
                 data.with_first(looks), replace(edges, shared=edges.shared[:looks]), plausible
             ),
@@ -95,11 +104,12 @@ def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 
         )
 
 
-def _refuse(worst: Sequence[Direction], cause: str, next_step: str) -> None:
+def _refuse(mount: Mount, worst: Sequence[Direction], cause: str, next_step: str) -> None:
     beyond = [it for it in worst if it.sigma > it.limit]
     if beyond:
         raise DegenerateError(
-            f"hand-eye: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: {cause}.",
+            f"{title(mount)}: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
+            f"{cause}.",
             culprits=[it.words for it in beyond],
             next_step=next_step,
         )
@@ -142,7 +152,7 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     """
     if len(data) >= FEWEST_VIEWS:
         return
-    culprit = f"the camera's offset from the {_frame(data.mount)}"
+    culprit = f"the {_names(0, data.mount)[0]}'s offset from the {_frame(data.mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
     if len(data) == 2:
         culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data)))}"
@@ -151,8 +161,8 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     if len(data) == 1 < views:
         stops = f"all {views} used views are from one pose of the robot"
     raise DegenerateError(
-        f"hand-eye: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not determined: "
-        f"{cause}.",
+        f"{title(data.mount)}: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not "
+        f"determined: {cause}.",
         culprits=[culprit],
         next_step=_advice(data.mount),
     )
@@ -198,8 +208,11 @@ def _words(edge: int, direction: FloatArray, mount: Mount, is_rotation: bool) ->
 def _names(edge: int, mount: Mount) -> tuple[str, str]:
     """What an edge places, and the frame that it hangs on."""
     if edge == 0:
-        return "camera", _frame(mount)
-    return "target", "base" if mount == "eye-in-hand" else "tool"
+        return "instrument" if mount == "instrument" else "camera", _frame(mount)
+    return (
+        "probe" if mount == "instrument" else "target",
+        "base" if mount == "eye-in-hand" else "tool",
+    )
 
 
 def axis_words(direction: FloatArray) -> str:

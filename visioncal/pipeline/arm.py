@@ -66,7 +66,7 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
 
 
 def _level(level: Level) -> dict[str, Any]:
-    return {
+    figures = {
         "level": level.name,
         "unknowns": level.unknowns,
         "rms_mm": level.inside.mm,
@@ -75,6 +75,7 @@ def _level(level: Level) -> dict[str, Any]:
         "held_out_deg": level.left_out.deg,
         "likelihood_ratio": level.likelihood_ratio,
     }
+    return {name: it for name, it in figures.items() if it is not None}
 
 
 def _observability(telling: Telling) -> dict[str, Any]:

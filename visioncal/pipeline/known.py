@@ -21,6 +21,7 @@ from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
@@ -44,6 +45,7 @@ class Known:
         corners: What was found of the target, by view.
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
+        readings: What an instrument read, where that is all that was observed.
         poses: The target's pose by view; several candidates until they are chosen from.
         pixel_px: Noise of a corner's coordinate [px].
         used: The views in the fit, in the session's order.
@@ -75,6 +77,7 @@ class Known:
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
+    readings: Readings | None = None
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     pixel_px: float | None = None
     used: tuple[int, ...] = ()
@@ -166,7 +169,9 @@ class Known:
             robot_part(robot, mount),
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
         )
-        if poses and all(pose.corners is not None for pose in poses):
+        if self.readings is not None and poses:
+            data = self.readings.told_to(data, poses)
+        elif poses and all(pose.corners is not None for pose in poses):
             shift = [pose.by_shared[0] for pose in poses]
             data = replace(
                 data,
@@ -190,6 +195,13 @@ class Known:
         count = 0 if self.robot is None else self.robot.joint_count
         return np.array([joints[view] for view in views]).reshape(len(views), count)
 
+    def with_readings(self, readings: Readings) -> Self:
+        """Takes over an instrument's readings, and makes their poses by the present arm."""
+        views = [view for view in readings.read_m if view in self.base_from_flange]
+        flange = dict(zip(views, self.flange_poses(views), strict=True))
+        known = replace(self, readings=readings, poses=readings.poses(flange))
+        return known.noting(readings.rejections)
+
     def with_arm_errors(self) -> Self:
         """Takes the errors of the arm's model for those that are estimated."""
         if self.arm_model is None or self.kinematics is None:
@@ -198,6 +210,11 @@ class Known:
         gain = sum(it.gain for it in self.kinematics.errors.values())
         errors = ArmErrors(self.arm_basis(self.used), first.sigma, gain, of_links=True)
         return replace(self, arm=errors)
+
+    @property
+    def arm_size(self) -> int:
+        """How many values the arm's errors have; they come last of what the views share."""
+        return 0 if self.arm_model is None else len(self.arm_model.values)
 
     @property
     def arm_values(self) -> FloatArray | None:
@@ -282,10 +299,10 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
 
 
 def rms_of(away_m: FloatArray, away_rad: FloatArray, rms_px: FloatArray) -> Rms:
-    """Root mean squares over views [m, rad, px]; views without corners have NaN pixels."""
-    seen = rms_px[np.isfinite(rms_px)]
+    """Root mean squares over views [m, rad, px]; what a view does not tell is NaN."""
+    turns_rad, seen = (it[np.isfinite(it)] for it in (away_rad, rms_px))
     return Rms(
         mm=float(1e3 * np.sqrt(np.mean(away_m**2))),
-        deg=float(np.rad2deg(np.sqrt(np.mean(away_rad**2)))),
+        deg=float(np.rad2deg(np.sqrt(np.mean(turns_rad**2)))) if len(turns_rad) else None,
         px=float(np.sqrt(np.mean(seen**2))) if len(seen) else None,
     )

@@ -151,7 +151,7 @@ def result_of(known: Known) -> Calibration:
             name: SolverResult(
                 {x_name: it.x, z_name: it.z},
                 1e3 * it.rms_m,
-                float(np.rad2deg(it.rms_rad)),
+                None if it.rms_rad is None else float(np.rad2deg(it.rms_rad)),
             )
             for name, it in result.solutions.items()
         },

@@ -12,7 +12,7 @@ from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import mean_transform
 from visioncal.types import Corners, FloatArray
 
-_NO_POSE = "no pose of the target: it has neither image nor cft_ columns"
+_NO_POSE = "no pose of the target: it has neither image nor cft_ nor meas_ columns"
 
 
 def view_results(known: Known) -> tuple[ViewResult, ...]:
@@ -29,7 +29,9 @@ def view_results(known: Known) -> tuple[ViewResult, ...]:
                 result,
                 rms_px=float(rms_px[index]) if np.isfinite(rms_px[index]) else None,
                 residual_mm=float(1e3 * away_m[index]),
-                residual_deg=float(np.rad2deg(away_rad[index])),
+                residual_deg=(
+                    float(np.rad2deg(away_rad[index])) if np.isfinite(away_rad[index]) else None
+                ),
             )
         results.append(result)
     return tuple(results)
@@ -62,7 +64,8 @@ def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, 
     edges, data = known.solved.edges, known.closure(views)
     centre = mean_transform(known.closure(known.used).under(edges.shared).placed(edges.x))
     rms_px = chain_rms_px(data, edges, known.seen(views), known.free)
-    return (*distances(data.under(edges.shared).placed(edges.x), centre), rms_px)
+    away_m, away_rad = distances(data.under(edges.shared).placed(edges.x), centre)
+    return away_m, away_rad if data.guess is None else np.full(len(data), np.nan), rms_px
 
 
 def _reason(known: Known, view: int) -> str:

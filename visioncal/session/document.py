@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean
-from visioncal.types import CameraKind, Mount
+from visioncal.types import CameraKind, CameraMount
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 # Nobody knows a focal length better than the least of these, or worse than the largest [px].
@@ -45,7 +45,7 @@ class RobotTable(_TableModel):
 
 
 class InstrumentTable(_TableModel):
-    """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]."""
+    """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]; see `instruments`."""
 
     name: str = "instrument"
     sigma_m: NotNegative | None = None
@@ -73,7 +73,7 @@ class Declaration(_TableModel):
 
     schema_version: Literal[1] = Field(alias="schema")
     name: str
-    mount: Mount
+    mount: CameraMount | None = None
     target: str | None = None
     camera: CameraTable | None = None
     robot: RobotTable | None = None
@@ -164,6 +164,8 @@ _MISSING = {
 def _contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
     """Finds fields that are well typed but do not fit together: (dotted path, words)."""
     camera = declaration.camera
+    if declaration.mount is None and (declaration.instrument is None or camera is not None):
+        yield "mount", "is missing" + _MISSING["mount"]
     if camera is not None:
         yield from _camera_contradictions(camera)
     for edge, prior in declaration.prior.items():

@@ -9,7 +9,7 @@ from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.consensus import agreeing_views, whole_units
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.figures import figure
-from visioncal.types import IntArray, Mask, Rejection
+from visioncal.types import IntArray, Mask, Mount, Rejection
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,29 +48,30 @@ def agree(
         found = agreeing_views(data.merged(units), thought)
     mask, edges = found.agrees[units], found.fit.edges
     away_m, away_rad = distances(data.under(edges.shared).placed(edges.x), edges.z)
-    surprise = np.sqrt(found.surprise[units] / 6.0)
-    limit = float(np.sqrt(found.limit / 6.0))
-    return Agreed(
-        mask,
-        edges,
-        tuple(
+    told = data.merged(units).told
+    surprise, limit = (np.sqrt(it / told)[units] for it in (found.surprise, found.limit))
+    seen = "target" if data.mount != "instrument" else "probe" if data.guess is None else "point"
+    rejections = []
+    for at in np.flatnonzero(~mask).tolist():
+        turned = "" if data.guess is not None else f" and {figure(np.rad2deg(away_rad[at]))} deg"
+        rejections.append(
             Rejection(
                 views[at],
-                f"disagrees with the other views: it places the target {figure(1e3 * away_m[at])} "
-                f"mm and {figure(np.rad2deg(away_rad[at]))} deg away, {figure(surprise[at])} times "
-                f"the noise (limit {figure(limit)}); {_cause(views, (stops == stops[at]) & mask)}",
+                f"disagrees with the other views: it places the {seen} {figure(1e3 * away_m[at])} "
+                f"mm{turned} away, {figure(surprise[at])} times the noise (limit "
+                f"{figure(limit[at])}); {_cause(views, (stops == stops[at]) & mask, data.mount)}",
             )
-            for at in np.flatnonzero(~mask).tolist()
-        ),
-    )
+        )
+    return Agreed(mask, edges, tuple(rejections))
 
 
-def _cause(views: Sequence[int], agreeing_mates: Mask) -> str:
+def _cause(views: Sequence[int], agreeing_mates: Mask, mount: Mount) -> str:
     """What is wrong with a view, by the views of its stop that agree with all others."""
+    observed = "reading" if mount == "instrument" else "image"
     mates = np.flatnonzero(agreeing_mates)
     if len(mates):
         return (
-            f"view {views[mates[0]]} of the same stop agrees: the image is wrong, or something "
-            "moved in between"
+            f"view {views[mates[0]]} of the same stop agrees: the {observed} is wrong, or "
+            "something moved in between"
         )
-    return "its pose or its image is wrong, or something had moved"
+    return f"its pose or its {observed} is wrong, or something had moved"
