@@ -85,8 +85,8 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     for name, edge in calibration.edges.items():
         x, y, z = 1e3 * edge.transform.translation
         console.print(
-            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm and "
-            f"{edge.sigma_deg:.2g} deg"
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm"
+            + (f" and {edge.sigma_deg:.2g} deg" if edge.oriented else ", its rotation not measured")
         )
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out

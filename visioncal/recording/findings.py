@@ -17,6 +17,7 @@ _BEND = "bow_"
 # What each source of uncertainty is, for people.
 SOURCES = {
     "pixels": "noise of the corners",
+    "instrument": "the instrument's readings",
     "robot": "the robot, from stop to stop",
     "poses": "noise of the poses",
     "intrinsics": "what is open about the lens",

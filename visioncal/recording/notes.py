@@ -91,7 +91,10 @@ def verdict_markdown(calibration: Calibration) -> str:
         "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
         "|---|---|---|---|",
     ]
-    lines += [f"| {plain(name)} {edge_line(it)}" for name, it in calibration.edges.items()]
+    lines += [
+        f"| {plain(name)} {edge_line(it, oriented=it.oriented)}"
+        for name, it in calibration.edges.items()
+    ]
     lines += [
         f"| {plain(name)} {edge_line(it.edge, oriented=it.oriented)}"
         for name, it in calibration.frames.items()

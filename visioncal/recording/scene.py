@@ -91,8 +91,8 @@ class Scene:
         if self.calibration is None:
             self._log_stops(stream)
             return
-        self._log_axes(stream, paths.CAMERA, paths.CAM_FRAME, 0.7)
-        self._log_axes(stream, paths.TARGET, paths.TARGET_FRAME, 0.7)
+        for end in self._ends:
+            self._log_axes(stream, paths.entity_of(end), end, 0.7)
         if self.calibration.camera is not None:
             self._log_frustum(stream, self.calibration.camera.camera)
         if self.session.target is not None:
@@ -117,17 +117,22 @@ class Scene:
         self._log_arm(stream, view)
         if self.calibration is None:
             return
-        base_from_cam = self._base_from("cam", base_from_flange)
-        base_from_target = self._base_from("target", base_from_flange)
-        _log_pose(stream, paths.CAMERA, paths.CAM_FRAME, base_from_cam)
-        _log_pose(stream, paths.TARGET, paths.TARGET_FRAME, base_from_target)
-        self._log_seen_target(stream, base_from_cam, seen)
+        for end in self._ends:
+            base_from_end = self._base_from(end, base_from_flange)
+            _log_pose(stream, paths.entity_of(end), end, base_from_end)
+        self._log_seen_target(stream, self._base_from("cam", base_from_flange), seen)
         if self.uncertainty is not None:
             self.uncertainty.log_view(stream, view.number)
         if self.charts is not None:
             self.charts.log_view(stream, view.number)
         if self.arm is not None:
             self.arm.log_view(stream, view.number)
+
+    @property
+    def _ends(self) -> list[str]:
+        """The frames that the calibration places: camera and target, or instrument and probe."""
+        edges = {} if self.calibration is None else self.calibration.edges
+        return [name.rpartition("_from_")[2] for name in edges]
 
     def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
         """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""

@@ -34,6 +34,7 @@ class Uncertainty:
     Attributes:
         edges: The edges that have a covariance, by name; tools and fixtures among them.
         scatter_m: By view, how far from the mean it puts the target: (3,) in the target's frame.
+        target: The frame whose placements these are.
         used: The views that the fit used.
         factor: How many times larger than it is everything is drawn.
         size_m: The cell's size [m].
@@ -41,6 +42,7 @@ class Uncertainty:
 
     edges: Mapping[str, Edge]
     scatter_m: Mapping[int, FloatArray]
+    target: str
     used: frozenset[int]
     factor: int
     size_m: float
@@ -56,7 +58,8 @@ class Uncertainty:
         sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
         factor = round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
-        return cls(edges, scatter_m, used, factor, size_m)
+        target = list(calibration.edges)[1].rpartition("_from_")[2]
+        return cls(edges, scatter_m, target, used, factor, size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Draws the ellipsoids, and all views' placements of the target."""
@@ -83,7 +86,7 @@ class Uncertainty:
             line_radii=_LINE * self.size_m,
         )
         stream.log(entity, frame, ellipsoid, static=True)
-        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME):
+        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME, self.target):
             # All are drawn alike, and tools are close to the camera: more labels would hide them.
             return
         # Above the camera and beside the board, clear of the name of the frame.
@@ -115,8 +118,12 @@ class Uncertainty:
         )
         larger = 1.5 if name == paths.THIS_VIEW else 1.0
         points = rr.Points3D(positions_m, colors=colour, radii=larger * _POINT * self.size_m)
-        entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{name}"
-        stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), points, static=static)
+        entity = f"{self._placements}/{name}"
+        stream.log(entity, rr.CoordinateFrame(self.target), points, static=static)
+
+    @property
+    def _placements(self) -> str:
+        return f"{paths.entity_of(self.target)}/placements_magnified_{self.factor}x"
 
     def _log_beyond(self, stream: rr.RecordingStream) -> None:
         """Arrows towards the placements that lie too far out to be drawn."""
@@ -129,8 +136,8 @@ class Uncertainty:
                 colors=colours.REJECTED,
                 radii=_LINE * self.size_m,
             )
-            entity = f"{paths.TARGET}/placements_magnified_{self.factor}x/{paths.BEYOND}"
-            stream.log(entity, rr.CoordinateFrame(paths.TARGET_FRAME), arrows, static=True)
+            entity = f"{self._placements}/{paths.BEYOND}"
+            stream.log(entity, rr.CoordinateFrame(self.target), arrows, static=True)
 
     def _within_reach(self, drawn_m: FloatArray) -> FloatArray:
         reach_m = _REACH * self.size_m
@@ -163,12 +170,11 @@ def _placed(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
     """(4, 4) the target as this view alone puts it, in the frame that carries it."""
     if seen.base_from_flange is None or seen.cam_from_target is None:
         return None
-    edges = calibration.transforms
-    if "flange_from_cam" in edges:
-        flange_from_cam = edges["flange_from_cam"].as_matrix()
-        return np.asarray(seen.base_from_flange @ flange_from_cam @ seen.cam_from_target)
-    base_from_cam = edges["base_from_cam"].as_matrix()
-    return np.asarray(invert(seen.base_from_flange) @ base_from_cam @ seen.cam_from_target)
+    # The camera's edge, or the instrument's, is the first.
+    edge = next(iter(calibration.edges.values())).transform.as_matrix()
+    in_hand = calibration.mount == "eye-in-hand"
+    robot = seen.base_from_flange if in_hand else invert(seen.base_from_flange)
+    return np.asarray(robot @ edge @ seen.cam_from_target)
 
 
 def round_factor(wanted_m: float, size_m: float) -> int:

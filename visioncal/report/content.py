@@ -118,7 +118,9 @@ def readable_time(created: str) -> str:
 
 def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
     """The estimated transforms, the wanted one first."""
-    return tuple(edge_card(name, edge) for name, edge in calibration.edges.items())
+    return tuple(
+        edge_card(name, edge, oriented=edge.oriented) for name, edge in calibration.edges.items()
+    )
 
 
 def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:

@@ -75,7 +75,9 @@ def diagnose(
             rest = fit_closure(data, edges)
             alike = neighbours(data, rest.edges, rest.noise)
             moved = drift(data, rest.edges, rest.noise)
-        parts = covariance_by_source(data, edges, noise, _owners(free, arm))
+        seen = "instrument" if data.mount == "instrument" else "pixels"
+        owners = _owners(free, arm, len(edges.shared))
+        parts = covariance_by_source(data, edges, noise, owners, seen)
         if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
         if result.held.any():
@@ -100,17 +102,20 @@ def diagnose(
     )
 
 
-def _owners(free: Free | None, arm: ArmErrors | None) -> dict[str, IntArray]:
-    """Which of the unknowns that all views share are whose."""
+def _owners(free: Free | None, arm: ArmErrors | None, shared: int) -> dict[str, IntArray]:
+    """Which of the unknowns that all views share are whose; the arm's come last."""
     owners: dict[str, IntArray] = {}
-    looks = 0 if free is None else len(free.columns)
+    errors = 0 if arm is None or not arm.is_estimated else arm.basis.shape[2]
+    if free is None and shared > errors:
+        # Places of points, of which an instrument's readings of one stop tell by themselves.
+        owners["instrument"] = np.arange(shared - errors)
     if free is not None:
         is_lens = free.columns < free.lens_count
         for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
             if mask.any():
                 owners[name] = np.flatnonzero(mask)
     if arm is not None and arm.is_estimated:
-        owners["arm"] = looks + np.arange(arm.basis.shape[2])
+        owners["arm"] = np.arange(shared - errors, shared)
     return owners
 
 
