@@ -48,7 +48,9 @@ def readings_session(
         stop, point = divmod(view, len(points))
         role = "holdout" if stop in held else ""
         numbers = (*row, *joints[stop])
-        cells.append([str(view), str(stop), role, points[point], *(repr(float(it)) for it in numbers)])
+        cells.append(
+            [str(view), str(stop), role, points[point], *(repr(float(it)) for it in numbers)]
+        )
     document = {
         "schema": 1,
         "name": name,
