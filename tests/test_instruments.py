@@ -276,7 +276,7 @@ def test_motion_that_tells_too_little_is_refused():
     # Joint 1 alone: the point goes round in a circle.
     turning = np.repeat(shop.joints[:1], 12, axis=0)
     turning[:, 0] = np.linspace(-1.5, 1.5, 12)
-    with pytest.raises(DegenerateError, match=r"is not determined at all.*about the base's z"):
+    with pytest.raises(DegenerateError, match=r"are not determined at all.*about the base's z"):
         known_of(session_of(tracked(POINT, joints=turning)))
     with pytest.raises(DataError, match="needs poses, and the instrument reads places alone"):
         known_of(session_of(shop), solver="tsai")

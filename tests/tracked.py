@@ -3,7 +3,9 @@
 Written with the simulation's own kinematics, so that the estimator is not judged with its own.
 """
 
+import tomllib
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,7 @@ class Tracked:
     """What a session is drawn from.
 
     Attributes:
-        robot: A UR's name.
+        robot: Its name.
         stops: How many.
         points: Places of the points on the flange [m]; one alone where poses are read.
         poses: Whether the first point is a probe whose rotation is read, too.
@@ -49,6 +51,7 @@ class Tracked:
     seed: int = 0
 
 
+ROBOTS = Path(__file__).parents[1] / "visioncal" / "robots"
 THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
 
 
@@ -77,7 +80,7 @@ class Shop:
 
 def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     rng = np.random.default_rng([7, options.seed])
-    arm = ur_arm(options.robot)
+    arm = arm_of(options.robot)
     errors = ArmErrors(options.dh_sigma_m, options.dh_sigma_rad, options.dh_sigma_rad)
     true_arm = disturb(arm, errors, rng)
     x = compose(exp(np.array([[0.1, -0.2, 2.5, 0, 0, 0]]))[0, :3, :3], np.array([2.5, -1.0, 0.4]))
@@ -96,6 +99,18 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
             place_read = true[:3, 3] + options.sigma_m * rng.normal(size=3)
             rows.append((stop, point, compose(true[:3, :3] @ turned, place_read)))
     return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
+
+
+def arm_of(name: str) -> Arm:
+    """A UR, or another arm by its standard table."""
+    if name.startswith("ur"):
+        return ur_arm(name)
+    rows = tomllib.loads((ROBOTS / f"{name}.toml").read_text(encoding="utf-8"))["joint"]
+    a, d, alpha, offset = (
+        np.array([row.get(key, 0.0) for row in rows])
+        for key in ("a_m", "d_m", "alpha_rad", "theta_offset_rad")
+    )
+    return Arm(name=name, a=a, d=d, alpha=alpha, beta=np.zeros(len(a)), offset=offset)
 
 
 def above(arm: Arm, stops: int, rng: np.random.Generator) -> FloatArray:
