@@ -20,6 +20,18 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
+# What is wrong where unknowns that all views share are not told, and what to do.
+_UNTOLD = {
+    "camera": (
+        "the views do not determine lens and board well enough",
+        "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
+        "views tilted by 30 to 45 degrees.",
+    ),
+    "instrument": (
+        "the readings do not determine where the points sit on the flange",
+        "Add 3 or more stops in which the flange is tilted about different axes.",
+    ),
+}
 # A null direction moves a part of an edge if it moves it by this much, of a length of one.
 _PART_OF_NULL = 0.05
 
@@ -98,9 +110,7 @@ def check_observability(data: Closure, edges: Edges, noise: Noise, looks: int = 
             worst_directions(
                 data.with_first(looks), replace(edges, shared=edges.shared[:looks]), plausible
             ),
-            "the views do not determine lens and board well enough",
-            "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
-            "views tilted by 30 to 45 degrees.",
+            *_UNTOLD["instrument" if data.mount == "instrument" else "camera"],
         )
 
 

@@ -223,10 +223,13 @@ class Known:
 
     @property
     def estimated_looks(self) -> int:
-        """How many unknowns of lens and board the views share, where they have to tell the lens.
+        """How many unknowns the views share that they have to tell.
 
-        They come before the arm's.
+        Those of lens and board where the lens was estimated, or the places of further points on the
+        flange. They come before the arm's.
         """
+        if self.readings is not None and not self.readings.are_poses:
+            return 3 * (len(self.readings.names) - 1)
         told = self.camera is not None and self.camera.estimated
         return 0 if self.free is None or not told else len(self.free.columns)
 
