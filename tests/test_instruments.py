@@ -192,6 +192,22 @@ def test_exchanged_points_are_named():
     assert known.kinematics.level == "geometry"
 
 
+@pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])
+def test_an_instrument_that_sinks_is_told(options):
+    shop = tracked(options)
+    rows = []
+    for stop, point, read in shop.rows:
+        sunk = read.copy()
+        sunk[2, 3] -= 5e-4 * stop / 29
+        rows.append((stop, point, sunk))
+    known = known_of(session_of(replace(shop, rows=tuple(rows))), level="hand-eye")
+    told = [it for it in known.warnings if "drift with time" in it]
+    assert len(told) == 1
+    moved = float(told[0].split("moved by ")[1].split(" mm")[0])
+    # Told to some 15 %: the arm repeats to 0.03 mm.
+    assert moved == pytest.approx(0.5, rel=0.5)
+
+
 def test_views_that_are_held_back_are_predicted():
     shop = tracked(replace(POINTS, **WRONG, stops=36))
     session = session_of(shop)
