@@ -301,8 +301,9 @@ class Known:
             ],
             dtype=np.int64,
         )
-        measured = any(self.poses[view].corners is None for view in views)
-        return self.shown(views).units(stops) if measured and len(self.boards) > 1 else stops
+        if len(self.boards) < 2 or all(self.poses[view].corners is not None for view in views):
+            return stops
+        return self.shown(views).units(stops)
 
     def seen(self, views: Sequence[int]) -> list[Corners | None]:
         """The corners of some views that their poses were made from."""
