@@ -23,6 +23,7 @@ LAYERS = (
     ("documents",),
     ("camera",),
     ("robot",),
+    ("instruments",),
     ("targets",),
     ("printing",),
     ("finders",),

@@ -105,7 +105,7 @@ def test_views_held_back_may_be_ambiguous(solver):
     told = session_of(cell)
     views = tuple(replace(it, holdout=it.number % 4 == 0) for it in told.views)
     plain = known_of(cell, session=replace(told, views=views), solver=solver)
-    for stage in STAGES[2:4]:
+    for stage in (it for it in STAGES if it.name in ("intrinsics", "pnp")):
         plain = stage.run(plain)
     held = range(0, 20, 4)
     assert any(len(plain.poses[it].cam_from_target) > 1 for it in held)

@@ -287,24 +287,30 @@ def _findings(
 _CAMERA_MOVED = {
     "eye-in-hand": "The camera moved on the flange, or the controller's tool frame was redefined",
     "eye-to-hand": "The camera moved in the cell, or the controller's base frame was redefined",
+    "instrument": "The instrument was set up elsewhere, or the controller's base frame was "
+    "redefined",
 }
 _BOARD_MOVED = {
     "eye-in-hand": "The board was moved in the cell, or the controller's base frame was redefined",
     "eye-to-hand": "The board was moved on the flange, or the controller's tool frame was "
     "redefined",
+    "instrument": "The probe was moved on the flange, or the controller's tool frame was redefined",
 }
 
 
 def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
     """Says which of the two bodies moved; an edge is told by the body at its end."""
-    camera = any(name.rpartition("_from_")[2].startswith("cam") for name in changed)
-    board = any(name.rpartition("_from_")[2].startswith("target") for name in changed)
+    ends = [name.rpartition("_from_")[2] for name in changed]
+    camera = any(it.startswith(("cam", "instrument")) for it in ends)
+    board = any(it.startswith(("target", "probe")) for it in ends)
+    sensor, seen = ("instrument", "probe") if mount == "instrument" else ("camera", "board")
     if camera and board:
-        return f"Camera and board both moved. {_CAMERA_MOVED[mount]}. {_BOARD_MOVED[mount]}."
+        both = f"{sensor.capitalize()} and {seen} both moved."
+        return f"{both} {_CAMERA_MOVED[mount]}. {_BOARD_MOVED[mount]}."
     if camera:
-        return f"{_CAMERA_MOVED[mount]}; the board did not: use the second calibration."
+        return f"{_CAMERA_MOVED[mount]}; the {seen} did not: use the second calibration."
     if board:
-        return f"{_BOARD_MOVED[mount]}; the camera did not: its calibration still holds."
+        return f"{_BOARD_MOVED[mount]}; the {sensor} did not: its calibration still holds."
     return "No transform changed: noise explains what differs."
 
 

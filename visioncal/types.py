@@ -12,8 +12,11 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 Image: TypeAlias = npt.NDArray[np.uint8]
 
-Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
-MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
+CameraMount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
+MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
+# What observes whom: a camera on the flange, one that stands still, or a measuring instrument that
+# stands still and reads a probe or points on the flange.
+Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
 TargetKind: TypeAlias = Literal["charuco", "checkerboard", "marker"]
 

@@ -69,7 +69,7 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
 
 def _solver_document(result: SolverResult) -> dict[str, Any]:
     poses = {name: pose_document(pose) for name, pose in result.matrices.items()}
-    return poses | {"rms_mm": result.rms_mm, "rms_deg": result.rms_deg}
+    return poses | present({"rms_mm": result.rms_mm, "rms_deg": result.rms_deg})
 
 
 def _camera_document(result: CameraResult) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _solver(document: Mapping[str, Any]) -> SolverResult:
     poses = {name: read_pose(it) for name, it in document.items() if isinstance(it, Mapping)}
-    return SolverResult(poses, document["rms_mm"], document["rms_deg"])
+    return SolverResult(poses, document["rms_mm"], document.get("rms_deg"))
 
 
 def _camera(document: Mapping[str, Any]) -> CameraResult:

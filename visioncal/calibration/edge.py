@@ -28,6 +28,11 @@ class Edge:
         return RigidTransform.from_matrix(self.matrix)
 
     @property
+    def oriented(self) -> bool:
+        """Whether its rotation was measured; else it is chosen, and has no covariance."""
+        return bool(self.covariance[:3, :3].any())
+
+    @property
     def sigma_mm(self) -> float:
         """Root of the trace of the translation's covariance [mm]."""
         return float(1e3 * np.sqrt(np.trace(self.covariance[3:, 3:])))

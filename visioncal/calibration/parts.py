@@ -18,12 +18,13 @@ class SolverResult:
     Attributes:
         matrices: (4, 4) both edges by name.
         rms_mm: Scatter of the target's position over the used views [mm].
-        rms_deg: Scatter of the target's orientation over the used views [deg].
+        rms_deg: Scatter of the target's orientation over the used views [deg]; None where places
+            alone were read.
     """
 
     matrices: Mapping[str, FloatArray]
     rms_mm: float
-    rms_deg: float
+    rms_deg: float | None = None
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:
@@ -74,10 +75,13 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class Rms:
-    """Root mean square residuals; `px` is None where no image was used."""
+    """Root mean square residuals.
+
+    `deg` is None where an instrument read places alone, `px` where no image was used.
+    """
 
     mm: float
-    deg: float
+    deg: float | None = None
     px: float | None = None
 
 

@@ -65,7 +65,7 @@ class Calibration:
     camera: CameraResult | None = None
     robot: Robot | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
-    stages: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    stages: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:

@@ -85,14 +85,16 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     for name, edge in calibration.edges.items():
         x, y, z = 1e3 * edge.transform.translation
         console.print(
-            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm and "
-            f"{edge.sigma_deg:.2g} deg"
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm"
+            + (f" and {edge.sigma_deg:.2g} deg" if edge.oriented else ", its rotation not measured")
         )
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
     console.print(
         f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
-        f"{held.mm:.2g} mm, {held.deg:.2g} deg" + (f", {held.px:.2g} px" if held.px else "")
+        f"{held.mm:.2g} mm"
+        + ("" if held.deg is None else f", {held.deg:.2g} deg")
+        + (f", {held.px:.2g} px" if held.px else "")
     )
     for view in calibration.views:
         if not view.used:
@@ -110,5 +112,6 @@ def _solver_table(calibration: Calibration) -> Table:
             for it, edge in calibration.edges.items()
         ]
         cells = [f"{mm:.3f} mm, {deg:.4f} deg" for mm, deg in away]
-        table.add_row(name, f"{result.rms_mm:.3f}", f"{result.rms_deg:.4f}", *cells)
+        deg = "" if result.rms_deg is None else f"{result.rms_deg:.4f}"
+        table.add_row(name, f"{result.rms_mm:.3f}", deg, *cells)
     return table

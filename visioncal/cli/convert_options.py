@@ -7,7 +7,7 @@ import typer
 
 from visioncal.errors import DataError
 from visioncal.formats import FOREIGN_FORMATS
-from visioncal.types import Mount
+from visioncal.types import CameraMount
 
 _POSES = "The poses of somebody else's recording"
 _CAMERA = "Its camera"
@@ -35,7 +35,7 @@ Form: TypeAlias = Annotated[
     str | None, _option("--from", panel=_OTHER, words=f"Its format, by name: {_FORMATS}.")
 ]
 MountOption: TypeAlias = Annotated[
-    Mount | None, _option("--mount", panel=_OTHER, words="Where the camera is.")
+    CameraMount | None, _option("--mount", panel=_OTHER, words="Where the camera is.")
 ]
 Target: TypeAlias = Annotated[
     str | None,

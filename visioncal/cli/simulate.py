@@ -17,7 +17,7 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
-from visioncal.types import Mount
+from visioncal.types import CameraMount
 
 _CAMERAS = {"wide": wide_camera, "fine": fine_camera, "fisheye": fisheye_camera}
 _BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
@@ -25,7 +25,7 @@ _BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
 
 def simulate_command(
     folder: Annotated[Path, typer.Argument(help="Where to write the session.")],
-    mount: Annotated[Mount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
+    mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
     views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20,
     robot: Annotated[str, typer.Option(help="ur3e, ur5e or ur10e.")] = "ur10e",
     camera: Annotated[

@@ -11,7 +11,11 @@ from visioncal.types import FloatArray, IntArray
 
 
 def covariance_by_source(
-    data: Closure, edges: Edges, noise: Noise, shared: Mapping[str, IntArray]
+    data: Closure,
+    edges: Edges,
+    noise: Noise,
+    shared: Mapping[str, IntArray],
+    seen: str = "pixels",
 ) -> dict[str, FloatArray]:
     """Splits the covariance of the joint fit into the parts that its sources contribute.
 
@@ -26,17 +30,18 @@ def covariance_by_source(
         noise: Of the flange, or of both together where the camera's is not known.
         shared: Which of the unknowns that the views share belong to which source, a new one or one
             of the others; those of no source count for nothing.
+        seen: What the noise of the camera's poses is called.
 
     Returns:
-        (12, 12) by source: `pixels`, `robot` (or `poses` for both together), and `shared`'s.
+        (12, 12) by source: `seen`, `robot` (or `poses` for both together), and `shared`'s.
     """
     fitted = covariance(closure_information(data, edges, noise))
     slopes, camera, robot = weighted_slopes(data, edges, noise)
-    parts = {}
+    parts: dict[str, FloatArray] = {}
     if data.camera_covariance is None:
         parts["poses"] = gram(slopes, robot @ slopes)
     else:
-        parts["pixels"] = gram(slopes, camera @ slopes)
+        parts[seen] = gram(slopes, camera @ slopes)
         parts["robot"] = gram(slopes, robot @ slopes)
     if data.shared is not None:
         owned = np.concatenate([*shared.values(), np.zeros(0, np.int64)])

@@ -10,6 +10,10 @@ The noise of a residual is that of the camera's pose, which is known from its co
 error of the flange, whose two levels are estimated (Strobl and Hirzinger 2006; Ulrich and Hillemann
 2021). Where nothing is known of the camera's poses, both are estimated as one.
 
+A measuring instrument that reads a probe on the flange is a camera that stands still, and the probe
+its target. Where it reads points alone, the chain's rotation is told by nothing but the points: the
+target's frame is then parallel to the flange by choice.
+
 Lens and board move all camera poses together. What is open about them are unknowns beside the
 edges, with the corners' information on them: to first order, and exactly where the poses were made
 with the same values, that is the bundle adjustment of corners, lens, board and edges in one.
@@ -42,6 +46,10 @@ from visioncal.types import FloatArray, IntArray, Mask, Mount
 
 _ROUNDS = 20
 _SETTLED = 1e-10
+# Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
+_CHOSEN = 1e12
+# Variances of a direction that a pose leaves open are above this [rad^2].
+_OPEN = 0.05
 # Noise levels are started from above: at least here [rad and m].
 _START_SIGMAS = np.array([5e-4, 5e-4])
 # Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
@@ -117,6 +125,8 @@ class Closure:
         camera: (m, 4, 4) `cam_from_target`.
         camera_covariance: (m, 6, 6) of the camera's right perturbations; None where unknown.
         shared: What moves all camera poses together; None where they are held.
+        guess: The edges near which rotations were supplied, where places are all that was measured;
+            None where the poses themselves were.
     """
 
     mount: Mount
@@ -124,6 +134,7 @@ class Closure:
     camera: FloatArray
     camera_covariance: FloatArray | None = None
     shared: Shared | None = None
+    guess: "Edges | None" = None
 
     def __len__(self) -> int:
         return len(self.robot)
@@ -136,13 +147,20 @@ class Closure:
     def subset(self, chosen: Mask) -> "Closure":
         """Returns the views of an (m,) mask."""
         known, shared = self.camera_covariance, self.shared
-        return Closure(
-            self.mount,
-            self.robot[chosen],
-            self.camera[chosen],
-            None if known is None else known[chosen],
-            None if shared is None else shared.subset(chosen),
+        return replace(
+            self,
+            robot=self.robot[chosen],
+            camera=self.camera[chosen],
+            camera_covariance=None if known is None else known[chosen],
+            shared=None if shared is None else shared.subset(chosen),
         )
+
+    @property
+    def told(self) -> IntArray:
+        """(m,) how many directions each view's pose tells: six, or fewer where places were read."""
+        if self.guess is None or self.camera_covariance is None:
+            return np.full(len(self), 6)
+        return np.asarray(np.sum(np.linalg.eigvalsh(self.camera_covariance) < _OPEN, axis=1))
 
     def with_more(self, more: Shared) -> "Closure":
         """Returns the views with more unknowns that they share, behind those that are there."""
@@ -207,12 +225,12 @@ def _joined(groups: Sequence[Closure]) -> Closure:
         arms.append(group.shared.by_flange[0])
         if known is not None and len(group) > 1:
             shared = shared.told(information, group.shared.by_camera - shift, away - mean)
-    return Closure(
-        groups[0].mount,
-        np.array(robot),
-        np.array(camera),
-        None if groups[0].camera_covariance is None else np.array(spreads),
-        None
+    return replace(
+        groups[0],
+        robot=np.array(robot),
+        camera=np.array(camera),
+        camera_covariance=None if groups[0].camera_covariance is None else np.array(spreads),
+        shared=None
         if shared is None
         else replace(shared, by_camera=np.array(shifts), by_flange=np.array(arms)),
     )
@@ -350,6 +368,7 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     """
     slopes, camera, robot = weighted_slopes(data, edges, noise)
     information = gram(slopes, (camera + robot) @ slopes)
+    information += _chosen(data, len(information))
     if data.shared is not None:
         information[12:, 12:] += data.shared.information
     return np.asarray(information)
@@ -439,13 +458,21 @@ def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
 
 
 def knowledge_of(data: Closure, edges: Edges) -> Knowledge:
-    """What is known of the unknowns without the robot: of what is shared alone."""
+    """What is known of the unknowns without the robot: of what is shared, and what is chosen."""
     size = 12 + len(edges.shared)
-    information, pull = np.zeros((size, size)), np.zeros(size)
+    information, pull = _chosen(data, size), np.zeros(size)
     if data.shared is not None:
         information[12:, 12:] = data.shared.information + np.diag(data.shared.anchor)
         pull[12:] = data.shared.pull + information[12:, 12:] @ edges.shared
     return Knowledge(information, pull)
+
+
+def _chosen(data: Closure, size: int) -> FloatArray:
+    """Information (size, size) on what is a matter of choice: nothing, or the target's rotation."""
+    information = np.zeros((size, size))
+    if data.guess is not None:
+        information[6:9, 6:9] = _CHOSEN * np.eye(3)
+    return information
 
 
 def components_of(data: Closure, z: FloatArray) -> Components:

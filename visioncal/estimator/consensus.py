@@ -55,15 +55,15 @@ class Agreement:
     Attributes:
         fit: Edges and noise from the views that agree.
         agrees: (m,) mask of them.
-        surprise: (m,) squared Mahalanobis distance of each view from what the others predict; six
-            on average where it is noise.
-        limit: What it may be.
+        surprise: (m,) squared Mahalanobis distance of each view from what the others predict; as
+            many on average as it tells directions (`Closure.told`) where it is noise.
+        limit: (m,) what it may be.
     """
 
     fit: ClosureFit
     agrees: Mask
     surprise: FloatArray
-    limit: float
+    limit: FloatArray
 
 
 def agreeing_views(data: Closure, start: Mask | None = None) -> Agreement:
@@ -148,16 +148,17 @@ def surprises(data: Closure, agrees: Mask, fit: ClosureFit) -> FloatArray:
     return squared_lengths(residuals, left, spread)[0]
 
 
-def _limit(data: Closure, agrees: Mask) -> float:
-    """Largest surprise that noise may give, corrected for the number of views.
+def _limit(data: Closure, agrees: Mask) -> FloatArray:
+    """Largest surprise (m,) that noise may give, corrected for the number of views.
 
     The noise's two levels are estimated from half of the residuals each, which gives the surprise
     the tails of an F distribution. Poses that were measured by others are better in some views than
     in others, and nobody says how much.
     """
-    freedom = max(3.0 * agrees.sum() - 6.0, 6.0)
-    limit = 6.0 * float(f_limit(_FALSE_ALARM / len(data), 6, freedom))
-    return limit if data.camera_covariance is not None else _UNEVEN**2 * limit
+    told = data.told
+    freedom = max(0.5 * float(told[agrees].sum()) - 6.0, 6.0)
+    limit = told * f_limit(_FALSE_ALARM / len(data), told, freedom)
+    return np.asarray(limit if data.camera_covariance is not None else _UNEVEN**2 * limit)
 
 
 def _core(data: Closure) -> tuple[Mask, Edges]:
@@ -174,7 +175,8 @@ def _candidates(data: Closure) -> Iterator[tuple[Edges, FloatArray]]:
     """Edges from all views and from small sets, each with all views' distances."""
     rng = np.random.default_rng(0)
     sets = [np.arange(len(data))]
-    sets += [rng.choice(len(data), _SET_SIZE, replace=False) for _ in range(_SETS)]
+    if data.guess is None:
+        sets += [rng.choice(len(data), _SET_SIZE, replace=False) for _ in range(_SETS)]
     for rows in sets:
         edges = _closed_form(data, rows)
         yield edges, _distances(data, edges)
@@ -197,6 +199,8 @@ def _concentrated(
 
 
 def _closed_form(data: Closure, rows: IntArray) -> Edges:
+    if data.guess is not None:
+        return Edges(data.guess.x, data.guess.z, data.unchanged)
     solution = SOLVERS["park"](data.robot[rows], data.camera[rows])
     return Edges(solution.x, solution.z, data.unchanged)
 
@@ -213,10 +217,10 @@ def _widened(data: Closure, core: Mask, edges: Edges) -> tuple[Mask, ClosureFit]
     The noise of the half that agrees best is less than that of all.
     """
     agrees, fit = core, fit_closure(data.subset(core), edges)
-    allowed, typical = float(chi2_limit(0.001, 6)), float(chi2_limit(0.5, 6))
+    allowed, typical = chi2_limit(0.001, data.told), chi2_limit(0.5, data.told)
     for _ in range(_ROUNDS):
         surprise = surprises(data, agrees, fit)
-        scale = max(float(np.median(surprise)) / typical, 1.0)
+        scale = max(float(np.median(surprise / typical)), 1.0)
         before, agrees = agrees, surprise < allowed * scale
         if np.array_equal(before, agrees) or agrees.sum() < LEAST_VIEWS:
             break
@@ -233,7 +237,7 @@ def _settled(data: Closure, agrees: Mask, fit: ClosureFit) -> tuple[Mask, Closur
         outside = np.flatnonzero(~agrees & (surprise < limit))
         if len(outside):
             agrees = agrees.copy()
-            agrees[outside[surprise[outside].argmin()]] = True
+            agrees[outside[(surprise / limit)[outside].argmin()]] = True
             fit = fit_closure(data.subset(agrees), fit.edges)
             continue
         without = _without_the_worst(data, agrees, surprise, limit, fit)
@@ -244,14 +248,14 @@ def _settled(data: Closure, agrees: Mask, fit: ClosureFit) -> tuple[Mask, Closur
 
 
 def _without_the_worst(
-    data: Closure, agrees: Mask, surprise: FloatArray, limit: float, fit: ClosureFit
+    data: Closure, agrees: Mask, surprise: FloatArray, limit: FloatArray, fit: ClosureFit
 ) -> tuple[Mask, ClosureFit] | None:
     """Leaves the worst view out where noise that it has no say in does not explain it."""
-    worst = int(np.where(agrees, surprise, -1.0).argmax())
-    if surprise[worst] < _SUSPECT_SHARE * limit or agrees.sum() <= LEAST_VIEWS:
+    worst = int(np.where(agrees, surprise / limit, -1.0).argmax())
+    if surprise[worst] < _SUSPECT_SHARE * limit[worst] or agrees.sum() <= LEAST_VIEWS:
         return None
     fewer = agrees.copy()
     fewer[worst] = False
     again = fit_closure(data.subset(fewer), fit.edges)
-    beyond = surprises(data, fewer, again)[worst] > limit
+    beyond = surprises(data, fewer, again)[worst] > limit[worst]
     return (fewer, again) if beyond else None

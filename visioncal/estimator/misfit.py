@@ -94,7 +94,7 @@ def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
         The motion; None where noise explains the residuals as well.
     """
     residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    flange = invert(data.robot) if data.mount == "eye-to-hand" else data.robot
+    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
     time = np.linspace(-0.5, 0.5, len(data))[:, None, None]
     seen = data.under(edges.shared)
     moving = flange_to_residual(seen, edges) @ (adjoint(invert(flange)) * time)

@@ -21,6 +21,18 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
+# What is wrong where unknowns that all views share are not told, and what to do.
+_UNTOLD = {
+    "camera": (
+        "the views do not determine lens and board well enough",
+        "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
+        "views tilted by 30 to 45 degrees.",
+    ),
+    "instrument": (
+        "the readings do not determine where the points sit on the flange",
+        "Add 3 or more stops in which the flange is tilted about different axes.",
+    ),
+}
 # A null direction moves a part of an edge if it moves it by this much, of a length of one.
 _PART_OF_NULL = 0.05
 
@@ -50,9 +62,16 @@ class Direction:
 
 def edge_names(mount: Mount) -> tuple[str, str]:
     """Names of the two unknown edges, in the order x, z."""
+    if mount == "instrument":
+        return "base_from_instrument", "flange_from_probe"
     if mount == "eye-in-hand":
         return "flange_from_cam", "base_from_target"
     return "base_from_cam", "flange_from_target"
+
+
+def title(mount: Mount) -> str:
+    """What messages about both edges begin with."""
+    return "instrument" if mount == "instrument" else "hand-eye"
 
 
 def check_observability(
@@ -85,16 +104,17 @@ def check_observability(
         culprit = _null_direction(spread, edges, data.mount, boards)
         verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
-            f"hand-eye: {culprit} {verb} not determined at all (information ratio "
+            f"{title(data.mount)}: {culprit} {verb} not determined at all (information ratio "
             f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data)}.",
             culprits=[culprit],
             next_step=_advice(data.mount),
         )
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
     worst = worst_directions(held, still, plausible, replace(boards, begin=0))
-    _refuse(worst[:4], _motion(data), _advice(data.mount))
+    _refuse(data.mount, worst[:4], _motion(data), _advice(data.mount))
     for board, name in enumerate(boards.names[1:], start=1):
         _refuse(
+            data.mount,
             worst[2 + 2 * board : 4 + 2 * board],
             "the views that show it are too few or too poor",
             f"Add views of target {name}, or take it out of the session.",
@@ -102,23 +122,23 @@ def check_observability(
     if looks:
         first = looks + boards.unknowns
         _refuse(
+            data.mount,
             worst_directions(
                 data.with_first(first),
                 replace(edges, shared=edges.shared[:first]),
                 plausible,
                 boards,
             ),
-            "the views do not determine lens and board well enough",
-            "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
-            "views tilted by 30 to 45 degrees.",
+            *_UNTOLD["instrument" if data.mount == "instrument" else "camera"],
         )
 
 
-def _refuse(worst: Sequence[Direction], cause: str, next_step: str) -> None:
+def _refuse(mount: Mount, worst: Sequence[Direction], cause: str, next_step: str) -> None:
     beyond = [it for it in worst if it.sigma > it.limit]
     if beyond:
         raise DegenerateError(
-            f"hand-eye: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: {cause}.",
+            f"{title(mount)}: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
+            f"{cause}.",
             culprits=[it.words for it in beyond],
             next_step=next_step,
         )
@@ -169,7 +189,7 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     """
     if len(data) >= FEWEST_VIEWS:
         return
-    culprit = f"the camera's offset from the {_frame(data.mount)}"
+    culprit = f"the {_sensor(data.mount)}'s offset from the {_frame(data.mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
     if len(data) == 2:
         culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data)))}"
@@ -178,8 +198,8 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     if len(data) == 1 < views:
         stops = f"all {views} used views are from one pose of the robot"
     raise DegenerateError(
-        f"hand-eye: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not determined: "
-        f"{cause}.",
+        f"{title(data.mount)}: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not "
+        f"determined: {cause}.",
         culprits=[culprit],
         next_step=_advice(data.mount),
     )
@@ -229,9 +249,16 @@ def _words(
 def _names(edge: int, mount: Mount, boards: Boards) -> tuple[str, str]:
     """What an edge places, and the frame that it hangs on."""
     if edge == 0:
-        return "camera", _frame(mount)
+        return _sensor(mount), _frame(mount)
     name = f"target {boards.names[edge - 1]}".strip()
-    return name, "base" if mount == "eye-in-hand" else "tool"
+    return (
+        "probe" if mount == "instrument" else name,
+        "base" if mount == "eye-in-hand" else "tool",
+    )
+
+
+def _sensor(mount: Mount) -> str:
+    return "instrument" if mount == "instrument" else "camera"
 
 
 def axis_words(direction: FloatArray) -> str:

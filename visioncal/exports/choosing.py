@@ -133,7 +133,7 @@ def _check_camera(form: ExportFormat, selection: Selection, there: Placements) -
     """Refuses what the formats of the camera do not hold."""
     if form.holds not in ("lens", "hand-eye"):
         return
-    if there.mount is None:
+    if there.mount is None or there.mount == "instrument":
         raise DataError(
             f"{form.name} holds the camera, and {there.words} has none.",
             culprits=[form.name],

@@ -13,8 +13,12 @@ from visioncal.types import Mount
 Source: TypeAlias = Calibration | FrameFile
 Kind: TypeAlias = Literal["tool", "fixture"]
 
-# The camera's transform.
-HAND_EYE: Mapping[Mount, str] = {"eye-in-hand": "flange_from_cam", "eye-to-hand": "base_from_cam"}
+# The camera's or the instrument's transform.
+HAND_EYE: Mapping[Mount, str] = {
+    "eye-in-hand": "flange_from_cam",
+    "eye-to-hand": "base_from_cam",
+    "instrument": "base_from_instrument",
+}
 # The frame in which such a thing is placed, by our names: flange, flange_2, ...
 _PARENTS: Mapping[Kind, re.Pattern[str]] = {
     "tool": re.compile(r"flange(_\w+)?", re.ASCII),
@@ -134,7 +138,10 @@ def placements(source: Source) -> Placements:
     if isinstance(source, FrameFile):
         return Placements(frames, tuple(frames), "this file of frames", None, None)
     origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
-    edges = {name: Placement(it, origin, source.verdict) for name, it in source.edges.items()}
+    edges = {
+        name: Placement(it, origin, source.verdict, it.oriented)
+        for name, it in source.edges.items()
+    }
     return Placements(
         {**edges, **frames}, tuple(frames), "this calibration", source.mount, source.camera
     )

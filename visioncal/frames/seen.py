@@ -197,7 +197,7 @@ def doubts(
 
 def _is_torn(found: Agreement) -> bool:
     """Whether images stayed in although they contradict each other."""
-    return bool(np.any(found.surprise[found.agrees] > found.limit)) and bool(found.agrees.all())
+    return bool(np.any((found.surprise > found.limit)[found.agrees])) and bool(found.agrees.all())
 
 
 def _distance(found: Agreement, at: int) -> str:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.told import EDGES
+from visioncal.estimator.told import EDGES, WHOLE_POSE
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
@@ -15,6 +15,8 @@ from visioncal.targets import corner_positions
 
 # So many places are enough for a map.
 _PLACES = 200
+# What readings of points tell of a pose: nothing of its rotation.
+_PLACE = np.arange(6) >= 3
 
 
 def telling_of(known: Known) -> Telling | None:
@@ -24,15 +26,20 @@ def telling_of(known: Known) -> Telling | None:
         return None
     targets, boards = tuple(known.session.boards.values()), known.shown(known.used)
     first = np.unique(known.stops, return_index=True)[1]
-    further = 12 + np.arange(boards.begin, boards.begin + boards.unknowns)
+    data = known.closure(known.used).merged(known.stops)
+    further = np.arange(boards.begin, boards.begin + boards.unknowns)
+    if known.readings is not None:
+        # Where further points sit on the flange is as open as where the first one does.
+        further = np.arange(len(data.unchanged) - known.arm_size)
     seen = ArmData(
-        known.closure(known.used).merged(known.stops),
+        data,
         known.solved,
         model,
         next(iter(found.errors.values())).sigma,
         known.joints(known.used)[first],
         corner_positions(targets[known.boards[0]]).mean(axis=0) if targets else np.zeros(3),
-        np.concatenate([EDGES, further]),
+        np.concatenate([EDGES, 12 + further]),
+        WHOLE_POSE if data.guess is None else _PLACE,
     )
     return tell(seen, known.convention)
 
@@ -70,7 +77,7 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
 
 
 def _level(level: Level) -> dict[str, Any]:
-    return {
+    figures = {
         "level": level.name,
         "unknowns": level.unknowns,
         "rms_mm": level.inside.mm,
@@ -79,6 +86,7 @@ def _level(level: Level) -> dict[str, Any]:
         "held_out_deg": level.left_out.deg,
         "likelihood_ratio": level.likelihood_ratio,
     }
+    return {name: it for name, it in figures.items() if it is not None}
 
 
 def _observability(telling: Telling) -> dict[str, Any]:

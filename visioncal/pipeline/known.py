@@ -24,6 +24,7 @@ from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
@@ -53,6 +54,7 @@ class Known:
         corners: What was found of the target, by view; those of several are numbered through.
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
+        readings: What an instrument read, where that is all that was observed.
         poses: The target's pose by view; several candidates until they are chosen from.
         pixel_px: Noise of a corner's coordinate [px].
         used: The views in the fit, in the session's order.
@@ -89,6 +91,7 @@ class Known:
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
+    readings: Readings | None = None
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     pixel_px: float | None = None
     used: tuple[int, ...] = ()
@@ -235,7 +238,9 @@ class Known:
             robot_part(robot, mount),
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
         )
-        if poses and all(pose.corners is not None for pose in poses):
+        if self.readings is not None and poses:
+            data = self.readings.told_to(data, poses)
+        elif poses and all(pose.corners is not None for pose in poses):
             shift = [pose.by_shared[0] for pose in poses]
             data = replace(
                 data,
@@ -276,6 +281,13 @@ class Known:
         count = 0 if self.robot is None else self.robot.joint_count
         return np.array([joints[view] for view in views]).reshape(len(views), count)
 
+    def with_readings(self, readings: Readings) -> Self:
+        """Takes over an instrument's readings, and makes their poses by the present arm."""
+        views = [view for view in readings.read_m if view in self.base_from_flange]
+        flange = dict(zip(views, self.flange_poses(views), strict=True))
+        known = replace(self, readings=readings, poses=readings.poses(flange))
+        return known.noting(readings.rejections)
+
     def with_arm_errors(self) -> Self:
         """Takes the errors of the arm's model for those that are estimated."""
         if self.arm_model is None or self.kinematics is None:
@@ -286,16 +298,24 @@ class Known:
         return replace(self, arm=errors)
 
     @property
+    def arm_size(self) -> int:
+        """How many values the arm's errors have; they come last of what the views share."""
+        return 0 if self.arm_model is None else len(self.arm_model.values)
+
+    @property
     def arm_values(self) -> FloatArray | None:
         """(p,) present values of the arm's errors; None for the nominal arm's."""
         return None if self.arm_model is None else self.arm_model.values
 
     @property
     def estimated_looks(self) -> int:
-        """How many unknowns of lens and board the views share, where they have to tell the lens.
+        """How many unknowns the views share that they have to tell.
 
-        They come before the arm's.
+        Those of lens and board where the lens was estimated, or the places of further points on the
+        flange. They come before the arm's.
         """
+        if self.readings is not None and not self.readings.are_poses:
+            return 3 * (len(self.readings.names) - 1)
         told = self.camera is not None and self.camera.estimated
         return 0 if self.free is None or not told else len(self.free.columns)
 
@@ -379,13 +399,10 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
 
 
 def rms_of(away_m: FloatArray, away_rad: FloatArray, rms_px: FloatArray) -> Rms:
-    """Root mean squares over views [m, rad, px].
-
-    Views without corners have NaN pixels, and those that cannot be predicted nothing but NaN.
-    """
-    seen = rms_px[np.isfinite(rms_px)]
+    """Root mean squares over views [m, rad, px]; what a view does not tell is NaN."""
+    away_m, turns_rad, seen = (it[np.isfinite(it)] for it in (away_m, away_rad, rms_px))
     return Rms(
-        mm=float(1e3 * np.sqrt(np.nanmean(away_m**2))),
-        deg=float(np.rad2deg(np.sqrt(np.nanmean(away_rad**2)))),
+        mm=float(1e3 * np.sqrt(np.mean(away_m**2))),
+        deg=float(np.rad2deg(np.sqrt(np.mean(turns_rad**2)))) if len(turns_rad) else None,
         px=float(np.sqrt(np.mean(seen**2))) if len(seen) else None,
     )

@@ -24,8 +24,9 @@ from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES
 from visioncal.stages.kinematics import ASKED
+from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
-from visioncal.types import Progress, SolverName
+from visioncal.types import FloatArray, Progress, SolverName
 
 _LEVELS = (*ASKED, "hand-eye")
 
@@ -140,6 +141,9 @@ def result_of(known: Known) -> Calibration:
     session, result = known.session, known.solved
     names, placed = _edges_in_order(known)
     spread = placed.covariance(result.covariance)
+    if known.readings is not None and not known.readings.are_poses:
+        # The rotation of a point's frame is a matter of choice.
+        spread[6:9], spread[:, 6:9] = 0.0, 0.0
     return Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
@@ -154,7 +158,7 @@ def result_of(known: Known) -> Calibration:
             name: SolverResult(
                 dict(zip(names, [it.x, *placed.seen_with(it.z)], strict=True)),
                 1e3 * it.rms_m,
-                float(np.rad2deg(it.rms_rad)),
+                None if it.rms_rad is None else float(np.rad2deg(it.rms_rad)),
             )
             for name, it in result.solutions.items()
         },
@@ -178,9 +182,11 @@ def _edges_in_order(known: Known) -> tuple[tuple[str, ...], Placed]:
     return (x_name, *names), placed.sorted(order)
 
 
-def _further(known: Known) -> dict[str, dict[str, Any]]:
+def _further(known: Known) -> dict[str, Any]:
     """What was refined beside the edges, and where the uncertainty comes from."""
-    documents = {}
+    documents: dict[str, Any] = {}
+    if known.readings is not None:
+        documents |= _instrument(known, known.readings)
     if known.free is not None and not known.session.targets:
         documents["board"] = _board(known, known.free, 0)
     elif known.free is not None:
@@ -201,6 +207,37 @@ def _further(known: Known) -> dict[str, dict[str, Any]]:
     if known.diagnosis is not None:
         documents["uncertainty"] = _uncertainty(known, known.diagnosis)
     return documents
+
+
+def _instrument(known: Known, readings: Readings) -> dict[str, Any]:
+    """The instrument as it was taken, and the places of the points that it read on the flange."""
+    instrument = readings.instrument
+    stated = {
+        "words": instrument.words,
+        "reads": "poses" if readings.are_poses else "places",
+        "sigma_m": instrument.sigma_m,
+        "sigma_per_m": instrument.sigma_per_m,
+        "sigma_rad": instrument.sigma_rad if readings.are_poses else None,
+    }
+    document: dict[str, Any] = {"instrument": {k: v for k, v in stated.items() if v is not None}}
+    if readings.mounting is not None:
+        on_flange = readings.mounting.moved(known.solved.edges).on_flange
+        document["points"] = [
+            {"point": name or "probe", **dict(zip(("x_m", "y_m", "z_m"), place, strict=True))}
+            | {"sigma_mm": _point_sigma_mm(known.solved.covariance, point)}
+            for point, (name, place) in enumerate(
+                zip(readings.names, on_flange.tolist(), strict=True)
+            )
+        ]
+    return document
+
+
+def _point_sigma_mm(spread: FloatArray, point: int) -> float:
+    """Root of the trace of a point's covariance on the flange; points but the first are shared."""
+    rows = np.eye(len(spread))[9:12]
+    if point:
+        rows = rows + np.eye(len(spread))[9 + 3 * point : 12 + 3 * point]
+    return 1e3 * float(np.sqrt(np.trace(rows @ spread @ rows.T)))
 
 
 def _board(known: Known, free: Free, place: int) -> dict[str, Any]:
@@ -268,8 +305,12 @@ def _noise(known: Known) -> dict[str, float]:
     """Standard deviations per axis: of corners and flange, or of both as one without corners."""
     noise = known.solved.noise
     of = "combined" if known.robot_noise is None else "robot"
-    pixel = {} if known.pixel_px is None else {"pixel_px": known.pixel_px}
-    return pixel | {
+    seen = {} if known.pixel_px is None else {"pixel_px": known.pixel_px}
+    if known.readings is not None:
+        seen["instrument_mm"] = 1e3 * known.readings.sigma_m
+        if known.readings.are_poses:
+            seen["instrument_deg"] = float(np.rad2deg(known.readings.instrument.sigma_rad or 0.0))
+    return seen | {
         f"{of}_translation_mm": 1e3 * noise.sigma_m,
         f"{of}_rotation_deg": float(np.rad2deg(noise.sigma_rad)),
     }

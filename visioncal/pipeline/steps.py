@@ -31,6 +31,7 @@ from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
+from visioncal.stages.readings import mounted, read_instrument
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses
 from visioncal.stages.seen_joints import (
@@ -40,12 +41,14 @@ from visioncal.stages.seen_joints import (
     misread_joints,
 )
 from visioncal.stages.validate import validate
+from visioncal.transforms import invert, rotation_angle
 from visioncal.types import Rejection
 
 # Views move in and out of the fit at most so often; they settle after one or two, as does the
-# linearisation of the arm's errors, to a step far below any arm's repeatability.
+# linearisation of the arm's errors, to a step far below any arm's repeatability. A rotation that is
+# supplied to readings of points needs less: it counts by its square.
 _ROUNDS = 4
-_ARM_AT_REST_RAD = 1e-7
+_ARM_AT_REST_RAD, _TURN_AT_REST_RAD = 1e-7, 1e-5
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,36 @@ def _not_used(session: Session) -> Iterator[str]:
     declared = session.declaration
     if declared.prior:
         yield f"[prior.{next(iter(declared.prior))}] was not used: this version knows no priors."
-    if any(name.startswith("meas_") for view in session.views for name in view.numbers):
-        yield "The instrument's readings (meas_ columns) were not used by this version."
+    readings = sum(view.reading_m is not None for view in session.views)
+    if readings and session.mount != "instrument":
+        yield (
+            f"{readings} rows have an instrument's readings (meas_ columns), which were not used: "
+            "where images or measured poses (cft_ columns) are there, these are. A session with "
+            "the readings alone calibrates the arm by the instrument."
+        )
+
+
+def _readings(known: Known) -> Known:
+    """Takes up an instrument's readings, where these are what was observed."""
+    if known.session.mount != "instrument":
+        return known
+    readings = read_instrument(known.session)
+    known = known.noting(readings.rejections)
+    if not readings.are_poses:
+        if known.solver != "joint":
+            raise DataError(
+                f"solver {known.solver!r} needs poses, and the instrument reads places alone.",
+                next_step="Leave --solver out.",
+            )
+        views = [
+            view
+            for view in readings.read_m
+            if view in known.base_from_flange and view not in known.held_back
+        ]
+        if not views:
+            raise _nothing_seen(known)
+        readings = mounted(readings, views, known.base_from_flange, known.stops_of(views))
+    return known.with_readings(readings)
 
 
 def _detect(known: Known) -> Known:
@@ -116,6 +147,8 @@ def _intrinsics(known: Known) -> Known:
 
 
 def _pnp(known: Known) -> Known:
+    if known.readings is not None:
+        return known
     targets, poses = tuple(known.session.boards.values()), given_poses(known.session)
     corners = {view: it for view, it in known.corners.items() if view not in known.reasons}
     fitted = {view: it for view, it in corners.items() if view not in known.held_back}
@@ -147,7 +180,7 @@ def _nothing_seen(known: Known) -> DataError:
     if not any(view.image for view in known.session.views):
         return DataError(
             f"session {known.session.name!r}: there are neither images nor measured poses.",
-            next_step="Give the views images, or cft_ columns.",
+            next_step="Give the views images, or cft_ or meas_ columns.",
         )
     return DataError(
         f"session {known.session.name!r}: no view shows the target.",
@@ -161,7 +194,7 @@ def _joints(known: Known) -> Known:
     robot, matched = known.zeroed_robot, known.matched
     poses = known.poses_of_one_board
     views = [it for it in poses if known.joints_rad and it in known.joints_rad]
-    if robot is None or not views:
+    if robot is None or not views or known.readings is not None:
         return known
     doubted = {} if matched is None else matched.contradicting
     sound = [it for it in views if it not in doubted and it not in known.held_back]
@@ -299,7 +332,10 @@ def _kinematics(known: Known) -> Known:
 
 
 def _hand_eye(known: Known) -> Known:
-    """Solves for both edges, with arm and further boards linearised anew until they stay."""
+    """Solves for both edges, with arm and further boards linearised anew until they stay.
+
+    With them go the rotations that were supplied to readings of points.
+    """
     for _ in range(_ROUNDS):
         known = known.with_arm_errors()
         boards = known.shown(known.used)
@@ -308,15 +344,25 @@ def _hand_eye(known: Known) -> Known:
         by_stop = replace(boards, shown=boards.shown[first])
         result = solve_hand_eye(data, known.solver, arm, known.estimated_looks, by_stop)
         known = replace(known, hand_eye=result)
-        model, shared = known.arm_model, result.edges.shared
-        step = shared[len(shared) - (0 if model is None else len(model.values)) :]
-        moved = np.abs(np.concatenate([[0.0], step, shared[boards.places]]))
-        if moved.max() < _ARM_AT_REST_RAD:
+        model, readings, shared = known.arm_model, known.readings, result.edges.shared
+        step = np.concatenate([shared[len(shared) - known.arm_size :], shared[boards.places]])
+        if np.abs(step).max(initial=0.0) < _ARM_AT_REST_RAD and _is_aimed(known):
             break
         known = relaid(known, shared)
         if model is not None:
-            known = replace(known, arm_model=model.moved(step))
+            known = replace(known, arm_model=model.moved(step[: known.arm_size]))
+        if readings is not None:
+            known = known.with_readings(readings.moved(result.edges))
     return known
+
+
+def _is_aimed(known: Known) -> bool:
+    """Whether rotations that were supplied are still those that the chain predicts."""
+    if known.readings is None or known.readings.are_poses:
+        return True
+    edges, data = known.solved.edges, known.closure(known.used)
+    turns = rotation_angle(invert(edges.z) @ data.under(edges.shared).placed(edges.x))
+    return bool(turns.max() < _TURN_AT_REST_RAD)
 
 
 def _arm_by_stop(known: Known) -> ArmErrors | None:
@@ -383,12 +429,14 @@ def _judge(known: Known) -> Known:
         warnings=known.warnings,
         notes=known.notes,
         workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
+        mount=known.session.mount,
     )
     return replace(known, findings=findings, verdict=judge(findings))
 
 
 STAGES: tuple[Stage, ...] = (
     Stage("robot", _read_robot),
+    Stage("readings", _readings),
     Stage("detect", _detect),
     Stage("intrinsics", _intrinsics),
     Stage("pnp", _pnp),

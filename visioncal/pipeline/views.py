@@ -14,7 +14,7 @@ from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import mean_transform
 from visioncal.types import Corners, FloatArray
 
-_NO_POSE = "no pose of the target: it has neither image nor cft_ columns"
+_NO_POSE = "no pose of the target: it has neither image nor cft_ nor meas_ columns"
 
 
 def view_results(known: Known) -> tuple[ViewResult, ...]:
@@ -31,7 +31,9 @@ def view_results(known: Known) -> tuple[ViewResult, ...]:
                 result,
                 rms_px=float(rms_px[index]) if np.isfinite(rms_px[index]) else None,
                 residual_mm=float(1e3 * away_m[index]),
-                residual_deg=float(np.rad2deg(away_rad[index])),
+                residual_deg=(
+                    float(np.rad2deg(away_rad[index])) if np.isfinite(away_rad[index]) else None
+                ),
             )
         results.append(result)
     return tuple(results)
@@ -69,7 +71,8 @@ def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, 
     rms_px = chain_rms_px(data, edges, known.seen(views), known.free, own)
     means = np.array([mean_transform(it) for it in _placed_by_board(known)])
     placed = data.under(edges.shared).placed(edges.x) @ own
-    return (*distances(placed, means[shown.shown]), rms_px)
+    away_m, away_rad = distances(placed, means[shown.shown])
+    return away_m, away_rad if data.guess is None else np.full(len(data), np.nan), rms_px
 
 
 def _placed_by_board(known: Known) -> Iterator[FloatArray]:

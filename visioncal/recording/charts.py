@@ -75,7 +75,7 @@ class Charts:
         used = frozenset(view.view for view in calibration.views if view.used)
         found = (
             coverage.image_chart(calibration, evidence),
-            coverage.directions_chart(evidence),
+            None if calibration.mount == "instrument" else coverage.directions_chart(evidence),
             coverage.rotation_axes_chart([it for it in evidence.values() if it.view in used]),
         )
         points = tuple(chart for chart in found if chart is not None)

@@ -18,6 +18,7 @@ _BEND = "bow_"
 # What each source of uncertainty is, for people.
 SOURCES = {
     "pixels": "noise of the corners",
+    "instrument": "the instrument's readings",
     "robot": "the robot, from stop to stop",
     "poses": "noise of the poses",
     "intrinsics": "what is open about the lens",
@@ -166,9 +167,12 @@ def _boards(calibration: Calibration) -> dict[str, Board]:
 
 def target_frames(calibration: Calibration, session: Session | None) -> dict[int, str]:
     """The frame of the target that each view shows, where the calibration places it."""
-    placed = {name.rpartition("_from_")[2] for name in calibration.edges}
+    placed = [name.rpartition("_from_")[2] for name in calibration.edges][1:]
     if session is None:
         return {}
+    if not session.targets:
+        # A target, or what an instrument reads in its place.
+        return dict.fromkeys((view.number for view in session.views), placed[0])
     frames = {
         view.number: f"target_{name}" if (name := session.board_of(view)) else "target"
         for view in session.views

@@ -91,7 +91,10 @@ def verdict_markdown(calibration: Calibration) -> str:
         "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
         "|---|---|---|---|",
     ]
-    lines += [f"| {plain(name)} {edge_line(it)}" for name, it in calibration.edges.items()]
+    lines += [
+        f"| {plain(name)} {edge_line(it, oriented=it.oriented)}"
+        for name, it in calibration.edges.items()
+    ]
     lines += [
         f"| {plain(name)} {edge_line(it.edge, oriented=it.oriented)}"
         for name, it in calibration.frames.items()
@@ -193,7 +196,8 @@ def _noise_label(name: str) -> str:
 
 def _rms_line(label: str, rms: Rms) -> str:
     px = "" if rms.px is None else f"{rms.px:.2g}"
-    return f"| {label} | {rms.mm:.2g} | {rms.deg:.2g} | {px} |"
+    deg = "" if rms.deg is None else f"{rms.deg:.2g}"
+    return f"| {label} | {rms.mm:.2g} | {deg} | {px} |"
 
 
 def solvers_markdown(calibration: Calibration) -> str:
@@ -204,7 +208,8 @@ def solvers_markdown(calibration: Calibration) -> str:
     lines = ["# Solvers compared", "", f"| {' | '.join(titles)} |"]
     lines.append("|---" + "|---:" * (len(titles) - 1) + "|")
     for solver, result in calibration.solvers.items():
-        cells = [plain(solver), f"{result.rms_mm:.3g}", f"{result.rms_deg:.3g}"]
+        deg = "" if result.rms_deg is None else f"{result.rms_deg:.3g}"
+        cells = [plain(solver), f"{result.rms_mm:.3g}", deg]
         for name in edges:
             if name in result.transforms:
                 ours, theirs = calibration.transforms[name], result.transforms[name]

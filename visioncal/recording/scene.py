@@ -129,7 +129,7 @@ class Scene:
 
     @property
     def _ends(self) -> list[str]:
-        """The frames that the calibration places: camera and targets."""
+        """The frames that the calibration places: camera and targets, or instrument and probe."""
         edges = {} if self.calibration is None else self.calibration.edges
         return [name.rpartition("_from_")[2] for name in edges]
 

@@ -65,7 +65,7 @@ class Uncertainty:
         """
         used = frozenset(view.view for view in calibration.views if view.used)
         if frames is None:
-            frames = dict.fromkeys(evidence, paths.TARGET_FRAME)
+            frames = dict.fromkeys(evidence, list(calibration.edges)[1].rpartition("_from_")[2])
         scatter_m: dict[int, FloatArray] = {}
         for frame in sorted(set(frames.values())):
             some = {view: it for view, it in evidence.items() if frames.get(view) == frame}
@@ -197,12 +197,11 @@ def _placed(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
     """(4, 4) the target as this view alone puts it, in the frame that carries it."""
     if seen.base_from_flange is None or seen.cam_from_target is None:
         return None
-    edges = calibration.transforms
-    if "flange_from_cam" in edges:
-        flange_from_cam = edges["flange_from_cam"].as_matrix()
-        return np.asarray(seen.base_from_flange @ flange_from_cam @ seen.cam_from_target)
-    base_from_cam = edges["base_from_cam"].as_matrix()
-    return np.asarray(invert(seen.base_from_flange) @ base_from_cam @ seen.cam_from_target)
+    # The camera's edge, or the instrument's, is the first.
+    edge = next(iter(calibration.edges.values())).transform.as_matrix()
+    in_hand = calibration.mount == "eye-in-hand"
+    robot = seen.base_from_flange if in_hand else invert(seen.base_from_flange)
+    return np.asarray(robot @ edge @ seen.cam_from_target)
 
 
 def round_factor(wanted_m: float, size_m: float) -> int:

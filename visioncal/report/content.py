@@ -21,6 +21,11 @@ _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rer
 
 _VIEW_COLUMNS = 3
 
+_MOUNTS = {
+    "eye-in-hand": "the camera rides on the robot",
+    "eye-to-hand": "the camera stands still and the robot carries the target",
+    "instrument": "a measuring instrument stands still and reads what the robot carries",
+}
 _HEADLINES = {
     "good": "Good: ready to use",
     "check": "Check: usable once the points below are settled",
@@ -113,7 +118,9 @@ def readable_time(created: str) -> str:
 
 def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
     """The estimated transforms, the wanted one first."""
-    return tuple(edge_card(name, edge) for name, edge in calibration.edges.items())
+    return tuple(
+        edge_card(name, edge, oriented=edge.oriented) for name, edge in calibration.edges.items()
+    )
 
 
 def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:
@@ -230,14 +237,17 @@ def residual_rows(calibration: Calibration) -> tuple[ResidualRow, ...]:
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     """The handful of figures that most readers come for."""
     edge = next(iter(calibration.edges.values()))
+    sensor = "instrument" if calibration.mount == "instrument" else "camera"
     used = sum(view.used for view in calibration.views)
     facts = [
-        Fact("camera position, sigma", f"{_rounded(edge.sigma_mm)} mm"),
-        Fact("camera orientation, sigma", f"{_rounded(edge.sigma_deg)}\N{DEGREE SIGN}"),
+        Fact(f"{sensor} position, sigma", f"{_rounded(edge.sigma_mm)} mm"),
+        Fact(f"{sensor} orientation, sigma", f"{_rounded(edge.sigma_deg)}\N{DEGREE SIGN}"),
         Fact(
             "held-out residual",
             f"{significant(calibration.validation.held_out.mm)} mm",
-            f"{significant(calibration.validation.held_out.deg)}\N{DEGREE SIGN}",
+            ""
+            if calibration.validation.held_out.deg is None
+            else f"{significant(calibration.validation.held_out.deg)}\N{DEGREE SIGN}",
         ),
         Fact("views used", f"{used} of {len(calibration.views)}"),
     ]
@@ -257,9 +267,7 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         Fact(
             "mount",
             calibration.mount,
-            "the camera rides on the robot"
-            if calibration.mount == "eye-in-hand"
-            else "the camera stands still and the robot carries the target",
+            _MOUNTS[calibration.mount],
         ),
         Fact("views", f"{used} used of {len(calibration.views)}"),
     ]

@@ -93,6 +93,7 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "residuals": content.residual_rows(calibration),
         "solvers": content.solver_rows(calibration),
         "has_pixels": calibration.rms.px is not None,
+        "observed": "probe" if calibration.mount == "instrument" else "target",
         "view_columns": content.view_columns(calibration.views, found),
     }
 

@@ -116,7 +116,7 @@ def corner_errors(evidence: ViewEvidence) -> FloatArray:
 def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
     """Where the camera looked at the target from: tilt against its normal, and azimuth."""
     poses = {it.view: it.cam_from_target for it in evidence if it.cam_from_target is not None}
-    if not poses:
+    if not poses or calibration.mount == "instrument":
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
     with svg.style():

@@ -50,7 +50,7 @@ def residuals_over_joints(
         for it in evidence
         if it.view in shown
         and (joints := joints_rad.get(it.view)) is not None
-        and (residual := twist_of(calibration, it, frames.get(it.view, "target"))) is not None
+        and (residual := twist_of(calibration, it, frames.get(it.view))) is not None
     ]
     if len(pairs) < 3:
         return Markup("")
@@ -60,14 +60,14 @@ def residuals_over_joints(
 
 
 def twist_of(
-    calibration: Calibration, seen: ViewEvidence, frame: str = "target"
+    calibration: Calibration, seen: ViewEvidence, frame: str | None = None
 ) -> FloatArray | None:
     """Where a view places its target against where the result does.
 
     Args:
         calibration: The result.
         seen: The view's poses.
-        frame: The frame of the target that it shows.
+        frame: The frame of the target that it shows; that of an only one where None.
 
     Returns:
         (6,) of (rotation [rad], translation [m]) in the target's frame; None without poses.
@@ -75,11 +75,12 @@ def twist_of(
     if seen.base_from_flange is None or seen.cam_from_target is None:
         return None
     # The camera's edge is the first, targets' follow.
-    x, *_ = (edge.matrix for edge in calibration.edges.values())
+    x, *targets = calibration.edges
     eye_in_hand = calibration.mount == "eye-in-hand"
-    z = calibration.edges[f"{'base' if eye_in_hand else 'flange'}_from_{frame}"].matrix
+    z = next((it for it in targets if it.endswith(f"_from_{frame}")), targets[0])
     robot = seen.base_from_flange if eye_in_hand else invert(seen.base_from_flange)
-    return log(invert(z) @ robot @ x @ seen.cam_from_target)
+    edges = calibration.edges
+    return log(invert(edges[z].matrix) @ robot @ edges[x].matrix @ seen.cam_from_target)
 
 
 def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -> Markup:

@@ -10,6 +10,7 @@ _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
 # What would lower each source's part.
 _REMEDIES = {
     "pixels": "sharper images, or a board that fills more of them, would lower it",
+    "instrument": "a nearer or a better instrument would lower it",
     "robot": "more stops would lower it",
     "poses": "more poses would lower it",
     "intrinsics": "views with the board near the image's edges would lower it",
@@ -23,9 +24,10 @@ _REMEDIES = {
 
 def summary(calibration: Calibration, found: Uncertainty) -> tuple[str, ...]:
     """Sentences: how well a point is placed where the views look, and what limits it."""
-    parent = next(iter(calibration.edges)).partition("_from_")[0]
+    parent, _, sensor = next(iter(calibration.edges)).partition("_from_")
+    where = "the views look" if calibration.camera is not None else "it was measured"
     sentences = [
-        f"A point where the views look, {significant(found.distance_m)} m from the camera, is "
+        f"A point where {where}, {significant(found.distance_m)} m from {frame_words(sensor)}, is "
         f"placed in the frame of {frame_words(parent)} with a sigma of "
         f"{significant(found.total_mm)} mm; 95 % of such results are right to within "
         f"{significant(found.radius95_mm)} mm."

@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean
-from visioncal.types import CameraKind, Mount
+from visioncal.types import CameraKind, CameraMount
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 # Nobody knows a focal length better than the least of these, or worse than the largest [px].
@@ -48,7 +48,7 @@ class RobotTable(_TableModel):
 
 
 class InstrumentTable(_TableModel):
-    """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]."""
+    """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]; see `instruments`."""
 
     name: str = "instrument"
     sigma_m: NotNegative | None = None
@@ -87,7 +87,7 @@ class Declaration(_TableModel):
 
     schema_version: Literal[1] = Field(alias="schema")
     name: str
-    mount: Mount
+    mount: CameraMount | None = None
     target: str | None = None
     targets: dict[str, Annotated[TargetTable, BeforeValidator(_as_table)]] = Field(
         default_factory=dict
@@ -182,6 +182,8 @@ _MISSING = {
 def _contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
     """Finds fields that are well typed but do not fit together: (dotted path, words)."""
     camera = declaration.camera
+    if declaration.mount is None and (declaration.instrument is None or camera is not None):
+        yield "mount", "is missing" + _MISSING["mount"]
     if camera is not None:
         yield from _camera_contradictions(camera)
     if declaration.targets and declaration.target is not None:

@@ -183,8 +183,15 @@ class Session:
 
     @property
     def mount(self) -> Mount:
-        """Whether the camera is in the hand or looks at it."""
-        return self.declaration.mount
+        """What observes whom: a camera in the hand or one that looks at it, or an instrument."""
+        declared = self.declaration.mount
+        return "instrument" if declared is None or self.is_read_by_instrument else declared
+
+    @cached_property
+    def is_read_by_instrument(self) -> bool:
+        """Whether an instrument's readings are all that was observed: a camera comes before it."""
+        seen = any(view.image or view.cam_from_target() is not None for view in self.views)
+        return not seen and any(view.reading_m is not None for view in self.views)
 
     @property
     def boards(self) -> Mapping[str, Target]:

@@ -68,6 +68,18 @@ class View:
         """The target's pose that was already measured (cft_*), if there is one."""
         return self._transform(known.MEASURED_CAM_POSE)
 
+    @property
+    def reading_m(self) -> FloatArray | None:
+        """(3,) the place that an instrument read (meas_*), in its frame [m], if there is one."""
+        names = known.INSTRUMENT_POSITION
+        return np.array([self.numbers[it] for it in names]) if names[0] in self.numbers else None
+
+    def instrument_from_probe(self) -> RigidTransform | None:
+        """The pose of a probe that an instrument read (meas_*), if its rotation was read too."""
+        names = (*known.INSTRUMENT_POSITION, *known.INSTRUMENT_QUATERNION)
+        there = names[0] in self.numbers and names[-1] in self.numbers
+        return self._transform(names) if there else None
+
     def _transform(self, names: Sequence[str]) -> RigidTransform | None:
         if names[0] not in self.numbers:
             return None

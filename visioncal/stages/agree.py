@@ -10,7 +10,7 @@ from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.consensus import LEAST_VIEWS, agreeing_views, whole_units
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.figures import figure
-from visioncal.types import IntArray, Mask, Rejection
+from visioncal.types import IntArray, Mask, Mount, Rejection
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,28 +63,25 @@ def agree(
         own = boards.moved(edges.shared).first_from_own
         placed, z = placed @ own, z @ own
     away_m, away_rad = distances(placed, z)
-
-    def cause(at: int) -> str:
-        others = np.zeros(len(views), dtype=bool)
+    told = merged.told
+    surprise, limit = (np.sqrt(it / told)[units] for it in (found.surprise, found.limit))
+    seen = "target" if data.mount != "instrument" else "probe" if data.guess is None else "point"
+    rejections = []
+    for at in np.flatnonzero(~mask).tolist():
+        turned = "" if data.guess is not None else f" and {figure(np.rad2deg(away_rad[at]))} deg"
+        of_its_board = np.zeros(len(views), dtype=bool)
         if boards is not None and boards.unknowns:
-            others = (boards.shown == boards.shown[at]) & mask
-        return _cause(views, (stops == stops[at]) & mask, others)
-
-    surprise = np.sqrt(found.surprise[units] / 6.0)
-    limit = float(np.sqrt(found.limit / 6.0))
-    return Agreed(
-        mask,
-        edges,
-        tuple(
+            of_its_board = (boards.shown == boards.shown[at]) & mask
+        cause = _cause(views, (stops == stops[at]) & mask, of_its_board, data.mount)
+        rejections.append(
             Rejection(
                 views[at],
-                f"disagrees with the other views: it places the target {figure(1e3 * away_m[at])} "
-                f"mm and {figure(np.rad2deg(away_rad[at]))} deg away, {figure(surprise[at])} times "
-                f"the noise (limit {figure(limit)}); {cause(at)}",
+                f"disagrees with the other views: it places the {seen} {figure(1e3 * away_m[at])} "
+                f"mm{turned} away, {figure(surprise[at])} times the noise (limit "
+                f"{figure(limit[at])}); {cause}",
             )
-            for at in np.flatnonzero(~mask).tolist()
-        ),
-    )
+        )
+    return Agreed(mask, edges, tuple(rejections))
 
 
 def _board_by_board(merged: Closure, units: IntArray, boards: Boards) -> Mask:
@@ -103,15 +100,16 @@ def _board_by_board(merged: Closure, units: IntArray, boards: Boards) -> Mask:
     return agrees
 
 
-def _cause(views: Sequence[int], agreeing_mates: Mask, of_its_board: Mask) -> str:
+def _cause(views: Sequence[int], agreeing_mates: Mask, of_its_board: Mask, mount: Mount) -> str:
     """What is wrong with a view, by those of its stop and its board that agree with all others."""
     if of_its_board.sum() == 1:
         other = views[int(np.flatnonzero(of_its_board)[0])]
         return f"it and view {other} alone show this target, and either may be wrong"
+    observed = "reading" if mount == "instrument" else "image"
     mates = np.flatnonzero(agreeing_mates)
     if len(mates):
         return (
-            f"view {views[mates[0]]} of the same stop agrees: the image is wrong, or something "
-            "moved in between"
+            f"view {views[mates[0]]} of the same stop agrees: the {observed} is wrong, or "
+            "something moved in between"
         )
-    return "its pose or its image is wrong, or something had moved"
+    return f"its pose or its {observed} is wrong, or something had moved"

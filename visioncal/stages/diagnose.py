@@ -79,7 +79,9 @@ def diagnose(
             rest = fit_closure(data, edges)
             alike = neighbours(data, rest.edges, rest.noise)
             moved = drift(data, rest.edges, rest.noise)
-        parts = covariance_by_source(data, edges, noise, _owners(data, free, arm, boards))
+        source = "instrument" if data.mount == "instrument" else "pixels"
+        owners = _owners(data, free, arm, boards)
+        parts = covariance_by_source(data, edges, noise, owners, source)
         if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
         if result.held.any():
@@ -108,19 +110,23 @@ def diagnose(
 def _owners(
     data: Closure, free: Free | None, arm: ArmErrors | None, boards: Boards
 ) -> dict[str, IntArray]:
-    """Which of the unknowns that all views share are whose."""
+    """Which of the unknowns that all views share are whose; the arm's come last."""
     owners: dict[str, IntArray] = {}
+    shared = len(data.unchanged)
+    errors = 0 if arm is None or not arm.is_estimated else arm.basis.shape[2]
+    if data.mount == "instrument" and shared > errors:
+        # Places of points, of which an instrument's readings of one stop tell by themselves.
+        owners["instrument"] = np.arange(shared - errors)
     if boards.unknowns and data.camera_covariance is not None:
         # All that is known of where boards are beside the chain is from images that show several.
         owners["pixels"] = np.arange(boards.begin, boards.begin + boards.unknowns)
-    looks = 0 if free is None else len(free.columns)
     if free is not None:
         is_lens = free.columns < free.lens_count
         for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
             if mask.any():
                 owners[name] = np.flatnonzero(mask)
     if arm is not None and arm.is_estimated:
-        owners["arm"] = looks + boards.unknowns + np.arange(arm.basis.shape[2])
+        owners["arm"] = np.arange(shared - errors, shared)
     return owners
 
 

@@ -26,6 +26,7 @@ from visioncal.estimator.observability import (
     check_observability,
     directions,
     refuse_too_few,
+    title,
 )
 from visioncal.solvers import SOLVERS
 from visioncal.transforms import invert
@@ -39,12 +40,15 @@ _START = "park"
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Both edges (4, 4) by one solver, and the scatter of the target that they leave."""
+    """Both edges (4, 4) by one solver, and the scatter of the target that they leave.
+
+    That of its rotation is None where places alone were read.
+    """
 
     x: FloatArray
     z: FloatArray
     rms_m: float
-    rms_rad: float
+    rms_rad: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +110,10 @@ def solve_hand_eye(
     boards = boards or Boards.one(len(data))
     with one_blas_thread():
         refuse_too_few(data)
-        closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
-        start = closed[_START if solver == "joint" else solver]
+        closed = {}
+        if data.guess is None:
+            closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
+        start = data.guess or closed[_START if solver == "joint" else solver]
         edges = Edges(start.x, start.z, data.unchanged)
         if solver == "joint":
             fit = fit_closure(data, edges)
@@ -122,7 +128,7 @@ def solve_hand_eye(
             spread = spread + misfit_covariance(data, fit.edges, fit.noise, arm)
     if not fit.settled:
         raise ConvergenceError(
-            f"hand-eye: the joint fit of {len(data)} views does not come to rest.",
+            f"{title(data.mount)}: the joint fit of {len(data)} views does not come to rest.",
             next_step="Take another solver with --solver, and look at the worst views.",
         )
     solutions = {"joint": _solution(data, fit.edges, boards)} if solver == "joint" else {}
@@ -149,5 +155,5 @@ def _solution(data: Closure, edges: Edges, boards: Boards) -> Solution:
         edges.x,
         edges.z,
         float(np.sqrt(np.mean(away_m**2))),
-        float(np.sqrt(np.mean(away_rad**2))),
+        float(np.sqrt(np.mean(away_rad**2))) if data.guess is None else None,
     )

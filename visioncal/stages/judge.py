@@ -1,6 +1,6 @@
 """Whether the result can be trusted, in plain sentences."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +10,21 @@ from visioncal.estimator.closure import Noise
 from visioncal.figures import figure
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult
-from visioncal.types import Rejection
+from visioncal.types import Mount, Rejection
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
 _ROUNDING = 1e-6
 _LISTED_VIEWS, _LISTED_PARTS = 3, 3
+_CAMERA_CAUSES = (
+    "a board that moved, images paired with other poses, units or conventions of the poses, "
+    "intrinsics, a warped board"
+)
+_CAUSES: Mapping[Mount, str] = {
+    "eye-in-hand": _CAMERA_CAUSES,
+    "eye-to-hand": _CAMERA_CAUSES,
+    "instrument": "an instrument or a tool that moved, readings paired with other poses, units or "
+    "conventions of the poses",
+}
 # So many views in a row are not left out by chance.
 _LEAST_RUN = 3
 
@@ -73,6 +83,7 @@ class Findings:
         notes: What of it is no reason for doubt.
         workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
             the median; None for a nominal arm [mm].
+        mount: What observed whom.
     """
 
     views: Sequence[ViewResult]
@@ -89,6 +100,7 @@ class Findings:
     warnings: Sequence[str]
     notes: Sequence[str] = ()
     workspace_mm: float | None = None
+    mount: Mount = "eye-in-hand"
 
 
 @dataclass(frozen=True)
@@ -139,9 +151,22 @@ def _praise(findings: Findings) -> str:
     used, worst = sum(view.used for view in findings.views), findings.hand_eye.worst[0]
     return (
         f"All {used} used views agree: left out of the fit, they are predicted to "
-        f"{figure(findings.held_out.mm)} mm and {figure(findings.held_out.deg)} deg (rms), and "
+        f"{_both(findings.held_out)} (rms), and "
         f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm."
     )
+
+
+def _both(rms: Rms) -> str:
+    """Residuals in position and, where these are known, in rotation."""
+    return f"{figure(rms.mm)} mm" + ("" if rms.deg is None else f" and {figure(rms.deg)} deg")
+
+
+def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
+    """Two sets' residuals side by side: of position and, where both are known, of rotation."""
+    pairs = [(one.mm, other.mm)]
+    if one.deg is not None and other.deg is not None:
+        pairs.append((one.deg, other.deg))
+    return pairs
 
 
 def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
@@ -152,20 +177,19 @@ def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doub
         for value, unit, (check, bad) in zip(
             (held.mm, held.deg), ("mm", "deg"), limits, strict=True
         )
-        if value > check
+        if value is not None and value > check
     ]
     if beyond:
         yield _Doubt(
             f"Left out of the fit, views disagree with the others by "
             f"{' and '.join(words for words, _ in beyond)}, rms; the worst are "
-            f"{_worst_views(findings.views)}. Possible causes: a board that moved, images paired "
-            "with other poses, units or conventions of the poses, intrinsics, a warped board, or "
-            "an arm with large model errors.",
+            f"{_worst_views(findings.views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
+            "arm with large model errors.",
             any(is_fatal for _, is_fatal in beyond),
         )
     ratios = [
         outside / within
-        for outside, within in ((held.mm, inside.mm), (held.deg, inside.deg))
+        for outside, within in _pairs(held, inside)
         if outside > _ROUNDING and within > 0.0
     ]
     ratio = max(ratios, default=0.0)
@@ -235,20 +259,22 @@ def outlying_views(
 
 
 def _residual(view: ViewResult, between: str = ", ") -> str:
-    mm, deg = view.residual_mm or 0.0, view.residual_deg or 0.0
-    return f"{figure(mm)} mm{between}{figure(deg)} deg"
+    turned = "" if view.residual_deg is None else f"{between}{figure(view.residual_deg)} deg"
+    return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
 def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
     holdout, held = findings.holdout, findings.held_out
     if holdout is None:
         return
-    ratio = max(holdout.mm / max(held.mm, _ROUNDING), holdout.deg / max(held.deg, _ROUNDING))
-    if ratio > options.holdout and max(holdout.mm, holdout.deg) > _ROUNDING:
+    pairs = _pairs(holdout, held)
+    ratio = max(back / max(left, _ROUNDING) for back, left in pairs)
+    if ratio > options.holdout and max(back for back, _ in pairs) > _ROUNDING:
+        observed = "readings" if findings.mount == "instrument" else "images"
         yield _Doubt(
-            f"The views that the session holds back are missed by {figure(holdout.mm)} mm and "
-            f"{figure(holdout.deg)} deg, {ratio:.0f} times worse than views left out in turn. They "
-            "lie where the result does not hold, or their poses or images are wrong."
+            f"The views that the session holds back are missed by {_both(holdout)}, {ratio:.0f} "
+            "times worse than views left out in turn. They lie where the result does not hold, or "
+            f"their poses or {observed} are wrong."
         )
 
 
@@ -358,9 +384,15 @@ def _robot_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
         return
     away_mm, away_deg = 1e3 * findings.robot.sigma_m, np.rad2deg(findings.robot.sigma_rad)
     if away_mm > options.robot_mm or away_deg > options.robot_deg:
+        cause = (
+            "the instrument reads worse than is stated of it, was moved, or the arm's model is off "
+            "by as much. Read a few stops twice to see how well readings repeat."
+            if findings.mount == "instrument"
+            else "the board is of another size than stated, or warped, the intrinsics are not this "
+            "camera's, or the arm's model is off by as much. Measure the board's squares first."
+        )
         yield _Doubt(
             f"To explain what is seen, the flange would have to be off by {figure(away_mm)} mm "
-            f"and {figure(away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely the "
-            "board is of another size than stated, or warped, the intrinsics are not this "
-            "camera's, or the arm's model is off by as much. Measure the board's squares first."
+            f"and {figure(away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
+            f"{cause}"
         )

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -90,7 +91,8 @@ def choose_level(
         if stated is not None:
             fits = _with_lost_zero(fits, data, stated, edges, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
-    levels = tuple(_level(name, fit) for name, fit in found.items())
+    turned = data.guess is None
+    levels = tuple(_level(name, fit, turned=turned) for name, fit in found.items())
     least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
     best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
     chosen = found[best.name]
@@ -130,13 +132,16 @@ def _best(levels: Sequence[Level]) -> Level:
     return best
 
 
-def _level(name: str, fit: LevelFit) -> Level:
-    return Level(name, fit.size, _rms(fit.inside), _rms(fit.left_out), fit.gain)
+def _level(name: str, fit: LevelFit, *, turned: bool) -> Level:
+    """Writes a fit as figures; `turned` says whether the views tell rotations."""
+    rms = partial(_rms, turned=turned)
+    return Level(name, fit.size, rms(fit.inside), rms(fit.left_out), fit.gain)
 
 
-def _rms(residuals: FloatArray) -> Rms:
+def _rms(residuals: FloatArray, *, turned: bool) -> Rms:
     square = np.mean(residuals.reshape(-1, 2, 3) ** 2, axis=0).sum(axis=1)
-    return Rms(mm=1e3 * float(np.sqrt(square[1])), deg=float(np.rad2deg(np.sqrt(square[0]))))
+    deg = float(np.rad2deg(np.sqrt(square[0])))
+    return Rms(mm=1e3 * float(np.sqrt(square[1])), deg=deg if turned else None)
 
 
 def check_asked(asked: str, *, can: bool, misread: str = "") -> None:

@@ -25,7 +25,7 @@ class HeldOut:
     Attributes:
         method: How views were left out, in words.
         away_m: (m,) distance between where the view and the fit place the target [m].
-        away_rad: (m,) the same in rotation [rad].
+        away_rad: (m,) the same in rotation [rad]; NaN where places alone were read.
         rms_px: (m,) reprojection error through the chain [px]; NaN for views without corners.
     """
 
@@ -72,12 +72,14 @@ def validate(
             held &= np.isin(boards.shown, boards.shown[~held])
             left, own = data.subset(held), boards.moved(edges.shared).first_from_own[held]
             placed = left.under(edges.shared).placed(edges.x)
-            away_m[held], away_rad[held] = distances(placed @ own, edges.z @ own)
+            away_m[held], turned = distances(placed @ own, edges.z @ own)
+            away_rad[held] = turned if data.guess is None else np.nan
             seen = [corners[int(at)] for at in np.flatnonzero(held)]
             rms_px[held] = chain_rms_px(left, edges, seen, free, own)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
+    fit = "whole fit" if data.mount == "instrument" else "hand-eye fit"
     unit = "views" if count == len(data) else "stops of the robot"
-    return HeldOut(f"{method} over {unit}, of the hand-eye fit", away_m, away_rad, rms_px)
+    return HeldOut(f"{method} over {unit}, of the {fit}", away_m, away_rad, rms_px)
 
 
 def _renumbered(stops: IntArray) -> IntArray:

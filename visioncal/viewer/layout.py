@@ -27,6 +27,8 @@ class _Contents:
     joints: int
     unused: bool
     frames: bool
+    turns: bool = True
+    sight: bool = True
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
@@ -49,6 +51,8 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         min(joints, default=0),
         not all(view.used for view in results),
         calibration is not None and bool(calibration.frames),
+        not results or any(view.residual_deg is not None for view in results),
+        session.mount != "instrument",
     )
     eye = _eye(session, calibration)
     arm = None if calibration is None else Kinematics.of(calibration)
@@ -84,7 +88,7 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
         ),
     )
     plots = _plots(contents)
-    left = rrb.Vertical(cell, rrb.Horizontal(plots[0], plots[-1]), row_shares=[3, 1])
+    left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
     verdict = _verdict(contents)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
     if not contents.images:
@@ -179,6 +183,8 @@ def _coverage(contents: _Contents) -> rrb.Container:
         paths.ROTATION_AXES,
         AXES_RINGS_DEG,
     )
+    if not contents.sight:
+        return rrb.Horizontal(axes, name="Coverage")
     if not contents.images:
         return rrb.Horizontal(directions, axes, name="Coverage")
     image = rrb.Spatial2DView(
@@ -243,7 +249,7 @@ def _cell_contents(contents: _Contents) -> list[str]:
 def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
     wanted = [
         ("Position residual [mm]", paths.POSITION_MM),
-        ("Orientation residual [deg]", paths.ORIENTATION_DEG),
+        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.turns else []),
     ]
     if contents.images:
         wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))

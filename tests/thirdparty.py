@@ -1,0 +1,121 @@
+"""Other people's readings of arms as sessions: a measuring arm, a laser, contacts of a humanoid."""
+
+import csv
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat
+from scipy.spatial.transform import Rotation
+
+from visioncal.robot import read_robot_document
+from visioncal.session import MemoryImages, Session
+from visioncal.types import FloatArray
+
+# What is not stated of these instruments is taken as usual for their kind.
+MEASURING_ARM, LASER = {"sigma_m": 6e-5}, {"sigma_m": 2e-5, "sigma_rad": 1e-4}
+CONTACT = {"sigma_m": 3e-4}
+
+
+def readings_session(
+    name: str,
+    robot: dict,
+    instrument: dict,
+    joints: FloatArray,
+    read: FloatArray,
+    *,
+    points: Sequence[str] = ("",),
+    held: Sequence[int] = (),
+) -> Session:
+    """A session of readings, as its text would be read.
+
+    Args:
+        name: Its name.
+        robot: The robot's document.
+        instrument: Its noise.
+        joints: (s, n) [rad].
+        read: (s p, 3) places or (s p, 7) poses [m], those of one stop together.
+        points: The names of p points.
+        held: Stops that no fit uses.
+    """
+    turned = read.shape[1] == 7
+    columns = ["view", "stop", "role", "point", "meas_x_m", "meas_y_m", "meas_z_m"]
+    columns += ["meas_qx", "meas_qy", "meas_qz", "meas_qw"] * turned
+    columns += [f"q{it + 1}_rad" for it in range(joints.shape[1])]
+    cells = []
+    for view, row in enumerate(read):
+        stop, point = divmod(view, len(points))
+        role = "holdout" if stop in held else ""
+        numbers = (*row, *joints[stop])
+        cells.append(
+            [str(view), str(stop), role, points[point], *(repr(float(it)) for it in numbers)]
+        )
+    document = {
+        "schema": 1,
+        "name": name,
+        "instrument": instrument,
+        "robot": {"model": robot["name"], "tip": robot["tip"]},
+    }
+    return Session.assemble(document, columns, cells, MemoryImages({}), robot_document=robot)
+
+
+def irb120(data: Path) -> Session:
+    """Three points at 36 stops of an ABB IRB 120 (Wu et al. 2015)."""
+    joints, read = irb120_set(data, "CaliJointAngles", "CaliPosition")
+    robot = read_robot_document("irb120")
+    return readings_session("irb120", robot, MEASURING_ARM, joints, read, points=("a", "b", "c"))
+
+
+def irb120_set(data: Path, joints: str, places: str) -> tuple[FloatArray, FloatArray]:
+    """Joint angles [rad] and places [m] of one of its sets."""
+    folder = data / "irb120_position"
+    q, read = (loadmat(folder / f"{it}.mat")[it].astype(float) for it in (joints, places))
+    return np.deg2rad(q), 1e-3 * read
+
+
+def rokae(data: Path, held: Sequence[int] = ()) -> Session:
+    """Poses at 30 stops of a six-axis arm, by a laser."""
+    folder = data / "rokae_laser_6d"
+    lines = (folder / "joint_angle.csv").read_text().splitlines()
+    inside = [re.search(r"j:\{([^}]*)\}", line)[1] for line in lines if "j:{" in line]
+    q = np.array([[float(it) for it in text.split(",")[:6]] for text in inside])
+    rows = [line.split() for line in (folder / "laser_pos.csv").read_text().splitlines() if line]
+    measured = np.array([[float(it) for it in row[7:13]] for row in rows])
+    turns = Rotation.from_euler("xyz", measured[:, 3:], degrees=True).as_quat()
+    read = np.column_stack([1e-3 * measured[:, :3], turns])
+    table = np.loadtxt(folder / "dh.csv", delimiter=",", skiprows=1)
+    return readings_session("rokae", modified_table(table), LASER, np.deg2rad(q), read, held=held)
+
+
+def modified_table(rows: FloatArray) -> dict:
+    """A robot's document of Craig's form from (n, 4) alpha [deg], a [mm], d [mm], theta [deg]."""
+    joints = [
+        {
+            "name": f"joint_{at + 1}",
+            "alpha_rad": float(np.deg2rad(alpha)),
+            "a_m": float(1e-3 * a),
+            "d_m": float(1e-3 * d),
+            "theta_offset_rad": float(np.deg2rad(theta)),
+        }
+        for at, (alpha, a, d, theta) in enumerate(rows)
+    ]
+    return {
+        "schema": 1,
+        "name": "rokae",
+        "tip": "flange",
+        "convention": "modified",
+        "joint": joints,
+    }
+
+
+def talos(data: Path, held: Sequence[int] = ()) -> Session:
+    """Contacts of the left hand of a TALOS at 61 postures."""
+    folder = data / "figaroh_small"
+    with (folder / "talos_left_arm_contact.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    names = [it for it in rows[0] if it.endswith("_joint")]
+    q = np.array([[float(row[it]) for it in names] for row in rows])
+    read = np.array([[float(row[it]) for it in ("x1", "y1", "z1")] for row in rows])
+    robot = read_robot_document(str(folder / "talos.urdf"), tip="gripper_left_base_link")
+    return readings_session("talos", robot, CONTACT, q, read, held=held)
