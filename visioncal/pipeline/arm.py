@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.told import EDGES, WHOLE_POSE
+from visioncal.estimator.told import EDGES
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
@@ -31,6 +31,8 @@ def telling_of(known: Known) -> Telling | None:
     if known.readings is not None:
         # Where further points sit on the flange is as open as where the first one does.
         further = np.arange(len(data.unchanged) - known.arm_size)
+    # Readings of one point show its place and no rotation; several points make a frame.
+    shows_pose = bool((data.told > 3).any())
     seen = ArmData(
         data,
         known.solved,
@@ -39,7 +41,7 @@ def telling_of(known: Known) -> Telling | None:
         known.joints(known.used)[first],
         corner_positions(targets[known.boards[0]]).mean(axis=0) if targets else np.zeros(3),
         np.concatenate([EDGES, 12 + further]),
-        WHOLE_POSE if data.guess is None else _PLACE,
+        measured=np.repeat([shows_pose, True], 3),
     )
     return tell(seen, known.convention)
 

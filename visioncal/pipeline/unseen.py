@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,12 @@ def unseen_views(known: Known, found: Kinematics) -> dict[str, list[dict[str, An
     before, after = (_lengths(fit.left_out) for fit in found.fits)
     first = np.unique(known.stops, return_index=True)[1]
     left_out = [known.used[int(at)] for at in first]
-    documents = {"left_out": list(_rows(left_out, before, after))}
+    rows = partial(_rows, turned=known.readings is None or known.readings.are_poses)
+    documents = {"left_out": list(rows(left_out, before, after))}
     views = sorted(known.measurable_held_back)
     if views:
         before, after = _held_back(known, found, views)
-        documents["holdout"] = list(_rows(views, before, after))
+        documents["holdout"] = list(rows(views, before, after))
     return documents
 
 
@@ -61,12 +63,16 @@ def _lengths(twists: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(twists.reshape(-1, 2, 3), axis=2))
 
 
-def _rows(views: Sequence[int], before: FloatArray, after: FloatArray) -> Iterator[dict[str, Any]]:
+def _rows(
+    views: Sequence[int], before: FloatArray, after: FloatArray, *, turned: bool
+) -> Iterator[dict[str, Any]]:
+    """One row a view; without degrees where places alone were read."""
     for view, was, now in zip(views, before, after, strict=True):
-        yield {
+        row: dict[str, Any] = {
             "view": view,
             "nominal_mm": 1e3 * float(was[1]),
             "nominal_deg": float(np.rad2deg(was[0])),
             "mm": 1e3 * float(now[1]),
             "deg": float(np.rad2deg(now[0])),
         }
+        yield {name: it for name, it in row.items() if turned or not name.endswith("deg")}

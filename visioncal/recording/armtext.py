@@ -74,7 +74,7 @@ def _levels(found: Kinematics) -> Iterator[str]:
 def _level(level: Level, *, taken: bool) -> str:
     words = f"**{plain(level.words)}**" if taken else plain(level.words)
     figures = (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
-    cells = [words, str(level.unknowns), *(f"{it:.2g}" for it in figures)]
+    cells = [words, str(level.unknowns), *("" if it is None else f"{it:.2g}" for it in figures)]
     return f"| {' | '.join([*cells, f'{level.likelihood_ratio:.0f}'])} |"
 
 

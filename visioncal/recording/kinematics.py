@@ -40,19 +40,25 @@ class Level:
         name: As on disk.
         unknowns: How many values it frees.
         rms_mm: Residual of the target's place in the fit [mm].
-        rms_deg: And of its orientation [deg].
+        rms_deg: And of its orientation [deg]; None where places alone were read.
         held_out_mm: The same of stops that were left out [mm].
-        held_out_deg: And of their orientation [deg].
+        held_out_deg: And of their orientation [deg]; None likewise.
         likelihood_ratio: Twice the gain in log-likelihood over the arm as stated.
     """
 
     name: str
     unknowns: int
     rms_mm: float
-    rms_deg: float
+    rms_deg: float | None
     held_out_mm: float
-    held_out_deg: float
+    held_out_deg: float | None
     likelihood_ratio: float
+
+    @property
+    def held_out(self) -> str:
+        """How well stops that were left out are predicted."""
+        turned = "" if self.held_out_deg is None else f" and {self.held_out_deg:.2g} deg"
+        return f"{self.held_out_mm:.2g} mm{turned}"
 
     @property
     def words(self) -> str:
@@ -90,13 +96,16 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Unseen:
-    """How far a view that the fit had not seen is off, by the arm as stated and as calibrated."""
+    """How far a view that the fit had not seen is off, by the arm as stated and as calibrated.
+
+    Degrees are None where places alone were read.
+    """
 
     view: int
     nominal_mm: float
-    nominal_deg: float
+    nominal_deg: float | None
     mm: float
-    deg: float
+    deg: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +186,7 @@ class Kinematics:
             )
         return (
             f"Taken: {now.words}. It predicts stops that are left out of the fit to "
-            f"{now.held_out_mm:.2g} mm and {now.held_out_deg:.2g} deg, the arm as stated to "
-            f"{before.held_out_mm:.2g} mm and {before.held_out_deg:.2g} deg."
+            f"{now.held_out}, the arm as stated to {before.held_out}."
         )
 
     def grouped(self) -> dict[str, list[Parameter]]:
@@ -219,11 +227,15 @@ def _level(document: Mapping[str, Any]) -> Level:
         str(document["level"]),
         int(document["unknowns"]),
         float(document["rms_mm"]),
-        float(document["rms_deg"]),
+        _known(document, "rms_deg"),
         float(document["held_out_mm"]),
-        float(document["held_out_deg"]),
+        _known(document, "held_out_deg"),
         float(document["likelihood_ratio"]),
     )
+
+
+def _known(document: Mapping[str, Any], name: str) -> float | None:
+    return float(document[name]) if name in document else None
 
 
 def _parameter(document: Mapping[str, Any]) -> Parameter:
@@ -254,7 +266,10 @@ def _unseen(documents: Sequence[Mapping[str, Any]]) -> tuple[Unseen, ...]:
     return tuple(
         Unseen(
             int(it["view"]),
-            *(float(it[name]) for name in ("nominal_mm", "nominal_deg", "mm", "deg")),
+            float(it["nominal_mm"]),
+            _known(it, "nominal_deg"),
+            float(it["mm"]),
+            _known(it, "deg"),
         )
         for it in documents
     )

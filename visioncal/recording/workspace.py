@@ -133,8 +133,9 @@ def _log_unseen(stream: rr.RecordingStream, seen: Unseen, *, held: bool) -> None
         (paths.UNSEEN_MM, seen.nominal_mm, seen.mm),
         (paths.UNSEEN_DEG, seen.nominal_deg, seen.deg),
     ):
-        stream.log(_series(plot, _STATED, held=held), rr.Scalars(before))
-        stream.log(_series(plot, _CALIBRATED, held=held), rr.Scalars(after))
+        if before is not None and after is not None:
+            stream.log(_series(plot, _STATED, held=held), rr.Scalars(before))
+            stream.log(_series(plot, _CALIBRATED, held=held), rr.Scalars(after))
 
 
 def _series(plot: str, name: str, *, held: bool) -> str:

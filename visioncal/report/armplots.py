@@ -26,7 +26,7 @@ _TALLEST = 1.0
 
 _BEFORE, _AFTER = svg.CHECK, svg.ACCENT
 
-_Pair = Callable[[Unseen], tuple[float, float]]
+_Pair = Callable[[Unseen], tuple[float | None, float | None]]
 
 
 def before_and_after(found: Kinematics) -> Markup:
@@ -40,15 +40,14 @@ def before_and_after(found: Kinematics) -> Markup:
     views = [*found.left_out, *found.holdout]
     places = np.arange(float(len(views)))
     places[len(found.left_out) :] += _GAP
-    panels: tuple[tuple[str, _Pair], ...] = (
-        ("position [mm]", lambda it: (it.nominal_mm, it.mm)),
-        ("orientation [deg]", lambda it: (it.nominal_deg, it.deg)),
-    )
+    panels: list[tuple[str, _Pair]] = [("position [mm]", lambda it: (it.nominal_mm, it.mm))]
+    if all(it.deg is not None for it in views):
+        panels.append(("orientation [deg]", lambda it: (it.nominal_deg, it.deg)))
     with svg.style():
-        figure = svg.new_figure(_WIDE_IN, 3.4)
-        rows = figure.subplots(len(panels), sharex=True)
+        figure = svg.new_figure(_WIDE_IN, 1.7 * len(panels))
+        rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
         for axes, (label, pair) in zip(rows, panels, strict=True):
-            pairs = np.array([pair(it) for it in views])
+            pairs = np.array([pair(it) for it in views], dtype=float)
             _dumbbells(axes, places, pairs)
             _mark_rms(axes, pairs[: len(found.left_out)])
             axes.set_ylabel(label)

@@ -137,7 +137,11 @@ def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
             )
             for name, entity in (
                 (f"Left out [mm], {words}", paths.UNSEEN_MM),
-                (f"Left out [deg], {words}", paths.UNSEEN_DEG),
+                *(
+                    [(f"Left out [deg], {words}", paths.UNSEEN_DEG)]
+                    if found.nominal.held_out_deg is not None
+                    else []
+                ),
             )
         )
     )
