@@ -113,7 +113,10 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
 
     Three points have six values more than one, of their places.
     """
-    shop = tracked(replace(options, stops=60, **WRONG))
+    shop = tracked(replace(options, **WRONG))
+    seen = known_of(session_of(shop)).telling.told
+    # What shapes the points' pattern is told beside the arm.
+    assert (seen.identifiable, seen.told) == (min(rank, 30), min(rank, 30))
     whole = information(shop, arm_columns=True)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))
     values = np.linalg.eigvalsh(whole * np.outer(scale, scale))
@@ -154,13 +157,17 @@ def test_outputs_are_whole_and_the_recording_gives_them_again(options, tmp_path)
     # The arm's 0.03 mm is told from the instrument's 0.02 mm, to some 15 %.
     assert document["noise"]["robot_translation_mm"] == pytest.approx(0.03, rel=0.5)
     assert ("deg" in document["rms"]) == options.poses
-    assert ("held_out_deg" in document["kinematics"]["levels"][0]) == options.poses
+    found = document["kinematics"]
+    assert ("held_out_deg" in found["levels"][0]) == options.poses
+    assert ("deg" in found["left_out"][0]) == options.poses
     rotation = np.array(document["transforms"]["flange_from_probe"]["covariance"])[:3, :3]
     assert rotation.any() == options.poses
     again = visioncal.calibrate(visioncal.Session.load(out / "recording.rrd"))
     again.save(tmp_path / "again.json")
     repeated = json.loads((tmp_path / "again.json").read_text())
     assert repeated | {"created": ""} == document | {"created": ""}
+    assert "child_frame_id: instrument" in command("export", out, "--to", "ros").out
+    assert "holds the camera, and" in command("export", out, "--to", "easy-handeye2").err
     report = (out / "report.html").read_text()
     assert "the instrument" in report
     assert "optical axis" not in report

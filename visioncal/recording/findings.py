@@ -135,9 +135,7 @@ class Findings:
         )
 
 
-def read_stage(
-    calibration: Calibration, name: str, read: Callable[[Mapping[str, Any]], _T]
-) -> _T | None:
+def read_stage(calibration: Calibration, name: str, read: Callable[[Any], _T]) -> _T | None:
     """Reads what one further stage found; None where it did not run.
 
     Raises:

@@ -141,10 +141,12 @@ def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str
 def _when_good(calibration: Calibration) -> Iterator[str]:
     wanted = next(iter(calibration.edges))
     arm = ", and the poses of the calibrated arm" if calibration.arm_is_calibrated else ""
+    is_read = calibration.mount == "instrument"
+    moved = "instrument from a moved probe" if is_read else "camera from a moved board"
     yield f"Use {wanted} as it stands in calibration.json, with its covariance{arm}."
     yield (
         "Keep calibration.json: visioncal diff tells a later calibration's change from noise, and "
-        "a moved camera from a moved board."
+        f"a moved {moved}."
     )
 
 

@@ -1,15 +1,17 @@
 """What the report says: rows of ready text, made from a calibration."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
+from typing import Any
 
 import numpy as np
 
 from visioncal.calibration import Calibration, Edge, Rms, SolverResult, Verdict, ViewResult
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
+from visioncal.recording.findings import read_stage
 from visioncal.recording.kinematics import Kinematics
 from visioncal.recording.numbers import decimals_for, fixed, matched, significant
 from visioncal.report.advice import Suspects, contradicts, outlying_views
@@ -264,11 +266,7 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
     """How the result was obtained."""
     used = sum(view.used for view in calibration.views)
     facts = [
-        Fact(
-            "mount",
-            calibration.mount,
-            _MOUNTS[calibration.mount],
-        ),
+        Fact("mount", calibration.mount, _MOUNTS[calibration.mount]),
         Fact("views", f"{used} used of {len(calibration.views)}"),
     ]
     answer = answering_solver(calibration)
@@ -285,7 +283,25 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         camera = calibration.camera.camera
         width, height = camera.resolution
         facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
-    return tuple(facts)
+    return (*facts, *_instrument_facts(calibration))
+
+
+def _instrument_facts(calibration: Calibration) -> tuple[Fact, ...]:
+    """What an instrument read, and where the points sit on the flange; empty without one."""
+    stated = read_stage(calibration, "instrument", lambda it: (str(it["words"]), str(it["reads"])))
+    points = read_stage(calibration, "points", lambda rows: [_point_fact(it) for it in rows])
+    if stated is None:
+        return ()
+    words, reads = stated
+    return (Fact("instrument", words, f"it read {reads}"), *(points or ()))
+
+
+def _point_fact(point: Mapping[str, Any]) -> Fact:
+    sigma_mm = float(point["sigma_mm"])
+    axis_mm = sigma_mm / np.sqrt(3.0)
+    place = ", ".join(matched(1e3 * float(point[name]), axis_mm) for name in ("x_m", "y_m", "z_m"))
+    note = f"{PLUS_MINUS} {significant(sigma_mm)}, on the flange"
+    return Fact(f"point {point['point']}", f"[{place}] mm", note)
 
 
 def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:
