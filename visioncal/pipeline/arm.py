@@ -15,8 +15,6 @@ from visioncal.targets import corner_positions
 
 # So many places are enough for a map.
 _PLACES = 200
-# What readings of points tell of a pose: nothing of its rotation.
-_PLACE = np.arange(6) >= 3
 
 
 def telling_of(known: Known) -> Telling | None:
