@@ -26,9 +26,6 @@ def telling_of(known: Known) -> Telling | None:
     first = np.unique(known.stops, return_index=True)[1]
     data = known.closure(known.used).merged(known.stops)
     further = np.arange(boards.begin, boards.begin + boards.unknowns)
-    if known.readings is not None:
-        # Where further points sit on the flange is as open as where the first one does.
-        further = np.arange(len(data.unchanged) - known.arm_size)
     # Readings of one point show its place and no rotation; several points make a frame.
     shows_pose = bool((data.told > 3).any())
     seen = ArmData(
