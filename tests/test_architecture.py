@@ -40,7 +40,7 @@ LAYERS = (
     ("stages",),
     ("pipeline",),
     ("frames",),
-    ("report", "viewer"),
+    ("planning", "report", "viewer"),
     ("outputs",),
     ("stored", "formats", "exports"),
     ("joining",),
