@@ -204,6 +204,16 @@ def first_corners(targets: Sequence[Target]) -> IntArray:
     return np.cumsum([0, *counts], dtype=np.int64)[:-1]
 
 
+def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
+    """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
+    side = target.square_m
+    if target.kind == "marker":
+        return np.full(2, -0.5 * side), np.full(2, 0.5 * side)
+    # A checkerboard's origin is its first inner corner, one square inside.
+    low = np.full(2, 0.0 if target.kind == "charuco" else -side)
+    return low, side * np.array([target.columns, target.rows], dtype=float)
+
+
 def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     """Builds OpenCV's board for a ChArUco target.
 

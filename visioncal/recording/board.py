@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from visioncal.targets import aruco_dictionary, charuco_board
+from visioncal.targets import aruco_dictionary, charuco_board, extent_m
 from visioncal.types import FloatArray, Image, Target
 
 # Enough to show the bits of the markers; the pattern of a large board still stays small.
@@ -13,7 +13,7 @@ _SQUARE_PX, _LARGEST_PX = 48, 2000
 
 def outline(target: Target) -> FloatArray:
     """(4, 3) corners of the printed pattern in the target's frame [m], clockwise on the page."""
-    low, high = _extent_m(target)
+    low, high = extent_m(target)
     return np.array(
         [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
     )
@@ -38,7 +38,7 @@ def sheet(target: Target) -> rr.Mesh3D:
 
 def picture(target: Target) -> Image:
     """The printed pattern inside its outline, as a grey image with x to the right and y down."""
-    squares = np.rint(np.subtract(*_extent_m(target)[::-1]) / target.square_m).astype(int)
+    squares = np.rint(np.subtract(*extent_m(target)[::-1]) / target.square_m).astype(int)
     square_px = max(min(_SQUARE_PX, _LARGEST_PX // int(squares.max())), 1)
     columns, rows = (int(count) for count in squares)
     if target.kind == "charuco":
@@ -53,13 +53,3 @@ def picture(target: Target) -> Image:
     # The square that touches corner 0 from outside, on its diagonal, is dark.
     light = np.where((row + column) % 2, 255, 0).astype(np.uint8)
     return np.kron(light, np.ones((square_px, square_px), dtype=np.uint8))
-
-
-def _extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
-    """Low and high x, y of the printed pattern in the target's frame [m]."""
-    side = target.square_m
-    if target.kind == "marker":
-        return np.full(2, -0.5 * side), np.full(2, 0.5 * side)
-    # A checkerboard's origin is its first inner corner, one square inside.
-    low = np.full(2, 0.0 if target.kind == "charuco" else -side)
-    return low, side * np.array([target.columns, target.rows], dtype=float)
