@@ -159,6 +159,26 @@ class Inverse:
         nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
         return replace(nearest, beyond=self._in_the_way(goal, wanted))
 
+    def from_start(self, base_from_flange: FloatArray, start: FloatArray) -> Posture:
+        """Goes to a pose from one posture alone: quick, for one that may be left out if it fails.
+
+        Args:
+            base_from_flange: (4, 4) the pose [m].
+            start: (n,) effective positions to start from [rad or m].
+
+        Returns:
+            Where the search ended, with joints turned as little as can be from zero.
+        """
+        import pinocchio as pin
+
+        goal = pin.SE3(base_from_flange)
+        return self._descend(goal, start, self._bounds, np.zeros(len(start)))
+
+    def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Draws (count, n) effective positions all over the joints' range [rad or m]."""
+        middle, half = self._bounds.middle_and_half(np.zeros(len(self._names)))
+        return np.asarray(middle + rng.uniform(-1.0, 1.0, (count, len(half))) * half)
+
     def _from_everywhere(
         self, goal: "pin.SE3", bounds: _Bounds, wanted: FloatArray
     ) -> Iterator[Posture]:

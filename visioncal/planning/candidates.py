@@ -1,0 +1,197 @@
+"""Stops that a robot can take: reachable, clear of everything, with the whole board in view."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.planning.cell import PlanCell
+from visioncal.planning.losses import (
+    CLEARANCE,
+    DISTANCE,
+    FOCUS,
+    GUESS,
+    IMAGE,
+    LIMITS,
+    REACH,
+    TILT,
+    Losses,
+)
+from visioncal.planning.obstacles import collisions_of
+from visioncal.planning.sight import sight_of
+from visioncal.robot import Robot
+from visioncal.robot.inverse import Inverse
+from visioncal.types import FloatArray, Mask, Progress
+
+# Stops are taken that show the board in this share of what the cell may really be; where next to
+# none do, the best of those that show it more often than not.
+_SURE, _RATHER, _NEXT_TO_NONE, _BEST = 0.97, 0.5, 0.01, 0.9
+# How many times the wished number of stops is tried, views and postures, before what was found is
+# taken; fewer than a tenth of the wish, or than a plan needs, are too few.
+_TRIES, _MOST_DRAWN, _LEAST_SHARE, _LEAST = 30, 400, 0.1, 12
+_BATCH = 2000
+# An arm with fewer joints reaches a drawn view only by chance: its postures are drawn instead.
+_FREE = 6
+# How many views that were out of reach are looked at again, to say why.
+_ASKED_AGAIN = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Stops that a robot can take.
+
+    Attributes:
+        q: (k, n) joint angles [rad].
+        cam_from_target: (k, 4, 4) how the board is seen, if the guesses are right [m].
+        seen: (k,) share of what the cell may really be in which the whole board is in the image.
+        lost: What kept how many drawn views or postures from being among them.
+    """
+
+    q: FloatArray
+    cam_from_target: FloatArray
+    seen: FloatArray
+    lost: Mapping[str, int]
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def candidates(
+    cell: PlanCell, count: int, seed: int = 0, progress: Progress | None = None
+) -> Candidates:
+    """Finds stops all over what the robot can reach and the camera can see.
+
+    Views of the board are drawn, and postures that reach them, each from a start of its own, so
+    that shoulder, elbow and wrist take all their branches. Of an arm with fewer than six joints the
+    postures are drawn.
+
+    Args:
+        cell: The cell.
+        count: How many are wished.
+        seed: Of everything random; the same seed gives the same stops.
+        progress: Called as stops are found.
+
+    Returns:
+        The stops, in random order; fewer than wished where the cell gives no more.
+
+    Raises:
+        DataError: There are too few; the message names what keeps the others from it.
+    """
+    search = _Search(cell, count, seed)
+    search.run(progress)
+    if len(search.kept) < max(_LEAST_SHARE * count, min(_LEAST, count)):
+        search.ask_again()
+        raise search.losses.error(len(search.kept), count)
+    q = np.array([it for it, _ in search.kept])
+    shares = np.array([share for _, share in search.kept])
+    return Candidates(q, cell.cam_from_target(q), shares, search.losses.counts())
+
+
+class _Search:
+    """Stops as they are found, with a count of what the others were lost to."""
+
+    def __init__(self, cell: PlanCell, count: int, seed: int) -> None:
+        self.kept: list[tuple[FloatArray, float]] = []
+        self.losses = Losses()
+        self._cell, self._count = cell, count
+        self._rng = np.random.default_rng(seed)
+        self._sight = sight_of(cell, seed)
+        self._collisions = collisions_of(cell)
+        self._inverse = Inverse(cell.robot)
+        self._unreached: list[FloatArray] = []
+
+    def run(self, progress: Progress | None) -> None:
+        """Draws until there are enough, or until it is plain that there are not."""
+        drawn, tried = 0, 0
+        draw = self._reaching if self._cell.robot.joint_count >= _FREE else self._postures
+        while (
+            len(self.kept) < self._count
+            and drawn <= _MOST_DRAWN * self._count
+            and tried <= _TRIES * self._count
+        ):
+            q, share = draw()
+            drawn, tried = drawn + _BATCH, tried + len(q)
+            self._keep(q, share)
+            if progress is not None:
+                progress("candidates", min(len(self.kept), self._count), self._count)
+        del self.kept[self._count :]
+
+    def ask_again(self) -> None:
+        """Finds the joints whose limits alone kept the arm from views that it did not reach."""
+        still = np.zeros(self._cell.robot.joint_count)
+        found = [self._inverse.solve(it, still) for it in self._unreached]
+        self.losses.blame(REACH, [f"limits of {name}" for it in found for name in it.beyond])
+
+    def _reaching(self) -> tuple[FloatArray, FloatArray]:
+        """Postures (k, n) that reach drawn views, and their shares (k,)."""
+        sight, robot, passed = self._sight, self._cell.robot, self.losses.passed
+        views = sight.draw(_BATCH, self._rng)
+        views = views[passed(IMAGE, sight.shows(views))]
+        views = views[passed(FOCUS, sight.sharp(views))]
+        flange = self._cell.flange_at(views)
+        share = sight.share(flange)
+        sure = passed(GUESS, _sure(share))
+        # More than are still needed would be thrown away.
+        few = np.flatnonzero(sure)[: 3 * (self._count - len(self.kept)) + 50]
+        flange, share = flange[few], share[few]
+        starts = self._inverse.starts(len(flange), self._rng)
+        near = _within(robot, flange)
+        reached = np.zeros(len(flange), dtype=bool)
+        for row in np.flatnonzero(near):
+            posture = self._inverse.from_start(flange[row], starts[row])
+            reached[row], starts[row] = posture.reached, posture.positions
+        passed(REACH, reached)
+        self._unreached += list(flange[~reached][: _ASKED_AGAIN - len(self._unreached)])
+        return robot.chain.encoded(starts[reached]), share[reached]
+
+    def _postures(self) -> tuple[FloatArray, FloatArray]:
+        """Drawn postures (k, n) that show the board, and their shares (k,)."""
+        sight, cell = self._sight, self._cell
+        q = cell.robot.chain.encoded(self._inverse.starts(_BATCH, self._rng))
+        flange = cell.robot.base_from_flange(q)
+        views = cell.seen_from(flange)
+        near, far = sight.distance_m
+        distance = sight.distances_m(views)
+        kept = np.ones(len(q), dtype=bool)
+        for limit, good in (
+            (IMAGE, sight.shows(views)),
+            (TILT, sight.tilt_rad(views) <= cell.limits.tilt_rad),
+            (DISTANCE, (distance >= near) & (distance <= far)),
+            (FOCUS, sight.sharp(views)),
+        ):
+            self.losses.passed(limit, good[kept])
+            kept &= good
+        q, share = q[kept], sight.share(flange[kept])
+        sure = self.losses.passed(GUESS, _sure(share))
+        return q[sure], share[sure]
+
+    def _keep(self, q: FloatArray, share: FloatArray) -> None:
+        """Keeps the postures (k, n) within the joints' limits that touch nothing."""
+        robot, margin = self._cell.robot, self._cell.limits.joint_margin_rad
+        over = np.maximum(robot.lower_rad + margin - q, q - robot.upper_rad + margin)
+        within = self.losses.passed(LIMITS, np.asarray(np.all(over <= 0.0, axis=1)))
+        self.losses.blame(LIMITS, [robot.joint_names[it] for it in over[~within].argmax(axis=1)])
+        q, share = q[within], share[within]
+        contact = self._collisions.first_contact(q)
+        clear = self.losses.passed(CLEARANCE, contact < 0)
+        pairs = [self._collisions.names[place] for place in contact[~clear]]
+        self.losses.blame(CLEARANCE, [f"{first} and {second}" for first, second in pairs])
+        self.kept += zip(q[clear], share[clear].tolist(), strict=True)
+
+
+def _within(robot: Robot, flange: FloatArray) -> Mask:
+    """Whether poses (k, 4, 4) are nearer than the outstretched arm."""
+    chain = robot.chain
+    if chain.prismatic.any():
+        return np.ones(len(flange), dtype=bool)
+    longest = float(np.linalg.norm(chain.placements[1:, :3, 3], axis=1).sum())
+    away = np.linalg.norm(flange[:, :3, 3] - chain.placements[0][:3, 3], axis=1)
+    return np.asarray(away <= longest)
+
+
+def _sure(share: FloatArray) -> Mask:
+    """Which of (k,) shares are taken."""
+    sure = share >= _SURE
+    if not len(share) or sure.mean() > _NEXT_TO_NONE:
+        return sure
+    return np.asarray(share >= max(_RATHER, float(np.quantile(share, _BEST))))

@@ -1,0 +1,169 @@
+"""From where a board is seen: views drawn around it, and the share of guesses that show it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.camera import normalise, project
+from visioncal.planning.cell import PlanCell
+from visioncal.planning.obstacles import board_size_m
+from visioncal.targets import extent_m
+from visioncal.transforms import compose, invert
+from visioncal.types import Camera, FloatArray, Mask, Target
+
+# How large the board is drawn: the image's half short side over half the print's diagonal.
+_NEAREST, _FARTHEST = 0.75, 1.6
+# The guesses are off by less than so many standard deviations, and a plan goes no farther than so
+# many times the distance at which the board would fill the image.
+_SURELY, _NEVER_BEYOND = 2.2, 6.0
+# How many cells stand for what may really be, and how many points for the print's outline.
+_GUESSES, _SIDE_POINTS = 40, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A camera that looks at a board.
+
+    Attributes:
+        cell: The cell, as it is guessed.
+        distance_m: Least and greatest distance between camera and board's centre [m].
+        outline: (p, 3) points around the print, in the target's frame [m].
+        centre: (3,) the print's centre [m].
+        rays_within: Tangents of rays are shorter; beyond, a lens model may fold back into the
+            image.
+        x: (g, 4, 4) draws of the guessed edge x.
+        z: (g, 4, 4) draws of the guessed edge z.
+    """
+
+    cell: PlanCell
+    distance_m: tuple[float, float]
+    outline: FloatArray
+    centre: FloatArray
+    rays_within: float
+    x: FloatArray
+    z: FloatArray
+
+    def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Draws views of the board.
+
+        The camera lies on a cap around the board's normal, uniform on its area, and is turned any
+        way about its line of sight; the board's centre is anywhere in the image.
+
+        Args:
+            count: How many.
+            rng: Source of randomness.
+
+        Returns:
+            (count, 4, 4) `cam_from_target` [m].
+        """
+        camera, limits = self.cell.camera, self.cell.limits
+        tilt = np.arccos(rng.uniform(np.cos(limits.tilt_rad), 1.0, count))
+        azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
+        inside = np.array(camera.resolution) - 1.0 - 2.0 * limits.edge_px
+        aim = limits.edge_px + rng.uniform(size=(count, 2)) * inside
+        plane = np.nan_to_num(normalise(camera, aim))
+        ray = np.column_stack([plane, np.ones(count)])
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        # The target's z leaves the camera. The turn that takes z to the ray comes last.
+        spun = Rotation.from_euler("ZXZ", np.column_stack([roll, tilt, azimuth]))
+        across = np.cross([0.0, 0.0, 1.0], ray)
+        sine = np.linalg.norm(across, axis=1, keepdims=True)
+        angle = np.arctan2(sine, ray[:, 2:])
+        turn = Rotation.from_rotvec(across * angle / np.maximum(sine, 1e-12))
+        rotation = np.asarray((turn * spun).as_matrix())
+        distance = rng.uniform(*self.distance_m, size=(count, 1))
+        return compose(rotation, distance * ray - rotation @ self.centre)
+
+    def shows(self, cam_from_target: FloatArray) -> Mask:
+        """Whether the whole print is in the image (...) of views (..., 4, 4)."""
+        camera, edge = self.cell.camera, self.cell.limits.edge_px
+        rotation = np.swapaxes(cam_from_target[..., :3, :3], -1, -2)
+        points = self.outline @ rotation + cam_from_target[..., None, :3, 3]
+        flat = points.reshape(-1, 3)
+        radius = np.linalg.norm(flat[:, :2], axis=1)
+        straight = radius < self.rays_within * flat[:, 2]
+        px = np.full((len(flat), 2), -np.inf)
+        px[straight] = project(camera, flat[straight])
+        inside = (px >= edge) & (px <= np.array(camera.resolution) - 1.0 - edge)
+        return np.asarray(inside.reshape(*points.shape[:-1], 2).all(axis=(-1, -2)))
+
+    def share(self, base_from_flange: FloatArray) -> FloatArray:
+        """The share (k,) of the guesses' draws in which (k, 4, 4) poses show the whole print."""
+        flange = base_from_flange[:, None]
+        if self.cell.mount == "eye-in-hand":
+            drawn = invert(flange @ self.x) @ self.z
+        else:
+            drawn = invert(self.x) @ flange @ self.z
+        return np.asarray(self.shows(drawn).mean(axis=1))
+
+    def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
+        """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
+        centre = cam_from_target[:, :3, :3] @ self.centre + cam_from_target[:, :3, 3]
+        along = np.einsum("ki,ki->k", centre, cam_from_target[:, :3, 2])
+        return np.asarray(np.arccos(np.clip(along / np.linalg.norm(centre, axis=1), -1.0, 1.0)))
+
+    def distances_m(self, cam_from_target: FloatArray) -> FloatArray:
+        """Distances (k,) between the camera and the board's centre [m]."""
+        centre = cam_from_target[:, :3, :3] @ self.centre + cam_from_target[:, :3, 3]
+        return np.asarray(np.linalg.norm(centre, axis=1))
+
+    def sharp(self, cam_from_target: FloatArray) -> Mask:
+        """Whether the whole print (k,) lies within the depths at which the image is sharp."""
+        span = self.cell.limits.focus_m
+        if span is None:
+            return np.ones(len(cam_from_target), dtype=bool)
+        depth = cam_from_target[:, 2, :3] @ self.outline.T + cam_from_target[:, 2, 3, None]
+        return np.asarray(((depth >= span[0]) & (depth <= span[1])).all(axis=1))
+
+
+def sight_of(cell: PlanCell, seed: int) -> Sight:
+    """Prepares the views of a cell, with draws of what its guesses may really be."""
+    drawn = cell.guesses(_GUESSES, seed)
+    low, high = extent_m(cell.target)
+    tangents = _tangents(cell.camera, 0.0)
+    return Sight(
+        cell,
+        cell.limits.distance_m or _distance_m(cell),
+        _outline(cell.target),
+        np.append(0.5 * (low + high), 0.0),
+        float(np.nanmax(np.linalg.norm(tangents, axis=1))) * (1.0 + 1e-6),
+        np.array([it.x for it in drawn]),
+        np.array([it.z for it in drawn]),
+    )
+
+
+def _distance_m(cell: PlanCell) -> tuple[float, float]:
+    """Distances at which the board fills the image, and stays in it if the guesses are off [m].
+
+    At a distance d the board is off by the errors of both places, by d times the error of the
+    camera's direction, and by half its own size times the error of its own.
+    """
+    half = float(np.nanmin(np.abs(_tangents(cell.camera, cell.limits.edge_px)).max(axis=1)))
+    radius = 0.5 * board_size_m(cell.target)
+    full = radius / half
+    farthest = _FARTHEST * full
+    for d in np.linspace(full, _NEVER_BEYOND * full, 60):
+        turned = cell.sigma_rad * np.hypot(d, radius)
+        if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
+            return _NEAREST * full, max(farthest, 1.5 * float(d))
+    return _NEAREST * full, _NEVER_BEYOND * full
+
+
+def _tangents(camera: Camera, edge_px: float) -> FloatArray:
+    """(n, 2) x / z and y / z of rays along the image's border, `edge_px` inside."""
+    along = np.linspace(-1.0, 1.0, 9)
+    ones = np.ones_like(along)
+    sides = [(along, -ones), (along, ones), (-ones, along), (ones, along)]
+    unit = np.concatenate([np.column_stack(side) for side in sides])
+    half = 0.5 * (np.array(camera.resolution) - 1.0)
+    return normalise(camera, half + unit * (half - edge_px))
+
+
+def _outline(target: Target) -> FloatArray:
+    """(p, 3) points around the print [m]."""
+    low, high = extent_m(target)
+    knots = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    shares = np.arange(_SIDE_POINTS)[:, None, None] / _SIDE_POINTS
+    points = knots + shares * (np.roll(knots, -1, axis=0) - knots)
+    return np.pad(points.reshape(-1, 2), ((0, 0), (0, 1)))
