@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.losses import (
+    AWAY,
     CLEARANCE,
     DISTANCE,
     FOCUS,
@@ -23,13 +24,16 @@ from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.types import FloatArray, Mask, Progress
 
-# Stops are taken that show the board in this share of what the cell may really be; where next to
-# none do, the best of those that show it more often than not.
-_SURE, _RATHER, _NEXT_TO_NONE, _BEST = 0.97, 0.5, 0.01, 0.9
-# How many times the wished number of stops is tried, views and postures, before what was found is
-# taken; fewer than a tenth of the wish, or than a plan needs, are too few.
-_TRIES, _MOST_DRAWN, _LEAST_SHARE, _LEAST = 30, 400, 0.1, 12
-_BATCH = 2000
+# Stops are taken that show the board in this share of what the cell may really be; where there are
+# too few, those that show it less surely.
+_SURE = (0.97, 0.9, 0.7, 0.5)
+# How many views or postures are drawn at a time; how many times before the next share is taken,
+# and how many where next to none are found: less than this share of the wish.
+_BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 15, 0.03
+# Fewer than this share of the wish, or than a plan needs, are too few.
+_LEAST_SHARE, _LEAST = 0.1, 12
+# So many stops tell at what distances others may be found.
+_TELLING = 100
 # An arm with fewer joints reaches a drawn view only by chance: its postures are drawn instead.
 _FREE = 6
 # How many views that were out of reach are looked at again, to say why.
@@ -93,6 +97,7 @@ class _Search:
     def __init__(self, cell: PlanCell, count: int, seed: int) -> None:
         self.kept: list[tuple[FloatArray, float]] = []
         self.losses = Losses()
+        self._bar, self._narrowed = _SURE[0], False
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
         self._sight = sight_of(cell, seed)
@@ -102,19 +107,26 @@ class _Search:
 
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough, or until it is plain that there are not."""
-        drawn, tried = 0, 0
         draw = self._reaching if self._cell.robot.joint_count >= _FREE else self._postures
-        while (
-            len(self.kept) < self._count
-            and drawn <= _MOST_DRAWN * self._count
-            and tried <= _TRIES * self._count
-        ):
-            q, share = draw()
-            drawn, tried = drawn + _BATCH, tried + len(q)
-            self._keep(q, share)
-            if progress is not None:
-                progress("candidates", min(len(self.kept), self._count), self._count)
+        for self._bar in _SURE:
+            for draws in range(_DRAWS):
+                poor = len(self.kept) < _NEXT_TO_NONE * self._count
+                if len(self.kept) >= self._count or (poor and draws >= _FIRST_DRAWS):
+                    break
+                self._keep(*draw())
+                self._narrow()
+                if progress is not None:
+                    progress("candidates", min(len(self.kept), self._count), self._count)
+            if not self.losses.lost[GUESS]:
+                break
         del self.kept[self._count :]
+
+    def _narrow(self) -> None:
+        """Draws at the distances that turn out well, once some have: others cost time alone."""
+        if not self._narrowed and len(self.kept) >= min(_TELLING, self._count):
+            q = np.array([q for q, _ in self.kept])
+            self._sight = self._sight.nearer_to(self._cell.cam_from_target(q))
+            self._narrowed = True
 
     def ask_again(self) -> None:
         """Finds the joints whose limits alone kept the arm from views that it did not reach."""
@@ -129,20 +141,18 @@ class _Search:
         views = views[passed(IMAGE, sight.shows(views))]
         views = views[passed(FOCUS, sight.sharp(views))]
         flange = self._cell.flange_at(views)
+        flange = flange[passed(AWAY, _within(robot, flange))]
         share = sight.share(flange)
-        sure = passed(GUESS, _sure(share))
+        sure = passed(GUESS, share >= self._bar)
         # More than are still needed would be thrown away.
         few = np.flatnonzero(sure)[: 3 * (self._count - len(self.kept)) + 50]
         flange, share = flange[few], share[few]
         starts = self._inverse.starts(len(flange), self._rng)
-        near = _within(robot, flange)
-        reached = np.zeros(len(flange), dtype=bool)
-        for row in np.flatnonzero(near):
-            posture = self._inverse.from_start(flange[row], starts[row])
-            reached[row], starts[row] = posture.reached, posture.positions
-        passed(REACH, reached)
+        found = [self._inverse.from_start(*it) for it in zip(flange, starts, strict=True)]
+        positions = np.array([it.positions for it in found]).reshape(starts.shape)
+        reached = passed(REACH, np.array([it.reached for it in found], dtype=bool))
         self._unreached += list(flange[~reached][: _ASKED_AGAIN - len(self._unreached)])
-        return robot.chain.encoded(starts[reached]), share[reached]
+        return robot.chain.encoded(positions[reached]), share[reached]
 
     def _postures(self) -> tuple[FloatArray, FloatArray]:
         """Drawn postures (k, n) that show the board, and their shares (k,)."""
@@ -162,7 +172,7 @@ class _Search:
             self.losses.passed(limit, good[kept])
             kept &= good
         q, share = q[kept], sight.share(flange[kept])
-        sure = self.losses.passed(GUESS, _sure(share))
+        sure = self.losses.passed(GUESS, share >= self._bar)
         return q[sure], share[sure]
 
     def _keep(self, q: FloatArray, share: FloatArray) -> None:
@@ -187,11 +197,3 @@ def _within(robot: Robot, flange: FloatArray) -> Mask:
     longest = float(np.linalg.norm(chain.placements[1:, :3, 3], axis=1).sum())
     away = np.linalg.norm(flange[:, :3, 3] - chain.placements[0][:3, 3], axis=1)
     return np.asarray(away <= longest)
-
-
-def _sure(share: FloatArray) -> Mask:
-    """Which of (k,) shares are taken."""
-    sure = share >= _SURE
-    if not len(share) or sure.mean() > _NEXT_TO_NONE:
-        return sure
-    return np.asarray(share >= max(_RATHER, float(np.quantile(share, _BEST))))

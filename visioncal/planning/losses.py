@@ -12,7 +12,7 @@ from visioncal.types import Mask
 IMAGE = "the whole board in the image"
 GUESS = "the whole board in the image although the guesses are off"
 FOCUS, TILT, DISTANCE = "the range of focus", "the tilt", "the distance"
-REACH = "the arm's reach"
+AWAY, REACH = "the arm's length", "the arm's reach"
 LIMITS, CLEARANCE = "the joints' limits", "the clearance"
 _ADVICE = {
     IMAGE: "Look whether guesses, board and camera are the cell's; widen distance_m.",
@@ -20,6 +20,8 @@ _ADVICE = {
     FOCUS: "Widen focus_m, or set distance_m to where the image is sharp.",
     TILT: "Widen tilt_rad, or turn the board towards the camera.",
     DISTANCE: "Widen distance_m, or put the board elsewhere.",
+    AWAY: "Put the board nearer to the arm, allow smaller distances, or look whether the guesses "
+    "are right.",
     REACH: "Put the board where the arm can look at it from all sides, or look whether the guesses "
     "are right.",
     LIMITS: "Put the board elsewhere, or look whether the limits are the robot's.",

@@ -1,11 +1,11 @@
 """From where a board is seen: views drawn around it, and the share of guesses that show it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.camera import normalise, project
+from visioncal.camera import normalise, project_with_jacobian
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.obstacles import board_size_m
 from visioncal.targets import extent_m
@@ -14,11 +14,17 @@ from visioncal.types import Camera, FloatArray, Mask, Target
 
 # How large the board is drawn: the image's half short side over half the print's diagonal.
 _NEAREST, _FARTHEST = 0.75, 1.6
+# What tilt leaves of a board's short side, and how many standard deviations of where it is in the
+# image are left free around it.
+_FORESHORTENED, _DOUBTED = 0.8, 1.5
+# How far draws reach beyond the distances that turned out well.
+_WIDER = 1.05
 # The guesses are off by less than so many standard deviations, and a plan goes no farther than so
 # many times the distance at which the board would fill the image.
 _SURELY, _NEVER_BEYOND = 2.2, 6.0
-# How many cells stand for what may really be, and how many points for the print's outline.
-_GUESSES, _SIDE_POINTS = 40, 3
+# How many cells stand for what may really be, how many of them are looked at first, and how many
+# points stand for a side of the print.
+_GUESSES, _FIRST, _SIDE_POINTS = 40, 8, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,8 @@ class Sight:
         """Draws views of the board.
 
         The camera lies on a cap around the board's normal, uniform on its area, and is turned any
-        way about its line of sight; the board's centre is anywhere in the image.
+        way about its line of sight; the board's centre is anywhere in the image where the board has
+        room.
 
         Args:
             count: How many.
@@ -60,8 +67,10 @@ class Sight:
         camera, limits = self.cell.camera, self.cell.limits
         tilt = np.arccos(rng.uniform(np.cos(limits.tilt_rad), 1.0, count))
         azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
-        inside = np.array(camera.resolution) - 1.0 - 2.0 * limits.edge_px
-        aim = limits.edge_px + rng.uniform(size=(count, 2)) * inside
+        distance = rng.uniform(*self.distance_m, size=(count, 1))
+        middle = 0.5 * (np.array(camera.resolution) - 1.0)
+        room = np.maximum(middle - limits.edge_px - self._taken_px(distance), 0.0)
+        aim = middle + rng.uniform(-1.0, 1.0, (count, 2)) * room
         plane = np.nan_to_num(normalise(camera, aim))
         ray = np.column_stack([plane, np.ones(count)])
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -72,8 +81,25 @@ class Sight:
         angle = np.arctan2(sine, ray[:, 2:])
         turn = Rotation.from_rotvec(across * angle / np.maximum(sine, 1e-12))
         rotation = np.asarray((turn * spun).as_matrix())
-        distance = rng.uniform(*self.distance_m, size=(count, 1))
         return compose(rotation, distance * ray - rotation @ self.centre)
+
+    def _taken_px(self, distance_m: FloatArray) -> FloatArray:
+        """How much of the image's half sides a board (k, 1) takes at least, with some doubt [px].
+
+        A drawn view need not show the board; this only saves drawing many that cannot.
+        """
+        cell = self.cell
+        low, high = extent_m(cell.target)
+        across = _FORESHORTENED * 0.5 * float((high - low).min())
+        doubt = _DOUBTED * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
+        return np.asarray(cell.camera.matrix[:2].mean() * (across / distance_m + doubt))
+
+    def nearer_to(self, cam_from_target: FloatArray) -> "Sight":
+        """The same, drawing distances like those of (k, 4, 4) views that turned out well."""
+        distance = self.distances_m(cam_from_target)
+        low, high = self.distance_m
+        least, most = float(distance.min()) / _WIDER, float(distance.max()) * _WIDER
+        return replace(self, distance_m=(max(low, least), min(high, most)))
 
     def shows(self, cam_from_target: FloatArray) -> Mask:
         """Whether the whole print is in the image (...) of views (..., 4, 4)."""
@@ -84,18 +110,27 @@ class Sight:
         radius = np.linalg.norm(flat[:, :2], axis=1)
         straight = radius < self.rays_within * flat[:, 2]
         px = np.full((len(flat), 2), -np.inf)
-        px[straight] = project(camera, flat[straight])
+        px[straight] = project_with_jacobian(camera, flat[straight], lens=False).px
         inside = (px >= edge) & (px <= np.array(camera.resolution) - 1.0 - edge)
         return np.asarray(inside.reshape(*points.shape[:-1], 2).all(axis=(-1, -2)))
 
     def share(self, base_from_flange: FloatArray) -> FloatArray:
-        """The share (k,) of the guesses' draws in which (k, 4, 4) poses show the whole print."""
+        """In what share (k,) of the guesses' draws (k, 4, 4) poses show the whole print.
+
+        Where the first draws show it less often than not, they are all that is counted.
+        """
+        first = self._drawn_shows(base_from_flange, slice(0, _FIRST))
+        share = np.asarray(first.mean(axis=1))
+        often = share > 0.5
+        rest = self._drawn_shows(base_from_flange[often], slice(_FIRST, None))
+        share[often] = np.concatenate([first[often], rest], axis=1).mean(axis=1)
+        return share
+
+    def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
         flange = base_from_flange[:, None]
         if self.cell.mount == "eye-in-hand":
-            drawn = invert(flange @ self.x) @ self.z
-        else:
-            drawn = invert(self.x) @ flange @ self.z
-        return np.asarray(self.shows(drawn).mean(axis=1))
+            return self.shows(invert(flange @ self.x[which]) @ self.z[which])
+        return self.shows(invert(self.x[which]) @ flange @ self.z[which])
 
     def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
         """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
@@ -146,7 +181,7 @@ def _distance_m(cell: PlanCell) -> tuple[float, float]:
     for d in np.linspace(full, _NEVER_BEYOND * full, 60):
         turned = cell.sigma_rad * np.hypot(d, radius)
         if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
-            return _NEAREST * full, max(farthest, 1.5 * float(d))
+            return _NEAREST * full, max(farthest, 1.15 * float(d))
     return _NEAREST * full, _NEVER_BEYOND * full
 
 
