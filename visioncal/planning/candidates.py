@@ -21,6 +21,7 @@ from visioncal.planning.losses import (
 from visioncal.planning.obstacles import collisions_of
 from visioncal.planning.sight import sight_of
 from visioncal.robot import Robot
+from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
 from visioncal.types import FloatArray, Mask, Progress
 
@@ -36,6 +37,9 @@ _LEAST_SHARE, _LEAST = 0.1, 12
 _TELLING = 100
 # An arm with fewer joints reaches a drawn view only by chance: its postures are drawn instead.
 _FREE = 6
+# A joint that stands nowhere in such a range [rad], and touches something there in this share of
+# postures, cannot pass it.
+_WIDE_RAD, _BARRED, _TURN = np.pi / 3.0, 0.5, 2.0 * np.pi
 # How many views that were out of reach are looked at again, to say why.
 _ASKED_AGAIN = 12
 
@@ -86,7 +90,7 @@ def candidates(
     if len(search.kept) < max(_LEAST_SHARE * count, min(_LEAST, count)):
         search.ask_again()
         raise search.losses.error(len(search.kept), count)
-    q = np.array([it for it, _ in search.kept])
+    q = _unwound(cell, search.collisions, np.array([it for it, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
     return Candidates(q, cell.cam_from_target(q), shares, search.losses.counts())
 
@@ -101,7 +105,7 @@ class _Search:
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
         self._sight = sight_of(cell, seed)
-        self._collisions = collisions_of(cell)
+        self.collisions = collisions_of(cell)
         self._inverse = Inverse(cell.robot)
         self._unreached: list[FloatArray] = []
 
@@ -182,9 +186,9 @@ class _Search:
         within = self.losses.passed(LIMITS, np.asarray(np.all(over <= 0.0, axis=1)))
         self.losses.blame(LIMITS, [robot.joint_names[it] for it in over[~within].argmax(axis=1)])
         q, share = q[within], share[within]
-        contact = self._collisions.first_contact(q)
+        contact = self.collisions.first_contact(q)
         clear = self.losses.passed(CLEARANCE, contact < 0)
-        pairs = [self._collisions.names[place] for place in contact[~clear]]
+        pairs = [self.collisions.names[place] for place in contact[~clear]]
         self.losses.blame(CLEARANCE, [f"{first} and {second}" for first, second in pairs])
         self.kept += zip(q[clear], share[clear].tolist(), strict=True)
 
@@ -197,3 +201,32 @@ def _within(robot: Robot, flange: FloatArray) -> Mask:
     longest = float(np.linalg.norm(chain.placements[1:, :3, 3], axis=1).sum())
     away = np.linalg.norm(flange[:, :3, 3] - chain.placements[0][:3, 3], axis=1)
     return np.asarray(away <= longest)
+
+
+def _unwound(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray:
+    """Turns joints of postures (k, n) by whole turns, so that ways between them may be straight.
+
+    Where a joint never stands in a wide range of angles, and most postures touch something if it is
+    turned there, as the floor, it cannot pass: its angles are counted from the middle of that range
+    on.
+    """
+    chain, margin = cell.robot.chain, cell.limits.joint_margin_rad
+    positions = chain.effective(q)
+    for joint in np.flatnonzero(~chain.prismatic):
+        angles = np.sort(positions[:, joint] % _TURN)
+        gaps = np.diff(angles, append=angles[0] + _TURN)
+        barred, cut = _BARRED, None
+        for place in np.flatnonzero(gaps > _WIDE_RAD):
+            between = angles[place] + 0.5 * gaps[place]
+            turned = positions[:_TELLING].copy()
+            turned[:, joint] = between
+            share = float((collisions.first_contact(chain.encoded(turned)) >= 0).mean())
+            if share > barred:
+                barred, cut = share, between
+        if cut is not None:
+            # Of the turns that begin there the one about zero.
+            cut -= _TURN * np.round((cut + 0.5 * _TURN) / _TURN)
+            positions[:, joint] = cut + (positions[:, joint] - cut) % _TURN
+    turned = chain.encoded(positions)
+    low, high = cell.robot.lower_rad + margin, cell.robot.upper_rad - margin
+    return np.where((turned >= low) & (turned <= high), turned, q)
