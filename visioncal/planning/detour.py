@@ -8,6 +8,8 @@ from visioncal.types import FloatArray
 
 # Draws before a search is given up, and how far one step of it goes [rad].
 _DRAWS, _STEP_RAD = 120, 0.7
+# After so many searches in vain, ways are straight or none.
+_IN_VAIN = 60
 # How far a detour may leave the box of both postures [rad].
 _ASIDE_RAD = 1.5
 
@@ -22,6 +24,7 @@ class Detours:
         self._upper = cell.robot.upper_rad - margin
         self._collisions = collisions
         self._rng = np.random.default_rng(seed)
+        self._in_vain = 0
 
     def way(self, start: FloatArray, end: FloatArray) -> FloatArray | int:
         """Finds a way: straight, or around what is in between.
@@ -38,8 +41,11 @@ class Detours:
         blocked = self._collisions.on_the_way(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
-        found = self._around(start, end)
-        return blocked if found is None else self._straightened(found)[1:-1]
+        found = self._around(start, end) if self._in_vain < _IN_VAIN else None
+        if found is None:
+            self._in_vain += 1
+            return blocked
+        return self._straightened(found)[1:-1]
 
     def _around(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
         """Two trees that grow towards draws and one another (Kuffner and LaValle 2000).

@@ -15,7 +15,7 @@ from visioncal.types import FloatArray
 # Exchanges gain at least this [rad]; a tour is improved over and over at most so many times.
 _GAIN_RAD, _ROUNDS = 1e-9, 50
 # Places at which a stop that was left aside is tried again, the nearest first.
-_PLACES = 6
+_PLACES = 3
 # A tour that leads to fewer of the stops is begun at another one, so many times.
 _MOST, _BEGINNINGS = 0.5, 3
 

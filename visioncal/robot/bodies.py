@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.files import Table
-from visioncal.robot.model import Robot
+from visioncal.robot.model import BODY_KEYS, Robot
 from visioncal.transforms import compose
 from visioncal.types import FloatArray
 
@@ -130,8 +130,8 @@ def _thickness(robot: Robot, usual_m: float) -> list[tuple[float, float]]:
     for place, name in enumerate(robot.joint_names):
         content = rows[place] if place < len(rows) else {}
         row = Table(content, f"robot {robot.name}, joint {name}")
-        radius = row.number("body_radius_m", usual_m, positive=True)
-        offset = row.number("body_offset_m", 0.0)
+        radius = row.number(BODY_KEYS[0], usual_m, positive=True)
+        offset = row.number(BODY_KEYS[1], 0.0)
         length = float(np.abs(robot.chain.placements[:, :3, 3]).sum())
         if max(radius, abs(offset)) > length:
             raise DataError(

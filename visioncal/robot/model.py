@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
 
+# What a joint's table may say of its link's body.
+BODY_KEYS = ("body_radius_m", "body_offset_m")
+
+
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A serial arm with its nominal or corrected geometry.
@@ -213,7 +217,10 @@ class Robot:
                     "zero are needed.",
                     culprits=[self.name],
                 )
-        return Robot.from_document(chain_document(self.name, self.tip, chain))
+        document = chain_document(self.name, self.tip, chain)
+        for row, known in zip(document["joint"], self.document.get("joint", ()), strict=False):
+            row |= {key: known[key] for key in BODY_KEYS if key in known}
+        return Robot.from_document(document)
 
     def _axis_jacobian(self, q: FloatArray) -> FloatArray:
         """How the flange (m, 6, n) moves with the joints' effective positions.
