@@ -30,7 +30,11 @@ from visioncal.types import FloatArray, Mask, Progress
 _SURE = (0.97, 0.9, 0.7, 0.5)
 # How many views or postures are drawn at a time; how many times before the next share is taken,
 # and how many where next to none are found: less than this share of the wish.
-_BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 15, 0.03
+_BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 8, 0.03
+# Views of a batch for which postures are looked for, at most.
+_MOST_TRIED = 800
+# Less sure stops help only where doubt about the guesses keeps out this share.
+_UNSURE = 0.5
 # Fewer than this share of the wish, or than a plan needs, are too few.
 _LEAST_SHARE, _LEAST = 0.1, 12
 # So many stops tell at what distances others may be found.
@@ -121,7 +125,7 @@ class _Search:
                 self._narrow()
                 if progress is not None:
                     progress("candidates", min(len(self.kept), self._count), self._count)
-            if not self.losses.lost[GUESS]:
+            if self.losses.lost[GUESS] < _UNSURE * self.losses.tried[GUESS]:
                 break
         del self.kept[self._count :]
 
@@ -149,7 +153,7 @@ class _Search:
         share = sight.share(flange)
         sure = passed(GUESS, share >= self._bar)
         # More than are still needed would be thrown away.
-        few = np.flatnonzero(sure)[: 3 * (self._count - len(self.kept)) + 50]
+        few = np.flatnonzero(sure)[: min(3 * (self._count - len(self.kept)) + 50, _MOST_TRIED)]
         flange, share = flange[few], share[few]
         starts = self._inverse.starts(len(flange), self._rng)
         found = [self._inverse.from_start(*it) for it in zip(flange, starts, strict=True)]

@@ -17,8 +17,8 @@ Shape: TypeAlias = Literal["capsule", "cylinder", "box"]
 # Radius of the links over the length of all links: 0.065 m for a UR5e, 0.09 m for a UR10e. Small
 # arms are not thinner than the motors in them [m].
 _THICKNESS, _THINNEST_M = 0.05, 0.045
-# Parts of a link that are shorter lie inside their neighbours [m].
-_SHORTEST_M = 1e-3
+# Links that are shorter lie inside their neighbours [m].
+_SHORTEST_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +116,12 @@ def _link(robot: Robot, link: int, radius_m: float, offset_m: float) -> list[Bod
     aside = offset_m * robot.chain.axes[link - 1] if link else np.zeros(3)
     knots = [np.zeros(3), aside, end + aside, end] if offset_m else [np.zeros(3), end]
     name = body_name(robot, link)
+    if np.abs(np.diff(knots, axis=0)).sum() < _SHORTEST_M:
+        return []
     return [
         capsule(name, link, start, stop, radius_m, of_arm=True)
         for start, stop in itertools.pairwise(knots)
-        if np.linalg.norm(stop - start) > _SHORTEST_M
+        if np.any(start != stop)
     ]
 
 
