@@ -132,13 +132,13 @@ def test_a_box_in_the_way_is_gone_around():
     cell = cell_of(CellOptions(robot="ur5e"))
     # The arm stands to the left and to the right of a wall, outstretched.
     left, right = (
-        np.array([2.6, -1.0, 1.2, -1.8, -1.6, 0]),
-        np.array([3.7, -1.0, 1.2, -1.8, -1.6, 0]),
+        np.array([2.6, -1.3, 1.3, -1.6, -1.57, 0]),
+        np.array([3.7, -1.3, 1.3, -1.6, -1.57, 0]),
     )
     stops = np.stack([left, right])
     free = ordered(cell, None, stops)
     assert [len(it) for it in free.segments] == [0]
-    height = compose(np.eye(3), np.array([0.55, 0.0, 0.25]))
+    height = compose(np.eye(3), np.array([0.55, 0.12, 0.25]))
     wall = Box("wall", height, np.array([0.3, 0.04, 0.5]))
     walled = ordered(replace(cell, boxes=(wall,)), None, stops)
     assert len(walled.order) == 2
