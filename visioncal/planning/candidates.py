@@ -150,7 +150,7 @@ class _Search:
         views = views[passed(FOCUS, sight.sharp(views))]
         flange = self._cell.flange_at(views)
         flange = flange[passed(AWAY, _within(robot, flange))]
-        share = sight.share(flange)
+        share = sight.share(flange, self._bar)
         sure = passed(GUESS, share >= self._bar)
         # More than are still needed would be thrown away.
         few = np.flatnonzero(sure)[: min(3 * (self._count - len(self.kept)) + 50, _MOST_TRIED)]
@@ -179,7 +179,7 @@ class _Search:
         ):
             self.losses.passed(limit, good[kept])
             kept &= good
-        q, share = q[kept], sight.share(flange[kept])
+        q, share = q[kept], sight.share(flange[kept], self._bar)
         sure = self.losses.passed(GUESS, share >= self._bar)
         return q[sure], share[sure]
 

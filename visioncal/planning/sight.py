@@ -16,7 +16,7 @@ from visioncal.types import Camera, FloatArray, Mask, Target
 _NEAREST, _FARTHEST = 0.75, 1.6
 # What tilt leaves of a board's short side, and how many standard deviations of where it is in the
 # image are left free around it.
-_FORESHORTENED, _DOUBTED = 0.8, 1.5
+_FORESHORTENED, _DOUBTED = 0.8, 2.0
 # How far draws reach beyond the distances that turned out well.
 _WIDER = 1.05
 # The guesses are off by less than so many standard deviations, and a plan goes no farther than so
@@ -24,7 +24,7 @@ _WIDER = 1.05
 _SURELY, _NEVER_BEYOND = 2.2, 6.0
 # How many cells stand for what may really be, how many of them are looked at first, and how many
 # points stand for a side of the print.
-_GUESSES, _FIRST, _SIDE_POINTS = 40, 8, 2
+_GUESSES, _FIRST, _SIDE_POINTS = 40, 6, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,16 +114,22 @@ class Sight:
         inside = (px >= edge) & (px <= np.array(camera.resolution) - 1.0 - edge)
         return np.asarray(inside.reshape(*points.shape[:-1], 2).all(axis=(-1, -2)))
 
-    def share(self, base_from_flange: FloatArray) -> FloatArray:
-        """In what share (k,) of the guesses' draws (k, 4, 4) poses show the whole print.
+    def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
+        """In what share of the guesses' draws poses show the whole print.
 
-        Where the first draws show it less often than not, they are all that is counted.
+        Args:
+            base_from_flange: (k, 4, 4) the poses [m].
+            wanted: Where the first draws leave no hope of this share, the others are not looked at.
+
+        Returns:
+            (k,) shares, those of the first draws where the wanted one is not reached.
         """
         first = self._drawn_shows(base_from_flange, slice(0, _FIRST))
         share = np.asarray(first.mean(axis=1))
-        often = share > 0.5
-        rest = self._drawn_shows(base_from_flange[often], slice(_FIRST, None))
-        share[often] = np.concatenate([first[often], rest], axis=1).mean(axis=1)
+        hope = np.sum(~first, axis=1) <= (1.0 - wanted) * _GUESSES
+        rest = self._drawn_shows(base_from_flange[hope], slice(_FIRST, None))
+        share[hope] = np.concatenate([first[hope], rest], axis=1).mean(axis=1)
+        share[~hope] = np.minimum(share[~hope], np.nextafter(wanted, 0.0))
         return share
 
     def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
