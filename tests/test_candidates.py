@@ -195,13 +195,37 @@ def test_the_way_begins_at_the_start():
         ({"limits": Limits(distance_m=(0.05, 0.1), floor_m=None)}, "whole board in the image"),
         ({"limits": Limits(focus_m=(0.1, 0.2), floor_m=None)}, "the range of focus"),
         ({"limits": Limits(floor_m=0.9)}, "the clearance \\(floor and"),
-        ({"boxes": (Box("press", np.eye(4), np.full(3, 3.0)),)}, "the clearance \\(press and"),
+        (
+            {"boxes": (Box("press", np.eye(4), np.array([0.3, 0.3, 0.6])),)},
+            "the clearance \\(press and",
+        ),
     ],
 )
 def test_what_leaves_too_few_stops_is_named(changes, culprit):
     cell = replace(cell_of(CellOptions(robot="ur5e")), **changes)
     with pytest.raises(DataError, match=f"Most in the way is .*{culprit}"):
         candidates(cell, 40)
+
+
+def test_boxes_do_not_hide_the_board():
+    cell = cell_of(CellOptions(robot="ur5e"))
+    centre = (cell.z @ np.append(centre_m(Sheet(cell.target, 1.0, 0.0)), 1.0))[:3]
+    # A shelf over a half of the board, out of the arm's way.
+    shelf = Box(
+        "shelf", compose(np.eye(3), centre + np.array([0.2, 0, 0.25])), np.array([0.3, 0.5, 0.01])
+    )
+    table = Box(
+        "table", compose(np.eye(3), centre - np.array([0, 0, 0.05])), np.array([0.6, 0.6, 0.0999])
+    )
+    shelved = replace(cell, boxes=(shelf, table), limits=replace(cell.limits, floor_m=None))
+    stops = candidates(shelved, 30, seed=2)
+    assert stops.lost["a free line of sight"] > 0
+    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0) @ cell.z[:3, :3].T + cell.z[:3, 3]
+    shares = np.linspace(0.0, 1.0, 300)[:, None, None]
+    for eye in (forward(ur_arm("ur5e"), stops.q) @ cell.x)[:, :3, 3]:
+        on_the_way = eye + shares * (outline - eye)
+        inside = np.abs(on_the_way - shelf.base_from_box[:3, 3]) < 0.5 * shelf.size_m
+        assert not inside.all(axis=-1).any()
 
 
 def test_a_joint_that_stops_the_arm_is_named():

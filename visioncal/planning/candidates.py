@@ -12,6 +12,7 @@ from visioncal.planning.losses import (
     DISTANCE,
     FOCUS,
     GUESS,
+    HIDDEN,
     IMAGE,
     LIMITS,
     REACH,
@@ -149,6 +150,7 @@ class _Search:
         views = views[passed(IMAGE, sight.shows(views))]
         views = views[passed(FOCUS, sight.sharp(views))]
         flange = self._cell.flange_at(views)
+        flange = flange[passed(HIDDEN, sight.free(flange))]
         flange = flange[passed(AWAY, _within(robot, flange))]
         share = sight.share(flange, self._bar)
         sure = passed(GUESS, share >= self._bar)
@@ -176,6 +178,7 @@ class _Search:
             (TILT, sight.tilt_rad(views) <= cell.limits.tilt_rad),
             (DISTANCE, (distance >= near) & (distance <= far)),
             (FOCUS, sight.sharp(views)),
+            (HIDDEN, sight.free(flange)),
         ):
             self.losses.passed(limit, good[kept])
             kept &= good
