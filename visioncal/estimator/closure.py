@@ -421,12 +421,28 @@ def weighted_slopes(
         (m, 6, 12 + k) inverse covariance of each residual times its derivatives, and the (m, 6, 6)
         covariances that the camera and the robot contribute to the residual.
     """
-    ideal = replace(data, camera=data.predicted_camera(edges.x, edges.z))
-    jacobian = closure_jacobian(ideal, replace(edges, shared=data.unchanged))
-    components = components_of(data, edges.z)
+    jacobian, components = _where_it_closes(data, edges)
     total = components.total(noise.sigmas)
     slopes = np.asarray(np.linalg.solve(total, jacobian), dtype=float)
     return slopes, components.known, total - components.known
+
+
+def whitened_slopes(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """Derivatives (m, 6, 12 + k) of residuals of unit covariance, where the chain closes exactly.
+
+    Their squares, summed over the views, are all of `closure_information` but what is known of the
+    shared unknowns without the robot.
+    """
+    jacobian, components = _where_it_closes(data, edges)
+    roots = np.linalg.cholesky(components.total(noise.sigmas))
+    return np.asarray(np.linalg.solve(roots, jacobian))
+
+
+def _where_it_closes(data: Closure, edges: Edges) -> tuple[FloatArray, Components]:
+    """Derivatives of the residuals, and what makes up their covariances, at exact poses."""
+    ideal = replace(data, camera=data.predicted_camera(edges.x, edges.z))
+    jacobian = closure_jacobian(ideal, replace(edges, shared=data.unchanged))
+    return jacobian, components_of(data, edges.z)
 
 
 def residual_blocks(
