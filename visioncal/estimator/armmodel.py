@@ -74,7 +74,7 @@ class ArmModel:
         count, at = self.nominal.joint_count, 0
         placements, functions = np.zeros((count + 1, 6)), np.zeros((count, 4))
         for name, weight in self.weights.items():
-            size = _size(name, count)
+            size = block_size(name, count)
             block = weight * values[at : at + size]
             at += size
             if name == "links":
@@ -110,5 +110,6 @@ class ArmModel:
         )
 
 
-def _size(name: str, joints: int) -> int:
+def block_size(name: str, joints: int) -> int:
+    """How many values a block has, for an arm of so many joints."""
     return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

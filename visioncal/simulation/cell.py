@@ -88,11 +88,13 @@ class Cell:
     shown: Shown
 
 
-def simulate(options: CellOptions) -> Cell:
+def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     """Builds a cell, moves its robot and looks at the board.
 
     Args:
         options: What the cell is made of. The same options give the same cell.
+        postures: (m, n) joint angles to move to, one a view, whatever the camera sees there [rad];
+            None draws as many as the options say, from which the board is in the image.
 
     Returns:
         The truth and the reports.
@@ -102,6 +104,8 @@ def simulate(options: CellOptions) -> Cell:
             arm cannot reach enough poses from which the board is in the image.
     """
     arm = ur_arm(options.robot)
+    if postures is not None:
+        options = replace(options, views=len(postures))
     errors = ArmErrors(
         options.dh_sigma_m,
         options.dh_sigma_rad,
@@ -114,7 +118,10 @@ def simulate(options: CellOptions) -> Cell:
     transforms = _mountings(options, arm, sheets[0])
     if options.second is not None:
         transforms = with_second(transforms, sheets, options.second)
-    moved = _postures(options, arm, sheets, transforms)
+    if postures is None:
+        moved = _postures(options, arm, sheets, transforms)
+    else:
+        moved = np.array(postures, dtype=float)
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
     true_base_from_flange = forward(true_arm, moved) @ exp(jitter)

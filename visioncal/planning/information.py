@@ -1,0 +1,318 @@
+"""What a stop of the robot would tell, by the estimator's own derivatives and priors.
+
+A stop's corners are predicted, compressed as seen ones are, and joined with the noise of the robot;
+what comes out is the information that the closure of the chain would have of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.camera import project
+from visioncal.errors import DataError
+from visioncal.estimator.appearance import (
+    SCALE,
+    Appearance,
+    Free,
+    board_basis,
+    board_prior,
+    compress,
+)
+from visioncal.estimator.arm import ArmErrors
+from visioncal.estimator.armmodel import ArmModel, block_size
+from visioncal.estimator.closure import Closure, Edges, Noise, whitened_slopes
+from visioncal.estimator.corners import CornerStack, floored_sigma_px
+from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.workspace import pose_slopes, postures, tool_slopes
+from visioncal.planning.cell import Box, PlanCell
+from visioncal.planning.purposes import Purpose
+from visioncal.robot import Robot
+from visioncal.stages.handeye import robot_part
+from visioncal.targets import corner_positions
+from visioncal.transforms import invert, skew
+from visioncal.types import FloatArray, IntArray, Mask
+
+# Worlds over which a plan is made: the guess, and some drawn from what is known of it.
+WORLDS = 4
+# A calibration takes nothing from the guesses: what is assumed of the edges beforehand only keeps
+# the information invertible [rad and m], for directions that the stops leave open.
+WEAK_SIGMA = 0.2
+# What an edge's component is counted in where unknowns of different kinds are compared.
+_EDGE_UNITS: FloatArray = np.tile(np.repeat([1e-3, 5e-4], 3), 2)
+# Postures that are tried for a declared workspace, and how many of those in it stand for it.
+_TRIED, _POSTURES = 8000, 400
+# A ChArUco board that the image cuts is found with so many corners.
+_FEWEST_CORNERS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Stops that were recorded already.
+
+    Attributes:
+        data: The chain at each stop, without errors of the arm.
+        free: Lens and board as the views see them; what it leaves open is shared in `data`.
+        q: (m, n) joint angles of the stops [rad]; None where they are not known.
+        noise: Of the robot at the stops.
+    """
+
+    data: Closure
+    free: Free
+    q: FloatArray | None
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What k candidates tell of p unknowns if a cell is as it is guessed to be.
+
+    Unknown are x, z, what is open about lens and board, and the arm's errors, in this order.
+
+    Attributes:
+        factors: (k, 6, p) the squares of each stop's are its information.
+        prior: (p, p) what is known beforehand.
+        recorded: (p, p) information of the stops that are recorded.
+        counted: (p, p) of which the trace with the covariance is the variance that counts: of a
+            place, as a mean over where it matters [m^2].
+        place: (p, p) the same for the place that the accuracy is stated of [m^2].
+        turn: (p, p) the same for the rotation [rad^2].
+        units: (p,) what one unit of each unknown is where different ones are compared.
+    """
+
+    factors: FloatArray
+    prior: FloatArray
+    recorded: FloatArray
+    counted: FloatArray
+    place: FloatArray
+    turn: FloatArray
+    units: FloatArray
+
+    def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
+        """Covariance (p, p) of the unknowns from some candidates and what is recorded."""
+        taken = self.factors[rows].reshape(-1, len(self.prior))
+        return covariance(self.prior + self.recorded + taken.T @ taken)
+
+
+def worlds_of(
+    cells: Sequence[PlanCell],
+    purpose: Purpose,
+    q: FloatArray,
+    *,
+    recorded: Recorded | None = None,
+    workspace: Box | None = None,
+) -> tuple[World, ...]:
+    """Predicts what candidates tell, in each of some cells.
+
+    Args:
+        cells: The cell as it is guessed to be, and as it may be.
+        purpose: What the stops are for.
+        q: (k, n) joint angles of the candidates [rad].
+        recorded: What was recorded already.
+        workspace: Where the arm's place counts: its postures that bring what it carries into this
+            box; None for all of them.
+
+    Raises:
+        DataError: The workspace holds no posture, or joint angles of what was recorded are needed
+            and not known.
+    """
+    with one_blas_thread():
+        return tuple(_world(cell, purpose, q, recorded, workspace) for cell in cells)
+
+
+def stop_factors(
+    cell: PlanCell, purpose: Purpose, q: FloatArray, free: Free | None = None
+) -> FloatArray:
+    """Predicts what stops tell.
+
+    Args:
+        cell: The cell, taken as it is guessed to be.
+        purpose: What is unknown.
+        q: (k, n) joint angles [rad].
+        free: Lens and board, with what is open about them; None for the stated ones, of which the
+            board's size is open by as much as is stated.
+
+    Returns:
+        (k, 6, p) whose squares are the information of each stop; zero where the board is not seen.
+    """
+    free = stated(cell) if free is None else free
+    poses = cell.cam_from_target(q)
+    stack, seen = _predicted(cell, poses)
+    size = 12 + len(free.columns) + sum(_arm_sizes(cell.robot, purpose))
+    factors = np.zeros((len(q), 6, size))
+    if seen.any():
+        found = compress(stack, free.basis, free.appearance, poses[seen])
+        data = Closure(
+            cell.mount,
+            robot_part(cell.robot.base_from_flange(q[seen]), cell.mount),
+            poses[seen],
+            floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
+            free.shared(found.by_shared[:, :, free.columns]),
+        )
+        factors[seen] = _factors(cell, purpose, data, q[seen], cell.noise)
+    return factors
+
+
+def stated(cell: PlanCell) -> Free:
+    """Lens and board as they are stated, the board's size being open by as much as is stated."""
+    positions = corner_positions(cell.target)
+    shape = board_prior(cell.target, positions)
+    look = Appearance(cell.camera, np.zeros(len(shape)))
+    return Free(
+        look,
+        board_basis(positions),
+        positions,
+        np.array([len(look.values) - len(shape) + SCALE]),
+        np.array([True]),
+        np.array([[shape[SCALE] ** -2.0]]),
+        np.zeros(1),
+    )
+
+
+def _world(
+    cell: PlanCell,
+    purpose: Purpose,
+    q: FloatArray,
+    recorded: Recorded | None,
+    workspace: Box | None,
+) -> World:
+    free = stated(cell) if recorded is None else recorded.free
+    factors = stop_factors(cell, purpose, q, free)
+    looks, arm = len(free.columns), sum(_arm_sizes(cell.robot, purpose))
+    sigma = _sigma(purpose)
+    weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
+    prior = block_diag(np.diag(weak), free.information, sigma**-2.0 * np.eye(arm))
+    known = np.zeros_like(prior)
+    if recorded is not None:
+        rows = _recorded_factors(cell, purpose, recorded).reshape(-1, len(prior))
+        known = rows.T @ rows
+    of_looks = np.sqrt(np.diag(covariance(free.information))) if looks else np.zeros(0)
+    units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
+    if purpose.judged == "sight":
+        judged = _of_sight(cell, purpose, q)
+    else:
+        judged = _of_workspace(cell, purpose, workspace)
+    counted, place, turn = (_widened(it, looks) for it in judged)
+    return World(factors, prior, known, counted, place, turn, units)
+
+
+def _recorded_factors(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> FloatArray:
+    q = recorded.q
+    if q is None and purpose.blocks:
+        raise DataError(
+            f"stops for {purpose.name} cannot be added: the recorded views have no joint angles.",
+            culprits=["q1_rad"],
+            next_step="Record q1_rad ..., or plan without the recorded session.",
+        )
+    at = np.zeros((len(recorded.data), cell.robot.joint_count)) if q is None else q
+    return _factors(cell, purpose, recorded.data, at, recorded.noise)
+
+
+def _factors(
+    cell: PlanCell, purpose: Purpose, data: Closure, q: FloatArray, noise: Noise
+) -> FloatArray:
+    if purpose.blocks:
+        basis = _model(cell.robot, purpose).basis(q)
+        data = data.with_more(ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).shared())
+    return whitened_slopes(data, Edges(cell.x, cell.z, data.unchanged), noise)
+
+
+def _model(robot: Robot, purpose: Purpose) -> ArmModel:
+    sigma = _sigma(purpose)
+    weights = {name: it / sigma for name, it in purpose.blocks.items()}
+    return ArmModel(robot, np.eye(4), weights, np.zeros(sum(_arm_sizes(robot, purpose))))
+
+
+def _sigma(purpose: Purpose) -> float:
+    """What the arm's unknowns are counted in: the first block's size [rad]."""
+    return next(iter(purpose.blocks.values()), 1.0)
+
+
+def _arm_sizes(robot: Robot, purpose: Purpose) -> tuple[int, ...]:
+    return tuple(block_size(name, robot.joint_count) for name in purpose.blocks)
+
+
+def _predicted(cell: PlanCell, poses: FloatArray) -> tuple[CornerStack, Mask]:
+    """The corners at (k, 4, 4) poses as they would be found, and which of these show the board."""
+    positions = corner_positions(cell.target)
+    points = positions @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
+    size = np.array(cell.camera.resolution)
+    visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
+    fewest = _FEWEST_CORNERS if cell.target.kind == "charuco" else len(positions)
+    seen = visible.sum(axis=1) >= fewest
+    view, corner = np.nonzero(visible[seen])
+    counts = visible[seen].sum(axis=1)
+    stack = CornerStack(
+        tuple(np.flatnonzero(seen).tolist()),
+        (0.0,) * len(counts),
+        np.cumsum(counts) - counts,
+        view,
+        corner,
+        positions[corner],
+        px[seen][view, corner],
+    )
+    return stack, seen
+
+
+def _of_sight(
+    cell: PlanCell, purpose: Purpose, q: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What counts of x: the camera's own place, and as much the places that it looks at.
+
+    A point that it sees comes out wrong by the offset's error and by the rotation's at the point's
+    distance, wherever the arm stands.
+    """
+    middle = corner_positions(cell.target).mean(axis=0)
+    looked_at = cell.cam_from_target(q) @ [*middle, 1.0]
+    size = 12 + sum(_arm_sizes(cell.robot, purpose))
+    place, turn, there = (np.zeros((len(q), 3, size)) for _ in range(3))
+    place[:, :, 3:6] = there[:, :, 3:6] = turn[:, :, :3] = np.eye(3)
+    there[:, :, :3] = -skew(looked_at[:, :3])
+    return (_mean_square(place) + _mean_square(there)) / 2, _mean_square(place), _mean_square(turn)
+
+
+def _of_workspace(
+    cell: PlanCell, purpose: Purpose, workspace: Box | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What counts of what the arm carries: its place seen from what stands still."""
+    at = _inside(cell, workspace)
+    model, edges = _model(cell.robot, purpose), Edges(cell.x, cell.z, np.zeros(0))
+    middle = corner_positions(cell.target).mean(axis=0)
+    place = _mean_square(tool_slopes(model, edges, cell.mount, middle, at))
+    turn = _mean_square(pose_slopes(model, edges, cell.mount, at)[:, :3])
+    return place, place, turn
+
+
+def _inside(cell: PlanCell, workspace: Box | None) -> FloatArray:
+    """(w, n) postures that stand for the workspace."""
+    if workspace is None:
+        return postures(cell.robot)
+    at = postures(cell.robot, _TRIED)
+    carried = cell.robot.base_from_flange(at) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
+    there = (invert(workspace.base_from_box) @ carried)[:, :3, 3]
+    within = np.all(np.abs(there) <= np.asarray(workspace.size_m) / 2, axis=1)
+    if not within.any():
+        raise DataError(
+            f"workspace {workspace.name}: none of {len(at)} postures all over the {cell.robot.name}"
+            "'s reach brings what it carries into the box.",
+            culprits=[f"workspace {workspace.name}"],
+            next_step="Give its centre in the base frame and its full lengths [m].",
+        )
+    return at[within][:_POSTURES]
+
+
+def _mean_square(slopes: FloatArray) -> FloatArray:
+    """Mean over m of slopes^T slopes: (m, 3, p) to (p, p)."""
+    rows = slopes.reshape(-1, slopes.shape[2])
+    return np.asarray(rows.T @ rows / len(slopes))
+
+
+def _widened(square: FloatArray, looks: int) -> FloatArray:
+    """Puts columns of zeros for lens and board behind those of the edges."""
+    size = len(square) + looks
+    wide = np.zeros((size, size))
+    rows = np.concatenate([np.arange(12), np.arange(12 + looks, size)])
+    wide[np.ix_(rows, rows)] = square
+    return wide

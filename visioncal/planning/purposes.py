@@ -1,0 +1,71 @@
+"""What stops are planned for: which unknowns they should tell, and which errors count.
+
+A later stage registers its purpose by one more entry of `PURPOSES`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal, TypeAlias
+
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean
+
+# Errors of a point that the camera sees, or of what the arm carries all over its workspace.
+Judged: TypeAlias = Literal["sight", "workspace"]
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What stops are planned for.
+
+    Both edges are unknown for any purpose.
+
+    Attributes:
+        name: Its name, as a user gives it.
+        blocks: The arm's errors that are unknown too (see `ArmModel`), with the standard deviation
+            that is known of them beforehand [rad]; lengths are off by 0.5 m times as much.
+        judged: Which errors count.
+        errors: What they are, in words.
+    """
+
+    name: str
+    judged: Judged
+    errors: str
+    blocks: Mapping[str, float] = field(default_factory=dict)
+
+
+# Where the robot finds what the camera sees is the camera's edge alone; the target's is scaffold.
+_HAND_EYE = Purpose("hand-eye", "sight", "the camera's place on the robot")
+_OFFSETS = Purpose(
+    "offsets",
+    "workspace",
+    "the arm's place all over its workspace",
+    # A lost encoder is set again by eye, to about this.
+    {"offsets": 2e-3},
+)
+_KINEMATICS = Purpose(
+    "kinematics",
+    "workspace",
+    "the arm's place all over its workspace",
+    # Arms come off by 1 mrad and 0.5 mm a link.
+    {"links": 1e-3},
+)
+PURPOSES: Mapping[str, Purpose] = MappingProxyType(
+    {it.name: it for it in (_HAND_EYE, _OFFSETS, _KINEMATICS)}
+)
+
+
+def purpose_of(name: str) -> Purpose:
+    """Finds a purpose.
+
+    Raises:
+        DataError: There is none of that name.
+    """
+    if name not in PURPOSES:
+        raise DataError(
+            f"stops can be planned for {', '.join(PURPOSES)}, not for {name!r}.",
+            culprits=["purpose"],
+            next_step=did_you_mean(name, PURPOSES),
+        )
+    return PURPOSES[name]
