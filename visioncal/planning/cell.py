@@ -102,6 +102,9 @@ class PlanCell:
         pixel_px: Noise of a corner, per axis [px].
         limits: What every stop and every way between two of them keeps.
         boxes: What else stands in the cell.
+        spread: (12, 12) covariance of both edges together (rotation, translation; right
+            perturbations), where recorded stops tell it: then both sigmas are typical of it. None
+            where the sigmas say all.
     """
 
     mount: Mount
@@ -116,6 +119,7 @@ class PlanCell:
     pixel_px: float
     limits: Limits = field(default_factory=Limits)
     boxes: tuple[Box, ...] = ()
+    spread: FloatArray | None = None
 
     def __post_init__(self) -> None:
         for name, edge in (("x", self.x), ("z", self.z)):
@@ -160,8 +164,13 @@ class PlanCell:
             Cells whose `x` and `z` are moved on the right by normal twists.
         """
         rng = np.random.default_rng(seed)
-        sigmas = np.repeat([self.sigma_rad, self.sigma_m], 3)
-        moves = exp(rng.standard_normal((count, 2, 6)) * sigmas)
+        draws = rng.standard_normal((count, 12))
+        if self.spread is None:
+            twists = draws * np.tile(np.repeat([self.sigma_rad, self.sigma_m], 3), 2)
+        else:
+            values, vectors = np.linalg.eigh(self.spread)
+            twists = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        moves = exp(twists.reshape(count, 2, 6))
         return tuple(replace(self, x=self.x @ by_x, z=self.z @ by_z) for by_x, by_z in moves)
 
 
