@@ -23,7 +23,7 @@ from scipy.linalg import solve_triangular
 
 from visioncal.errors import DataError
 from visioncal.estimator.linalg import one_blas_thread
-from visioncal.planning.information import World
+from visioncal.planning.information import WEAK_SIGMA, World
 from visioncal.types import FloatArray, IntArray
 
 Criterion: TypeAlias = Literal["I", "D", "A", "E", "O1"]
@@ -39,6 +39,8 @@ _LITTLE = 1e-4
 # The largest variance is a peak, and not smooth: so many of the most promising stops are tried,
 # where the promise is the drop of the mean variance raised to this power.
 _TRIED, _POWER = 12, 6
+# A sigma over this means that nothing tells: it is that of what is assumed beforehand [rad or m].
+OPEN_SIGMA = 0.25 * WEAK_SIGMA
 # An exchange must gain this share; so many of them a stop are enough.
 _GAIN, _EXCHANGES = 1e-4, 1.0
 
@@ -71,6 +73,11 @@ class Accuracy:
 
     mm: float
     deg: float
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a direction is not determined at all; the figures are nothing to go by then."""
+        return self.mm > 1e3 * OPEN_SIGMA or self.deg > np.rad2deg(OPEN_SIGMA)
 
     def meets(self, wish: Wish) -> bool:
         """Whether it is as good as was wished."""

@@ -1,0 +1,246 @@
+"""Where a plan begins that adds to a session: what the session tells, be it ever so little."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visioncal.errors import DataError, DegenerateError
+from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.closure import (
+    Closure,
+    Edges,
+    Noise,
+    closure_information,
+    fit_closure,
+    normal_equations,
+)
+from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.steps import STAGES
+from visioncal.planning.cell import Box, Limits, PlanCell
+from visioncal.planning.information import Recorded
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.transforms import invert, log
+from visioncal.types import FloatArray, Mount, Progress
+
+# Without a guess, what is mounted on the flange is about so far from it, per axis [m].
+_MOUNTED_M = 0.1
+# Stops cannot be found for edges that are known no better [rad and m].
+_TOO_VAGUE_RAD, _TOO_VAGUE_M = 0.5, 0.5
+# No arm repeats better; a few stops may show less by chance [rad and m].
+_LEAST_NOISE = Noise(2e-5, 1e-5)
+# What well-kept arms repeat to, where nothing has been seen of it [rad and m].
+_TYPICAL = Noise(5e-5, 3e-5)
+# Newton's steps to the nearest edges; the problem is as good as linear.
+_STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Rough guesses of both edges (4, 4), and how well they are known, per axis [rad and m]."""
+
+    x: FloatArray
+    z: FloatArray
+    sigma_rad: float
+    sigma_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_rad", "sigma_m"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise DataError(
+                    f"the guesses: {name} is {getattr(self, name)}; a number above zero is needed.",
+                    culprits=[name],
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A session to which stops are added.
+
+    Attributes:
+        cell: The cell as far as the session tells it.
+        recorded: What the session tells.
+        refusal: Why the session alone gives no result; empty where it does.
+        views: The number of the first view of each stop.
+    """
+
+    cell: PlanCell
+    recorded: Recorded
+    refusal: str
+    views: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SoFar:
+    """What is known of a session, and why no more."""
+
+    known: Known
+    refusal: str = field(default="")
+
+
+def so_far(session: Session, *, level: str = "hand-eye", progress: Progress | None = None) -> SoFar:
+    """Calibrates a session as far as it goes.
+
+    Args:
+        session: What was recorded.
+        level: How far to go, as `visioncal.calibrate` takes it.
+        progress: Told of long work.
+
+    Raises:
+        DataError: The input is wrong or shows no target.
+    """
+    known = Known(session, "joint", progress, level=level)
+    for at, stage in enumerate(STAGES):
+        if progress is not None:
+            progress(stage.name, at, len(STAGES))
+        try:
+            known = stage.run(known)
+        except DegenerateError as error:
+            return SoFar(known, error.message)
+    return SoFar(known)
+
+
+def begin(
+    found: SoFar,
+    *,
+    guess: Guess | None = None,
+    limits: Limits | None = None,
+    boxes: tuple[Box, ...] = (),
+) -> Begun:
+    """Puts a session as the start of a plan.
+
+    Where the stops leave a direction open, the edges are those nearest to the guess among all that
+    the stops allow; without a guess, those by which what is mounted is nearest to the flange.
+
+    Args:
+        found: What is known of the session.
+        guess: What is known of the edges besides.
+        limits: What the added stops must keep.
+        boxes: What else stands in the cell.
+
+    Raises:
+        DataError: The session lacks a robot's model, a camera or a board, or it tells too little to
+            begin without a guess.
+    """
+    known = found.known
+    robot, camera, target, free = known.robot, known.camera, known.session.target, known.free
+    if robot is None or camera is None or target is None or free is None or known.pixel_px is None:
+        raise _lacking(known)
+    views, stops = known.used, known.stops
+    first = np.unique(stops, return_index=True)[1]
+    arm = _arm(known, robot)
+    # The arm's own errors are the purpose's business: they are put in again with its priors.
+    data = _without_arm(known).merged(stops)
+    with one_blas_thread():
+        edges, noise = _start(known, data, guess)
+        nearest, spread = _nearest(data, edges, noise, guess)
+    sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
+    if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
+        raise _too_vague(known, len(data))
+    cell = PlanCell(
+        known.session.mount,
+        arm,
+        free.appearance.camera,
+        target,
+        nearest.x,
+        nearest.z,
+        float(sigmas[0]),
+        float(sigmas[1]),
+        noise,
+        known.pixel_px,
+        limits or Limits(),
+        boxes,
+        spread,
+    )
+    q = None if known.joints_rad is None else known.joints(views)[first]
+    recorded = Recorded(data, free, q, noise)
+    return Begun(cell, recorded, found.refusal, tuple(views[at] for at in first.tolist()))
+
+
+def _arm(known: Known, robot: Robot) -> Robot:
+    """The arm up to the frame of the reported poses, as far as it is calibrated."""
+    if known.arm_model is not None:
+        return known.arm_model.robot
+    if known.joints_rad is None:
+        return robot
+    return ArmModel.of(robot, known.joints(known.used), known.flange_poses(known.used)).robot
+
+
+def _without_arm(known: Known) -> Closure:
+    data = known.closure(known.used)
+    return data.with_first(0 if known.free is None else len(known.free.columns))
+
+
+def _start(known: Known, data: Closure, guess: Guess | None) -> tuple[Edges, Noise]:
+    if known.hand_eye is not None:
+        found, noise = known.hand_eye.edges, known.hand_eye.noise
+    elif known.agreed is not None:
+        agreed = known.agreed.edges
+        fit = fit_closure(data, Edges(agreed.x, agreed.z, data.unchanged))
+        found, noise = fit.edges, fit.noise
+    elif guess is not None:
+        return Edges(guess.x, guess.z, data.unchanged), _TYPICAL
+    else:
+        raise _too_vague(known, len(data))
+    at_least = Noise(
+        max(noise.sigma_rad, _LEAST_NOISE.sigma_rad), max(noise.sigma_m, _LEAST_NOISE.sigma_m)
+    )
+    return Edges(found.x, found.z, data.unchanged), at_least
+
+
+def _nearest(
+    data: Closure, edges: Edges, noise: Noise, guess: Guess | None
+) -> tuple[Edges, FloatArray]:
+    """The likeliest edges with what is known beforehand, and their covariance (12, 12)."""
+    size = 12 + len(data.unchanged)
+    weights = np.zeros((size, size))
+    weights[:12, :12] = np.diag(_weights(data.mount, guess))
+    for _ in range(_STEPS):
+        information, gradient = normal_equations(data, edges, noise)
+        away = np.zeros(size)
+        away[:12] = _away(edges, guess)
+        # What is shared has settled before; it may follow, but it does not move.
+        step = -covariance(information + weights) @ (gradient + weights @ away)
+        edges = edges.moved(np.concatenate([step[:12], np.zeros(size - 12)]))
+    spread = covariance(closure_information(data, edges, noise) + weights)
+    return edges, spread[:12, :12]
+
+
+def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
+    if guess is not None:
+        return np.tile(np.repeat([guess.sigma_rad**-2.0, guess.sigma_m**-2.0], 3), 2)
+    weights = np.full((2, 2, 3), 1e-6)
+    weights[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
+    return weights.ravel()
+
+
+def _away(edges: Edges, guess: Guess | None) -> FloatArray:
+    """(12,) steps from what is known beforehand to the edges."""
+    if guess is not None:
+        return np.concatenate([log(invert(guess.x) @ edges.x), log(invert(guess.z) @ edges.z)])
+    local = [it[:3, :3].T @ it[:3, 3] for it in (edges.x, edges.z)]
+    return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
+
+
+def _lacking(known: Known) -> DataError:
+    session, missing = known.session, []
+    if known.robot is None:
+        missing.append("a model of its robot ([robot] model)")
+    if session.target is None:
+        missing.append("a board (target)")
+    if known.camera is None or known.free is None or known.pixel_px is None:
+        missing.append("images of the board")
+    return DataError(
+        f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
+        culprits=[f"session {session.name!r}"],
+    )
+
+
+def _too_vague(known: Known, stops: int) -> DataError:
+    return DataError(
+        f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
+        "of the robot do not tell where camera and board are, not even roughly.",
+        culprits=[f"session {known.session.name!r}"],
+        next_step="Give rough guesses of both transforms.",
+    )
