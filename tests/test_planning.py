@@ -10,12 +10,14 @@ from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Edges, Noise, closure_information
+from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Box
-from visioncal.planning.design import CRITERIA, Wish, chosen, shortfall
+from visioncal.planning.design import chosen, shortfall
 from visioncal.planning.improving import next_best
 from visioncal.planning.information import stop_factors, worlds_of
 from visioncal.planning.purposes import PURPOSES, purpose_of
 from visioncal.planning.recorded import Guess, begin
+from visioncal.planning.selection import CRITERIA
 from visioncal.simulation import CellOptions, exact, simulate
 from visioncal.targets import corner_positions
 from visioncal.transforms import exp
@@ -147,6 +149,16 @@ def test_a_wish_that_no_candidates_give_is_refused_with_what_they_give(views):
     words = shortfall(design, wish, 10)
     assert "cannot be reached" in words
     assert f"{design.best.mm:.2g} mm" in words
+
+
+def test_a_board_of_unknown_size_is_named_as_what_is_in_the_way():
+    options = CELL
+    worlds = worlds_of([true_cell(options)], KINEMATICS, postures_in_view(options, 60))
+    # A size that is open by 0.1 % leaves half a millimetre of an arm's place at a metre.
+    wish = Wish(mm=0.4)
+    design = chosen(worlds, 30, wish=wish)
+    assert design.best.mm > 0.4 > design.best_look.mm
+    assert "square_sigma_m" in shortfall(design, wish, 30)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -21,12 +21,13 @@ from test_kinematics import WRONG_LINKS, error_m
 from visioncal.estimator.closure import Noise
 from visioncal.pipeline.known import Known
 from visioncal.planning.candidates import candidates
-from visioncal.planning.design import CRITERIA, chosen
+from visioncal.planning.design import chosen
 from visioncal.planning.improving import next_best
 from visioncal.planning.information import WORLDS as SAMPLE
 from visioncal.planning.information import World, worlds_of
 from visioncal.planning.purposes import PURPOSES
 from visioncal.planning.recorded import Begun, begin
+from visioncal.planning.selection import CRITERIA
 from visioncal.simulation import Cell, CellOptions, simulate
 from visioncal.types import FloatArray
 
@@ -208,13 +209,13 @@ def main(worlds: int) -> None:
     text = "\n".join(
         (
             f"Stops of a UR5e chosen from {CANDIDATES} feasible ones, and as many drawn from them;",
-            f"one board, {worlds} worlds a row. Planned from guesses that are off by "
-            f"{1e2 * GUESS_M:.0f} cm and",
-            f"{np.rad2deg(GUESS_RAD):.1f} deg (one sigma per axis), over {SAMPLE} cells as they may",
-            "be. Kinematics: an arm whose links are off by 0.5 mm and 1 mrad, seen by 5 MP; errors of what it carries all over its workspace. Hand-eye: a",
-            "right arm, 1 MP; errors of the camera's edge. Errors are root mean squares over the",
-            "worlds; expected is the sigma in the true cell, which is better than that of the",
-            "random stops in every world where the least ratio is over 1.\n",
+            f"one board, {worlds} worlds a row. Planned over {SAMPLE} cells, from guesses that are",
+            f"off by {1e2 * GUESS_M:.0f} cm and {np.rad2deg(GUESS_RAD):.1f} deg (sigma per axis).",
+            "Kinematics: an arm whose links are off by 0.5 mm and 1 mrad, seen by 5 MP; errors of",
+            "what it carries all over its workspace. Hand-eye: a right arm, 1 MP; errors of the",
+            "camera's edge. Errors are root mean squares over the worlds; expected is the sigma in",
+            "the true cell: where the least ratio is over 1, random stops never were expected",
+            "better.\n",
             "| purpose | camera | stops | planned [mm] | random [mm] | ratio | ratio of means "
             "| ratio of rotations | planned, expected [mm] | random | ratio | least ratio |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",

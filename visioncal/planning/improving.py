@@ -8,11 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.estimator.armmodel import block_size
 from visioncal.figures import figure
+from visioncal.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.planning.cell import Box
-from visioncal.planning.design import OPEN_SIGMA, Accuracy, Criterion, Design, Wish, chosen
+from visioncal.planning.design import Design, chosen
 from visioncal.planning.information import WORLDS, World, worlds_of
 from visioncal.planning.purposes import Purpose
 from visioncal.planning.recorded import Begun
+from visioncal.planning.selection import Criterion
 from visioncal.robot import Robot
 from visioncal.transforms import invert
 from visioncal.types import FloatArray

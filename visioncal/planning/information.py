@@ -79,6 +79,7 @@ class World:
         place: (p, p) the same for the place that the accuracy is stated of [m^2].
         turn: (p, p) the same for the rotation [rad^2].
         units: (p,) what one unit of each unknown is where different ones are compared.
+        looks: How many of the unknowns are of lens and board; they stand behind the edges.
     """
 
     factors: FloatArray
@@ -88,6 +89,22 @@ class World:
     place: FloatArray
     turn: FloatArray
     units: FloatArray
+    looks: int
+
+    def with_known_looks(self) -> "World":
+        """Returns the world as it is where lens and board are known exactly."""
+        kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.looks))
+        block = np.ix_(kept, kept)
+        return World(
+            self.factors[:, :, kept],
+            self.prior[block],
+            self.recorded[block],
+            self.counted[block],
+            self.place[block],
+            self.turn[block],
+            self.units[kept],
+            0,
+        )
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
         """Covariance (p, p) of the unknowns from some candidates and what is recorded."""
@@ -194,7 +211,7 @@ def _world(
     else:
         judged = _of_workspace(cell, purpose, workspace)
     counted, place, turn = (_widened(it, looks) for it in judged)
-    return World(factors, prior, known, counted, place, turn, units)
+    return World(factors, prior, known, counted, place, turn, units, looks)
 
 
 def _recorded_factors(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> FloatArray:
