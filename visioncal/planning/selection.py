@@ -6,7 +6,7 @@ over the worlds in which the plan must be good:
     I   mean variance of the places that count
     D   determinant of the unknowns' covariance
     A   mean variance of the unknowns, each in its own unit
-    E   largest variance of a combination of what the candidates tell at all
+    E   largest variance of a combination of unknowns, of those that the candidates tell
     O1  geometric mean of the stacked Jacobian's singular values, over the root of the stops
 
 A stop adds six rows, so that its effect on a covariance C is a correction of rank six (Woodbury):
@@ -67,7 +67,9 @@ class Reduced:
         counted: What counts for the criterion.
         place: The variance of the place that the accuracy is stated of [m^2].
         turn: The same for the rotation [rad^2].
-        told: (r, t) directions that the candidates tell well enough to count for E and O1.
+        told: (r, t) directions that the candidates tell well enough to count for O1.
+        watched: (r, r) of edges and arm in their units, as far as the candidates tell them well;
+            the largest variance among them counts for E.
     """
 
     factors: FloatArray
@@ -76,6 +78,7 @@ class Reduced:
     place: Variance
     turn: Variance
     told: FloatArray
+    watched: FloatArray
 
 
 def reduced(world: World, criterion: Criterion) -> Reduced:
@@ -91,21 +94,25 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     values, vectors = np.linalg.eigh(rows.T @ rows + recorded)
     basis = vectors[:, values > _UNTOLD]
     share = values[values > _UNTOLD]
-    wanted = np.diag(world.units**-2.0) / size if criterion == "A" else world.counted
+    # Lens and board are in the way of what is wanted, and not wanted themselves.
+    inverse = 1.0 / world.units
+    inverse[12 : 12 + world.looks] = 0.0
+    wanted = np.diag(inverse**2) / (size - world.looks) if criterion == "A" else world.counted
 
     def seen(square: FloatArray) -> Variance:
         turned = out.T @ square @ out
         inner = basis.T @ turned @ basis
         return Variance(_square_root(inner), float(np.trace(turned) - np.trace(inner)))
 
-    least = _LEAST_SHARE**2 * share.max(initial=0.0) if criterion == "O1" else 1.0
+    watched = np.linalg.qr(inverse[:, None] * (out @ basis) * (share > 1.0)).R
     return Reduced(
         factors @ basis,
         np.eye(len(share)) + basis.T @ recorded @ basis,
         seen(wanted),
         seen(world.place),
         seen(world.turn),
-        np.eye(len(share))[:, share > least],
+        np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
+        watched,
     )
 
 
@@ -178,7 +185,7 @@ class Selection:
         if self.criterion in ("I", "A"):
             return world.counted.of(spread)
         if self.criterion == "E":
-            return float(np.linalg.eigvalsh(_inner(world, spread)).max(initial=0.0))
+            return float(np.linalg.eigvalsh(_watched(world, spread)).max(initial=0.0))
         return float(np.exp(np.linalg.slogdet(spread)[1] / max(len(spread), 1)))
 
     def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
@@ -193,7 +200,7 @@ class Selection:
             return float(np.sqrt(self.value))
         # What little is known beforehand is no part of the Jacobian.
         told = [
-            np.linalg.slogdet(_inner(world, it - np.eye(len(it))))
+            np.linalg.slogdet(world.told.T @ (it - np.eye(len(it))) @ world.told)
             for world, it in zip(self.problem, self.information, strict=True)
         ]
         mean = [
@@ -241,12 +248,12 @@ class Selection:
         return np.asarray(sign * np.trace(np.linalg.solve(changed, squares), axis1=1, axis2=2))
 
 
-def _inner(world: Reduced, square: FloatArray) -> FloatArray:
-    return np.asarray(world.told.T @ square @ world.told)
+def _watched(world: Reduced, spread: FloatArray) -> FloatArray:
+    return np.asarray(world.watched @ spread @ world.watched.T)
 
 
 def _peak(world: Reduced, spread: FloatArray) -> FloatArray:
-    """(t, r) roots of the slope of the mean of a high power of the variances."""
-    values, vectors = np.linalg.eigh(_inner(world, spread))
+    """(r, r) roots of the slope of the mean of a high power of the variances."""
+    values, vectors = np.linalg.eigh(_watched(world, spread))
     weights = (np.maximum(values, 0.0) / values[-1]) ** (_POWER - 1)
-    return np.asarray(np.sqrt(weights)[:, None] * (world.told @ vectors).T)
+    return np.asarray(np.sqrt(weights)[:, None] * (vectors.T @ world.watched))
