@@ -18,7 +18,8 @@ from visioncal.planning.information import stop_factors, worlds_of
 from visioncal.planning.purposes import PURPOSES, purpose_of
 from visioncal.planning.recorded import Guess, begin
 from visioncal.planning.selection import CRITERIA
-from visioncal.simulation import CellOptions, exact, simulate
+from visioncal.simulation import CellOptions, exact, fine_camera, simulate
+from visioncal.simulation.options import Second
 from visioncal.targets import corner_positions
 from visioncal.transforms import exp
 
@@ -244,6 +245,30 @@ def test_a_session_that_is_good_already_needs_no_stop():
     assert easy.design.met
     assert len(easy.design.rows) == 0
     assert easy.helps == ()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        replace(CELL, views=12, seed=4),
+        replace(CELL, views=16, seed=3, state_intrinsics=False, mount="eye-to-hand"),
+        replace(CELL, views=16, seed=6, second=Second(), camera=fine_camera()),
+    ],
+    ids=["stated lens", "estimated lens", "two boards"],
+)
+def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
+    cell = simulate(options)
+    found = so_far_of(cell)
+    begun = begin(found)
+    world = worlds_of([begun.cell], HAND_EYE, cell.joints[:3], recorded=begun.recorded)[0]
+    solved = found.known.solved
+    # Values that are held cost by how far the data pull at them: that is told of data alone.
+    spread = solved.covariance - np.outer(solved.held, solved.held)
+    sigmas = np.sqrt(np.diag(spread)[:6])
+    # The plan's weak prior of 0.2 m and rad is all that differs.
+    assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
+    three = world.covariance(range(3))
+    assert np.trace(three[3:6, 3:6]) < np.trace(world.covariance([])[3:6, 3:6])
 
 
 def test_stops_for_the_arm_say_what_of_it_they_tell():

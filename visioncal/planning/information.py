@@ -22,7 +22,7 @@ from visioncal.estimator.appearance import (
 )
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import ArmModel, block_size
-from visioncal.estimator.closure import Closure, Edges, Noise, whitened_slopes
+from visioncal.estimator.closure import Closure, Edges, Noise, Shared, whitened_slopes
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.workspace import pose_slopes, postures, tool_slopes
@@ -53,15 +53,24 @@ class Recorded:
 
     Attributes:
         data: The chain at each stop, without errors of the arm.
-        free: Lens and board as the views see them; what it leaves open is shared in `data`.
+        free: Lens and boards as the views see them. What they leave open comes first of what is
+            shared in `data`; behind it, where further boards are.
         q: (m, n) joint angles of the stops [rad]; None where they are not known.
         noise: Of the robot at the stops.
+        first_corner: The number of the first corner of the board that is planned for.
     """
 
     data: Closure
     free: Free
     q: FloatArray | None
     noise: Noise
+    first_corner: int = 0
+
+    @property
+    def shared(self) -> FloatArray:
+        """(k, k) information on what the views share, from corners and priors."""
+        shared = self.data.shared
+        return np.zeros((0, 0)) if shared is None else shared.information
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +88,7 @@ class World:
         place: (p, p) the same for the place that the accuracy is stated of [m^2].
         turn: (p, p) the same for the rotation [rad^2].
         units: (p,) what one unit of each unknown is where different ones are compared.
-        looks: How many of the unknowns are of lens and board; they stand behind the edges.
+        looks: How many of the unknowns are of lens and boards; they stand behind the edges.
     """
 
     factors: FloatArray
@@ -139,7 +148,7 @@ def worlds_of(
 
 
 def stop_factors(
-    cell: PlanCell, purpose: Purpose, q: FloatArray, free: Free | None = None
+    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: Recorded | None = None
 ) -> FloatArray:
     """Predicts what stops tell.
 
@@ -147,16 +156,19 @@ def stop_factors(
         cell: The cell, taken as it is guessed to be.
         purpose: What is unknown.
         q: (k, n) joint angles [rad].
-        free: Lens and board, with what is open about them; None for the stated ones, of which the
-            board's size is open by as much as is stated.
+        recorded: What tells of lens and board; None where they are as stated, the board's size
+            being open by as much as is stated.
 
     Returns:
         (k, 6, p) whose squares are the information of each stop; zero where the board is not seen.
     """
-    free = stated(cell) if free is None else free
+    free = stated(cell) if recorded is None else recorded.free
     poses = cell.cam_from_target(q)
-    stack, seen = _predicted(cell, poses)
-    size = 12 + len(free.columns) + sum(_arm_sizes(cell.robot, purpose))
+    stack, seen = _predicted(cell, poses, 0 if recorded is None else recorded.first_corner)
+    known = free.information if recorded is None else recorded.shared
+    # No further board is seen, wherever it is.
+    elsewhere = np.zeros((int(seen.sum()), 6, len(known) - len(free.columns)))
+    size = 12 + len(known) + sum(_arm_sizes(cell.robot, purpose))
     factors = np.zeros((len(q), 6, size))
     if seen.any():
         found = compress(stack, free.basis, free.appearance, poses[seen])
@@ -165,10 +177,15 @@ def stop_factors(
             robot_part(cell.robot.base_from_flange(q[seen]), cell.mount),
             poses[seen],
             floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
-            free.shared(found.by_shared[:, :, free.columns]),
+            _shared(known, [found.by_shared[:, :, free.columns], elsewhere]),
         )
         factors[seen] = _factors(cell, purpose, data, q[seen], cell.noise)
     return factors
+
+
+def _shared(known: FloatArray, moved: list[FloatArray]) -> Shared:
+    by_camera, nothing = np.concatenate(moved, axis=2), np.zeros(len(known))
+    return Shared(known, nothing, nothing, by_camera, np.zeros_like(by_camera))
 
 
 def stated(cell: PlanCell) -> Free:
@@ -194,17 +211,17 @@ def _world(
     recorded: Recorded | None,
     workspace: Box | None,
 ) -> World:
-    free = stated(cell) if recorded is None else recorded.free
-    factors = stop_factors(cell, purpose, q, free)
-    looks, arm = len(free.columns), sum(_arm_sizes(cell.robot, purpose))
+    shared = stated(cell).information if recorded is None else recorded.shared
+    factors = stop_factors(cell, purpose, q, recorded)
+    looks, arm = len(shared), sum(_arm_sizes(cell.robot, purpose))
     sigma = _sigma(purpose)
     weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
-    prior = block_diag(np.diag(weak), free.information, sigma**-2.0 * np.eye(arm))
+    prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm))
     known = np.zeros_like(prior)
     if recorded is not None:
         rows = _recorded_factors(cell, purpose, recorded).reshape(-1, len(prior))
         known = rows.T @ rows
-    of_looks = np.sqrt(np.diag(covariance(free.information))) if looks else np.zeros(0)
+    of_looks = np.sqrt(np.diag(covariance(shared))) if looks else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
         judged = _of_sight(cell, purpose, q)
@@ -250,7 +267,7 @@ def _arm_sizes(robot: Robot, purpose: Purpose) -> tuple[int, ...]:
     return tuple(block_size(name, robot.joint_count) for name in purpose.blocks)
 
 
-def _predicted(cell: PlanCell, poses: FloatArray) -> tuple[CornerStack, Mask]:
+def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[CornerStack, Mask]:
     """The corners at (k, 4, 4) poses as they would be found, and which of these show the board."""
     positions = corner_positions(cell.target)
     points = positions @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
@@ -266,7 +283,7 @@ def _predicted(cell: PlanCell, poses: FloatArray) -> tuple[CornerStack, Mask]:
         (0.0,) * len(counts),
         np.cumsum(counts) - counts,
         view,
-        corner,
+        first_corner + corner,
         positions[corner],
         px[seen][view, corner],
     )

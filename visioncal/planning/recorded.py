@@ -1,6 +1,6 @@
 """Where a plan begins that adds to a session: what the session tells, be it ever so little."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.information import Recorded
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.targets import first_corners
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray, Mount, Progress
 
@@ -124,8 +125,8 @@ def begin(
             begin without a guess.
     """
     known = found.known
-    robot, camera, target, free = known.robot, known.camera, known.session.target, known.free
-    if robot is None or camera is None or target is None or free is None or known.pixel_px is None:
+    robot, free, targets = known.robot, known.free, tuple(known.session.boards.values())
+    if robot is None or free is None or not targets or known.pixel_px is None:
         raise _lacking(known)
     views, stops = known.used, known.stops
     first = np.unique(stops, return_index=True)[1]
@@ -142,7 +143,7 @@ def begin(
         known.session.mount,
         arm,
         free.appearance.camera,
-        target,
+        targets[known.boards[0]],
         nearest.x,
         nearest.z,
         float(sigmas[0]),
@@ -154,7 +155,8 @@ def begin(
         spread,
     )
     q = None if known.joints_rad is None else known.joints(views)[first]
-    recorded = Recorded(data, free, q, noise)
+    corner = int(first_corners(targets)[known.boards[0]])
+    recorded = Recorded(data, free, q, noise, corner)
     return Begun(cell, recorded, found.refusal, tuple(views[at] for at in first.tolist()))
 
 
@@ -168,8 +170,7 @@ def _arm(known: Known, robot: Robot) -> Robot:
 
 
 def _without_arm(known: Known) -> Closure:
-    data = known.closure(known.used)
-    return data.with_first(0 if known.free is None else len(known.free.columns))
+    return replace(known, arm=None).closure(known.used)
 
 
 def _start(known: Known, data: Closure, guess: Guess | None) -> tuple[Edges, Noise]:
@@ -227,9 +228,9 @@ def _lacking(known: Known) -> DataError:
     session, missing = known.session, []
     if known.robot is None:
         missing.append("a model of its robot ([robot] model)")
-    if session.target is None:
+    if not session.boards:
         missing.append("a board (target)")
-    if known.camera is None or known.free is None or known.pixel_px is None:
+    if known.free is None or known.pixel_px is None:
         missing.append("images of the board")
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
