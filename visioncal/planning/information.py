@@ -183,11 +183,6 @@ def stop_factors(
     return factors
 
 
-def _shared(known: FloatArray, moved: list[FloatArray]) -> Shared:
-    by_camera, nothing = np.concatenate(moved, axis=2), np.zeros(len(known))
-    return Shared(known, nothing, nothing, by_camera, np.zeros_like(by_camera))
-
-
 def stated(cell: PlanCell) -> Free:
     """Lens and board as they are stated, the board's size being open by as much as is stated."""
     positions = corner_positions(cell.target)
@@ -250,6 +245,11 @@ def _factors(
         basis = _model(cell.robot, purpose).basis(q)
         data = data.with_more(ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).shared())
     return whitened_slopes(data, Edges(cell.x, cell.z, data.unchanged), noise)
+
+
+def _shared(known: FloatArray, moved: list[FloatArray]) -> Shared:
+    by_camera, nothing = np.concatenate(moved, axis=2), np.zeros(len(known))
+    return Shared(known, nothing, nothing, by_camera, np.zeros_like(by_camera))
 
 
 def _model(robot: Robot, purpose: Purpose) -> ArmModel:
