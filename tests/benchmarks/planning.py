@@ -34,6 +34,8 @@ from visioncal.types import FloatArray
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 CANDIDATES = 1500
+# Real arms and noises that each world's stops are tried with: one alone says little.
+DRAWS = 3
 # How well the guesses are known from which is planned.
 GUESS_RAD, GUESS_M = 0.03, 0.01
 SURE = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
@@ -43,7 +45,7 @@ STOPS = {"kinematics": 30, "hand-eye": 10}
 
 
 def duel(name: str, options: CellOptions) -> tuple[FloatArray, FloatArray]:
-    """Errors of planned and of random stops (2, e), and what was expected of them (2,) [mm]."""
+    """Errors of planned and random stops (2, draws, e), and what was expected (2,) [mm]."""
     purpose, count = PURPOSES[name], STOPS[name]
     error = arm_error if name == "kinematics" else edge_error
     cell = plan_cell(options, GUESS_RAD, GUESS_M)
@@ -54,8 +56,8 @@ def duel(name: str, options: CellOptions) -> tuple[FloatArray, FloatArray]:
     truth = worlds_of([true_cell(options)], purpose, q)[0]
     errors, expected = [], []
     for rows in (planned, random):
-        real = simulate(options, q[rows])
-        errors.append(error(real, calibrated(real)))
+        real = [simulate(replace(options, draw=it), q[rows]) for it in range(DRAWS)]
+        errors.append([error(it, calibrated(it)) for it in real])
         expected.append(expected_mm(truth, rows))
     return np.array(errors), np.array(expected)
 
@@ -80,6 +82,8 @@ def edge_error(cell: Cell, known: Known) -> FloatArray:
 def duels_row(name: str, options: CellOptions, found: list[tuple[FloatArray, FloatArray]]) -> str:
     """One line of the first table."""
     errors, expected = (np.array(it) for it in zip(*found, strict=True))
+    # Worlds and draws alike.
+    errors = np.concatenate(np.moveaxis(errors, 2, 1))
     rms, ratios = np.sqrt(np.mean(errors**2, axis=0)), expected[:, 1] / expected[:, 0]
     means = np.mean(errors[:, 1, 0]) / np.mean(errors[:, 0, 0])
     rotation = "" if rms.shape[1] == 1 else f" {rms[1, 1] / rms[0, 1]:.2f}"
@@ -209,8 +213,9 @@ def main(worlds: int) -> None:
     text = "\n".join(
         (
             f"Stops of a UR5e chosen from {CANDIDATES} feasible ones, and as many drawn from them;",
-            f"one board, {worlds} worlds a row. Planned over {SAMPLE} cells, from guesses that are",
-            f"off by {1e2 * GUESS_M:.0f} cm and {np.rad2deg(GUESS_RAD):.1f} deg (sigma per axis).",
+            f"one board, {worlds} worlds a row, each with {DRAWS} draws of arm and noise. Planned",
+            f"over {SAMPLE} cells, from guesses that are off by {1e2 * GUESS_M:.0f} cm and",
+            f"{np.rad2deg(GUESS_RAD):.1f} deg (one sigma per axis).",
             "Kinematics: an arm whose links are off by 0.5 mm and 1 mrad, seen by 5 MP; errors of",
             "what it carries all over its workspace. Hand-eye: a right arm, 1 MP; errors of the",
             "camera's edge. Errors are root mean squares over the worlds; expected is the sigma in",

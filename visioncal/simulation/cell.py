@@ -47,6 +47,10 @@ class Stream(IntEnum):
     LENS = 9
 
 
+# What another draw of the same cell draws anew.
+_DRAWN_ANEW = (Stream.ARM, Stream.ROBOT, Stream.PIXELS)
+
+
 @dataclass(frozen=True, eq=False)
 class Cell:
     """A simulated cell with m views, numbered from 0.
@@ -153,7 +157,8 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
 
 def stream(options: CellOptions, purpose: Stream, *index: int) -> np.random.Generator:
     """The generator of one source of randomness; `index` tells views apart."""
-    return np.random.default_rng([options.seed, int(purpose), *index])
+    again = (options.draw,) if options.draw and purpose in _DRAWN_ANEW else ()
+    return np.random.default_rng([options.seed, int(purpose), *again, *index])
 
 
 def _mountings(options: CellOptions, arm: Arm, sheet: Sheet) -> dict[str, FloatArray]:

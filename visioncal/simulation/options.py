@@ -98,6 +98,8 @@ class CellOptions:
         second: A second board; None for a cell with one.
         seed: Of everything random. Each source of randomness has a stream of its own, so that a
             change of one option leaves the others' draws as they were.
+        draw: Which draw of the real arm and of all noise; the cell, and what the robot moves to,
+            are the same for all.
     """
 
     robot: str = "ur10e"
@@ -130,6 +132,7 @@ class CellOptions:
     board_bow_m: float = 0.0
     second: Second | None = None
     seed: int = 0
+    draw: int = 0
 
     def __post_init__(self) -> None:
         if self.views < 1:
