@@ -1,13 +1,20 @@
-"""What `visioncal calibrate` writes: the result, the report and the recording."""
+"""What `visioncal calibrate` and `visioncal plan` write into a folder."""
 
+import json
 import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from visioncal.errors import DataError
+from visioncal.files import named_errors, write_atomically
 from visioncal.pipeline import Run
+from visioncal.planning.plan import Plan
+from visioncal.planning.written import program_of, stops_table
 from visioncal.session import Session
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
+STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 
 
 def write_outputs(
@@ -35,8 +42,60 @@ def write_outputs(
     from visioncal.report import write_report
     from visioncal.viewer import blueprint
 
+    def write(aside: Path) -> None:
+        run.calibration.save(aside / CALIBRATION)
+        write_report(aside / REPORT, run.calibration, session, run.evidence, note)
+        if session is not None:
+            layout = blueprint(session, run.calibration)
+            write_recording(aside / RECORDING, session, run.calibration, run.evidence, layout)
+
     # The result last: it is what the others are beside.
     files = (*([] if session is None else [RECORDING]), REPORT, CALIBRATION)
+    return _write_together(folder, files, write)
+
+
+def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[Path, ...]:
+    """Writes a plan's table, program, preview and JSON into a folder, together or not at all.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        plan: The plan.
+        document: The content of plan.json.
+
+    Returns:
+        The files that were written. Robots that are not programmed like a UR get no program, and
+        one that an earlier plan left is taken away.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.planning.preview import preview_of
+    from visioncal.recording.preview import write_preview
+    from visioncal.viewer.planned import plan_blueprint
+
+    program = program_of(plan)
+    preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
+
+    def write(aside: Path) -> None:
+        write_preview(aside / PREVIEW, preview, plan_blueprint(preview))
+        write_atomically(aside / STOPS, stops_table(plan))
+        if program:
+            write_atomically(aside / PROGRAM, program)
+        text = json.dumps(document, indent=2, allow_nan=False)
+        write_atomically(aside / PLAN, f"{text}\n")
+
+    files = (PREVIEW, *([PROGRAM] if program else []), STOPS, PLAN)
+    written = _write_together(folder, files, write)
+    if not program:
+        with named_errors(folder / PROGRAM):
+            (folder / PROGRAM).unlink(missing_ok=True)
+    return written
+
+
+def _write_together(
+    folder: Path, files: Sequence[str], write: Callable[[Path], None]
+) -> tuple[Path, ...]:
+    """Has files written aside, and moves them into a folder once all are there."""
     taken = [folder / file for file in files if (folder / file).is_dir()]
     if taken:
         raise DataError(
@@ -46,11 +105,7 @@ def write_outputs(
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
             aside = Path(name)
-            run.calibration.save(aside / CALIBRATION)
-            write_report(aside / REPORT, run.calibration, session, run.evidence, note)
-            if session is not None:
-                layout = blueprint(session, run.calibration)
-                write_recording(aside / RECORDING, session, run.calibration, run.evidence, layout)
+            write(aside)
             for file in files:
                 (aside / file).replace(folder / file)
     except OSError as error:

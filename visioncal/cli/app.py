@@ -14,6 +14,7 @@ from visioncal.cli.diff import diff_command
 from visioncal.cli.export import export_command
 from visioncal.cli.fixture import fixture_command
 from visioncal.cli.locate import locate_command
+from visioncal.cli.plan import plan_command
 from visioncal.cli.report import report_command
 from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
@@ -34,6 +35,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("demo")(demo_command)
+app.command("plan")(plan_command)
 app.command("calibrate")(calibrate_command)
 app.command("report")(report_command)
 app.command("diff")(diff_command)

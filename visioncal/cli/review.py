@@ -8,7 +8,7 @@ import typer
 
 from visioncal.cli.console import messages
 from visioncal.errors import DataError
-from visioncal.outputs import RECORDING
+from visioncal.outputs import PREVIEW, RECORDING
 
 # The first bytes of every recording that rerun writes.
 _MAGIC = b"RRF2"
@@ -16,7 +16,8 @@ _MAGIC = b"RRF2"
 
 def review_command(
     recording: Annotated[
-        Path, typer.Argument(help="A recording.rrd, or the folder that calibrate wrote it to.")
+        Path,
+        typer.Argument(help="A recording.rrd, a plan.rrd, or the folder that one was written to."),
     ],
     web: Annotated[
         bool, typer.Option("--web", help="Show it in a browser instead of a window.")
@@ -56,12 +57,14 @@ def find_recording(path: Path) -> Path:
     """Finds the recording that is meant.
 
     Args:
-        path: An `.rrd`, or a folder that holds recording.rrd.
+        path: An `.rrd`, or a folder that holds recording.rrd, or else plan.rrd.
 
     Raises:
         DataError: There is none, or it is no recording; a session's folder is told from others.
     """
     file = path / RECORDING if path.is_dir() else path
+    if path.is_dir() and not file.is_file() and (path / PREVIEW).is_file():
+        file = path / PREVIEW
     if path.is_dir() and not file.is_file():
         is_session = (path / "session.toml").is_file()
         raise DataError(

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.estimator.armmodel import block_size
 from visioncal.figures import figure
 from visioncal.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
-from visioncal.planning.cell import Box
+from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.design import Design, chosen
 from visioncal.planning.information import WORLDS, World, worlds_of
 from visioncal.planning.purposes import Purpose
@@ -90,30 +90,56 @@ def next_best(
     cells = (begun.cell, *begun.cell.guesses(worlds - 1, seed))
     predicted = worlds_of(cells, purpose, q, recorded=begun.recorded, workspace=workspace)
     design = chosen(predicted, count, criterion=criterion, wish=wish)
-    return Additions(design, tuple(_helps(begun, purpose, q, predicted[0], design)))
+    names = [f"added stop {it + 1}" for it in range(len(design.rows))]
+    return Additions(
+        design,
+        tuple(helps(begun.cell, purpose, q, predicted[0], design, names, begun=begun)),
+    )
 
 
-def _helps(
-    begun: Begun, purpose: Purpose, q: FloatArray, world: World, design: Design
+def helps(
+    cell: PlanCell,
+    purpose: Purpose,
+    q: FloatArray,
+    world: World,
+    design: Design,
+    names: Sequence[str],
+    *,
+    begun: Begun | None = None,
 ) -> Iterator[Help]:
-    data = begun.recorded.data
-    there = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
-    names = [f"view {it}" for it in begun.views]
-    poses = begun.cell.robot.base_from_flange(q[design.rows])
+    """Says what each chosen stop is good for, those before it being taken.
+
+    Args:
+        cell: The cell as it is guessed to be.
+        purpose: What the stops are for.
+        q: (k, n) joint angles of the candidates [rad].
+        world: What the candidates tell if the guesses are right.
+        design: Which of them are chosen.
+        names: What to call the chosen ones, in their order.
+        begun: What was recorded already; None for nothing.
+    """
+    there, known = np.zeros((0, 4, 4)), []
+    if begun is not None:
+        data = begun.recorded.data
+        there = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
+        known = [f"view {it}" for it in begun.views]
+    poses = cell.robot.base_from_flange(q[design.rows])
     before = world.covariance([])
     for place, row in enumerate(design.rows.tolist()):
         after = world.covariance(design.rows[: place + 1])
-        motion = _motion(begun, there, poses[place], names)
+        motion = _motion(cell, there, poses[place], known)
         then, now = history = design.history[place : place + 2]
-        effect = _effect(begun, purpose, before, after, history)
+        effect = _effect(cell, purpose, before, after, history)
         yield Help(row, f"{motion}: {effect}", then.mm, now.mm)
         there = np.concatenate([there, poses[place][None]])
-        names.append(f"added stop {place + 1}")
+        known = [*known, names[place]]
         before = after
 
 
-def _motion(begun: Begun, there: FloatArray, pose: FloatArray, names: list[str]) -> str:
+def _motion(cell: PlanCell, there: FloatArray, pose: FloatArray, names: Sequence[str]) -> str:
     """How a stop differs from the one whose direction is nearest."""
+    if not len(there):
+        return "begin here"
     turns = Rotation.from_matrix((invert(there) @ pose)[:, :3, :3]).as_rotvec()
     angles = np.linalg.norm(turns, axis=1)
     nearest = int(np.argmin(angles))
@@ -122,16 +148,16 @@ def _motion(begun: Begun, there: FloatArray, pose: FloatArray, names: list[str])
         return f"shift by {shift:.0f} cm from {names[nearest]}"
     axis = turns[nearest] / angles[nearest]
     degrees = f"by {np.rad2deg(angles[nearest]):.0f} deg from {names[nearest]}"
-    flange_from_cam = begun.cell.x
-    if begun.cell.mount == "eye-to-hand":
-        flange_from_cam = invert(there[nearest]) @ begun.cell.x
+    flange_from_cam = cell.x
+    if cell.mount == "eye-to-hand":
+        flange_from_cam = invert(there[nearest]) @ cell.x
     if abs(axis @ flange_from_cam[:3, 2]) > _NEARLY_AXIS:
         return f"turn about the optical axis {degrees}"
     return f"tilt about the tool's {_axes(axis)} {degrees}"
 
 
 def _effect(
-    begun: Begun,
+    cell: PlanCell,
     purpose: Purpose,
     before: FloatArray,
     after: FloatArray,
@@ -141,7 +167,7 @@ def _effect(
     if purpose.judged == "sight":
         return _edge_effect(before, after)
     then, now = (1e-3 * it.mm for it in history)
-    joint = _joint_told(begun.cell.robot, purpose, np.diag(before - after))
+    joint = _joint_told(cell.robot, purpose, np.diag(before - after))
     change = _change("the error over the workspace", then, now, is_rotation=False)
     return f"{change}; tells most of {joint}"
 
@@ -171,6 +197,8 @@ def _edge_effect(before: FloatArray, after: FloatArray) -> str:
 def _change(what: str, then: float, now: float, *, is_rotation: bool) -> str:
     """Says how a sigma [m or rad] falls."""
     unit, scale = ("deg", float(np.rad2deg(1.0))) if is_rotation else ("mm", 1e3)
+    if now > OPEN_SIGMA:
+        return f"a beginning; {what} is open yet"
     if then > OPEN_SIGMA:
         return f"determines what was open; {what} is now {figure(now * scale)} {unit}"
     figures = f"({figure(then * scale)} -> {figure(now * scale)} {unit})"

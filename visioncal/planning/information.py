@@ -183,6 +183,30 @@ def stop_factors(
     return factors
 
 
+def place_sigmas(
+    cell: PlanCell, purpose: Purpose, spread: FloatArray, workspace: Box | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Predicts how surely the arm's places are known all over its workspace.
+
+    Args:
+        cell: The cell, taken as it is guessed to be.
+        purpose: What is unknown; one that judges the workspace.
+        spread: (p, p) covariance of the unknowns, as `World.covariance` has it.
+        workspace: The part of it that counts; None for all.
+
+    Returns:
+        (w, 3) places of what the arm carries, in the base [m], and their (w,) standard deviations
+        as a whole, roots of the covariances' traces [m].
+    """
+    at = _inside(cell, workspace)
+    slopes = _workspace_slopes(cell, purpose, at)
+    arm = slopes.shape[2] - 12
+    rows = np.concatenate([np.arange(12), np.arange(len(spread) - arm, len(spread))])
+    inner = spread[np.ix_(rows, rows)]
+    carried = cell.robot.base_from_flange(at) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
+    return carried[:, :3, 3], np.sqrt(np.einsum("wij,jk,wik->w", slopes, inner, slopes))
+
+
 def stated(cell: PlanCell) -> Free:
     """Lens and board as they are stated, the board's size being open by as much as is stated."""
     positions = corner_positions(cell.target)
@@ -313,10 +337,16 @@ def _of_workspace(
     """What counts of what the arm carries: its place seen from what stands still."""
     at = _inside(cell, workspace)
     model, edges = _model(cell.robot, purpose), Edges(cell.x, cell.z, np.zeros(0))
-    middle = corner_positions(cell.target).mean(axis=0)
-    place = _mean_square(tool_slopes(model, edges, cell.mount, middle, at))
+    place = _mean_square(_workspace_slopes(cell, purpose, at))
     turn = _mean_square(pose_slopes(model, edges, cell.mount, at)[:, :3])
     return place, place, turn
+
+
+def _workspace_slopes(cell: PlanCell, purpose: Purpose, at: FloatArray) -> FloatArray:
+    """(w, 3, 12 + a) how the places of what the arm carries move with edges and arm."""
+    model, edges = _model(cell.robot, purpose), Edges(cell.x, cell.z, np.zeros(0))
+    middle = corner_positions(cell.target).mean(axis=0)
+    return tool_slopes(model, edges, cell.mount, middle, at)
 
 
 def _inside(cell: PlanCell, workspace: Box | None) -> FloatArray:

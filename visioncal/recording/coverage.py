@@ -45,7 +45,12 @@ def image_chart(
     points = {view: it.corners.px for view, it in evidence.items() if it.corners is not None}
     if not points or calibration.camera is None:
         return None
-    width, height = calibration.camera.camera.resolution
+    return corners_chart(calibration.camera.camera.resolution, points)
+
+
+def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray]) -> PointChart:
+    """Corners (k, 2) by view in one image [px]."""
+    width, height = resolution
     # Pixel centres are at integers, so the image begins half a pixel before the first one.
     x = np.linspace(0, width, _CELLS[0] + 1) - 0.5
     y = np.linspace(0, height, _CELLS[1] + 1) - 0.5

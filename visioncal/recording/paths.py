@@ -50,6 +50,14 @@ UNSEEN_MM = "/arm/unseen/position_mm"
 UNSEEN_DEG = "/arm/unseen/orientation_deg"
 ARM_NOTE = "/notes/arm"
 
+# A plan: what is in the way, and how far the joints go.
+OBSTACLES = "/obstacles"
+WAY = "/way"
+WAY_TIMELINE = "way"
+PREDICTED_SIGMA = "/plan/sigma_after_so_many_stops_mm"
+PLAN_NOTE = "/notes/plan"
+STOP_NOTE = "/notes/stop"
+
 # Plots and text.
 RESIDUALS = "/residuals"
 POSITION_MM = f"{RESIDUALS}/position_mm"

@@ -21,7 +21,7 @@ from visioncal.types import Camera, FloatArray, Target
 # Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
 # The views that are not the current one, drawn as small frusta or boards.
-_SMALL_FRUSTUM = 0.05
+SMALL_FRUSTUM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class Scene:
         for end in self._ends:
             self._log_axes(stream, paths.entity_of(end), end, 0.7)
         if self.calibration.camera is not None:
-            self._log_frustum(stream, self.calibration.camera.camera)
+            log_image_plane(stream, self.calibration.camera.camera, self.size_m)
         for end, target in self._boards.items():
             frame, sheet = rr.CoordinateFrame(end), board.sheet(target)
             stream.log(f"{paths.entity_of(end)}/sheet", frame, sheet, static=True)
@@ -112,13 +112,13 @@ class Scene:
     def log_view(self, stream: rr.RecordingStream, view: View, seen: ViewEvidence) -> None:
         """Logs where everything is in one view, at the stream's current time."""
         base_from_flange = self.base_from_flange.get(view.number)
-        _log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, base_from_flange)
+        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, base_from_flange)
         self._log_arm(stream, view)
         if self.calibration is None:
             return
         for end in self._ends:
             base_from_end = self._base_from(end, base_from_flange)
-            _log_pose(stream, paths.entity_of(end), end, base_from_end)
+            log_pose(stream, paths.entity_of(end), end, base_from_end)
         self._log_seen_target(stream, self._base_from("cam", base_from_flange), view, seen)
         if self.uncertainty is not None:
             self.uncertainty.log_view(stream, view.number)
@@ -211,10 +211,8 @@ class Scene:
             return []
         if self.calibration.mount == "eye-in-hand":
             camera = self.calibration.camera
-            frustum = (
-                [] if camera is None else _frustum(camera.camera, _SMALL_FRUSTUM * self.size_m)
-            )
-            shapes = [("cam", it) for it in frustum]
+            rim = [] if camera is None else frustum(camera.camera, SMALL_FRUSTUM * self.size_m)
+            shapes = [("cam", it) for it in rim]
         else:
             shapes = [(end, board.closed_outline(it)) for end, it in self._boards.items()]
         return [
@@ -222,20 +220,6 @@ class Scene:
             for end, shape in shapes
             if (base_from_end := self._base_from(end, base_from_flange)) is not None
         ]
-
-    def _log_frustum(self, stream: rr.RecordingStream, camera: Camera) -> None:
-        matrix = matrix_3x3(camera)
-        # Rerun puts the image's corner, not the first pixel's centre, at the origin.
-        matrix[:2, 2] += 0.5
-        pinhole = rr.Pinhole(
-            image_from_camera=matrix,
-            resolution=camera.resolution,
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=_FRUSTUM * self.size_m,
-            parent_frame=paths.CAM_FRAME,
-            child_frame=paths.IMAGE_FRAME,
-        )
-        stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), pinhole, static=True)
 
     def _log_arm(self, stream: rr.RecordingStream, view: View) -> None:
         """Draws the robot, or only a line to its flange where its joints are not known."""
@@ -278,7 +262,23 @@ class Scene:
         stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
 
 
-def _frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
+def log_image_plane(stream: rr.RecordingStream, camera: Camera, size_m: float) -> None:
+    """Hangs the image into the camera's frame, as large as a cell of some size [m] asks for."""
+    matrix = matrix_3x3(camera)
+    # Rerun puts the image's corner, not the first pixel's centre, at the origin.
+    matrix[:2, 2] += 0.5
+    pinhole = rr.Pinhole(
+        image_from_camera=matrix,
+        resolution=camera.resolution,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_FRUSTUM * size_m,
+        parent_frame=paths.CAM_FRAME,
+        child_frame=paths.IMAGE_FRAME,
+    )
+    stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), pinhole, static=True)
+
+
+def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
     """The edges of a camera's field of view down to a depth [m], as lines in its frame."""
     width, height = camera.resolution
     fx, fy, cx, cy = camera.matrix
@@ -288,7 +288,7 @@ def _frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
     return [rim, *(np.stack([np.zeros(3), corner]) for corner in rim[:4])]
 
 
-def _log_pose(
+def log_pose(
     stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray | None
 ) -> None:
     """Places a frame; an unknown one must not keep the place of the view before."""

@@ -8,7 +8,7 @@ import rerun as rr
 
 from visioncal.calibration import Calibration
 from visioncal.recording import colours, paths
-from visioncal.recording.kinematics import Kinematics, Unseen, WorkspaceMap
+from visioncal.recording.kinematics import Kinematics, Unseen
 from visioncal.recording.uncertainty import round_factor
 from visioncal.robot import Robot
 from visioncal.session import Session, View
@@ -71,7 +71,8 @@ class ArmPicture:
         frame = rr.CoordinateFrame(paths.BASE_FRAME)
         stream.log(paths.magnified_arm(self.factor), frame, static=True)
         if self.found.workspace is not None:
-            self._log_map(stream, self.found.workspace)
+            found = self.found.workspace
+            log_map(stream, found.places_m, found.sigma_mm, self.size_m)
         for plot in (paths.UNSEEN_MM, paths.UNSEEN_DEG):
             for held in (False, True):
                 for name, label, colour in (
@@ -86,34 +87,6 @@ class ArmPicture:
                     )
                     stream.log(_series(plot, name, held=held), points, static=True)
 
-    def _log_map(self, stream: rr.RecordingStream, found: WorkspaceMap) -> None:
-        low, high = np.percentile(found.sigma_mm, [_LOW_PERCENT, _HIGH_PERCENT])
-        frame = rr.CoordinateFrame(paths.BASE_FRAME)
-        places = rr.Points3D(
-            found.places_m,
-            colors=_colours(found.sigma_mm, low, high),
-            radii=_PLACE * self.size_m,
-            labels=[f"{it:.2g} mm" for it in found.sigma_mm],
-            show_labels=False,
-        )
-        stream.log(f"{paths.WORKSPACE}/sigma_of_a_tool_s_place", frame, places, static=True)
-        steps_mm = np.linspace(low, high, _LEGEND_STEPS)
-        # A column beside the map, as high as it.
-        bottom, top = found.places_m[:, 2].min(), found.places_m[:, 2].max()
-        column = np.zeros((_LEGEND_STEPS, 3))
-        column[:, :2] = found.places_m[:, :2].min(axis=0)
-        column[:, 2] = np.linspace(bottom, top, _LEGEND_STEPS)
-        words = [f"{it:.2g} mm" for it in steps_mm]
-        words[-1] += " sigma of a tool's place"
-        legend = rr.Points3D(
-            column,
-            colors=_colours(steps_mm, low, high),
-            radii=_LEGEND * self.size_m,
-            labels=words,
-            show_labels=True,
-        )
-        stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
-
     def log_view(self, stream: rr.RecordingStream, view: int) -> None:
         """Draws the arm as stated in one view, and marks what both make of it."""
         strips = []
@@ -126,6 +99,38 @@ class ArmPicture:
             for it in rows:
                 if it.view == view:
                     _log_unseen(stream, it, held=held)
+
+
+def log_map(
+    stream: rr.RecordingStream, places_m: FloatArray, sigma_mm: FloatArray, size_m: float
+) -> None:
+    """Draws standard deviations (w,) [mm] at (w, 3) places of a cell of some size [m]."""
+    low, high = np.percentile(sigma_mm, [_LOW_PERCENT, _HIGH_PERCENT])
+    frame = rr.CoordinateFrame(paths.BASE_FRAME)
+    places = rr.Points3D(
+        places_m,
+        colors=_colours(sigma_mm, low, high),
+        radii=_PLACE * size_m,
+        labels=[f"{it:.2g} mm" for it in sigma_mm],
+        show_labels=False,
+    )
+    stream.log(f"{paths.WORKSPACE}/sigma_of_a_tool_s_place", frame, places, static=True)
+    steps_mm = np.linspace(low, high, _LEGEND_STEPS)
+    # A column beside the map, as high as it.
+    bottom, top = places_m[:, 2].min(), places_m[:, 2].max()
+    column = np.zeros((_LEGEND_STEPS, 3))
+    column[:, :2] = places_m[:, :2].min(axis=0)
+    column[:, 2] = np.linspace(bottom, top, _LEGEND_STEPS)
+    words = [f"{it:.2g} mm" for it in steps_mm]
+    words[-1] += " sigma of a tool's place"
+    legend = rr.Points3D(
+        column,
+        colors=_colours(steps_mm, low, high),
+        radii=_LEGEND * size_m,
+        labels=words,
+        show_labels=True,
+    )
+    stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
 
 
 def _log_unseen(stream: rr.RecordingStream, seen: Unseen, *, held: bool) -> None:

@@ -106,7 +106,7 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
 def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
     """What the calibrated arm is worth, how views left out speak for it, and its parameters."""
     # The places are all around the base, farther out than the views.
-    wider = eye if found.workspace is None else _eye_on(found.workspace.places_m, _MAP_DISTANCE)
+    wider = eye if found.workspace is None else eye_on(found.workspace.places_m, _MAP_DISTANCE)
     cell = rrb.Spatial3DView(
         name="Sigma of a tool's place over the workspace",
         origin="/",
@@ -177,16 +177,7 @@ def _residuals(contents: _Contents) -> rrb.Container:
 
 
 def _coverage(contents: _Contents) -> rrb.Container:
-    directions = _disc(
-        "Where the camera looks from, about the target's normal",
-        paths.DIRECTIONS,
-        DIRECTIONS_RINGS_DEG,
-    )
-    axes = _disc(
-        "Axes of rotation from view to view, about the flange's z",
-        paths.ROTATION_AXES,
-        AXES_RINGS_DEG,
-    )
+    directions, axes = disc_views()
     if not contents.sight:
         return rrb.Horizontal(axes, name="Coverage")
     if not contents.images:
@@ -199,6 +190,21 @@ def _coverage(contents: _Contents) -> rrb.Container:
     return rrb.Horizontal(
         image, rrb.Vertical(directions, axes), name="Coverage", column_shares=[1.6, 1]
     )
+
+
+def disc_views() -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
+    """The charts of where the camera looks from, and of the axes of rotation."""
+    directions = _disc(
+        "Where the camera looks from, about the target's normal",
+        paths.DIRECTIONS,
+        DIRECTIONS_RINGS_DEG,
+    )
+    axes = _disc(
+        "Axes of rotation from view to view, about the flange's z",
+        paths.ROTATION_AXES,
+        AXES_RINGS_DEG,
+    )
+    return directions, axes
 
 
 def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DView:
@@ -220,10 +226,10 @@ def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D
         return None
     edges = {} if calibration is None else calibration.transforms
     fixed = [edge.translation for name, edge in edges.items() if name.startswith("base_from_")]
-    return _eye_on(np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed]))
+    return eye_on(np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed]))
 
 
-def _eye_on(places: FloatArray, distance: float = _EYE_DISTANCE) -> rrb.EyeControls3D:
+def eye_on(places: FloatArray, distance: float = _EYE_DISTANCE) -> rrb.EyeControls3D:
     """Looks at (k, 3) places from where all of them fill the view [m]."""
     low, high = places.min(axis=0), places.max(axis=0)
     centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))

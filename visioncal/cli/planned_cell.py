@@ -1,0 +1,307 @@
+"""The cell that a plan is for: from a robot and options, a session, or a calibration."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.calibration import Calibration
+from visioncal.cli.numbers import numbers_in
+from visioncal.errors import DataError
+from visioncal.estimator.closure import Noise
+from visioncal.files import read_bytes, some_of
+from visioncal.formats.boards import described_target
+from visioncal.formats.intrinsics import read_intrinsics
+from visioncal.outputs import CALIBRATION
+from visioncal.planning.cell import Box, Limits, PlanCell
+from visioncal.planning.recorded import Begun, Guess, begin, so_far
+from visioncal.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibration
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.stored import load_stored
+from visioncal.targets import target_from_document
+from visioncal.transforms import compose
+from visioncal.types import Camera, FloatArray, Mount, Progress, Target
+
+_SESSION = "session.toml"
+
+
+@dataclass(frozen=True)
+class CellWords:
+    """What the user said of the cell, as it was written; None for what was not said."""
+
+    robot: str | None
+    target: str | None
+    camera: str | None
+    resolution: str | None
+    mount: Mount | None
+    cam: str | None
+    board: str | None
+    guess_mm: float
+    guess_deg: float
+    noise_px: float | None
+    noise_mm: float | None
+    noise_deg: float | None
+    limits: Limits
+    boxes: tuple[Box, ...]
+
+    def given(self, *names: str) -> list[str]:
+        """Those of some options that were given."""
+        return [f"--{it}" for it in names if getattr(self, it) is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What a plan starts from.
+
+    Attributes:
+        words: What it is, for people.
+        robot: A robot's name or file; None where it is something else.
+        calibration: An earlier result, if it is one.
+        session: What was recorded, if that was kept.
+    """
+
+    words: str
+    robot: str | None = None
+    calibration: Calibration | None = None
+    session: Session | None = None
+
+
+def find_source(name: str) -> Source:
+    """Tells robots, sessions and calibrations apart.
+
+    Raises:
+        DataError: What is named cannot be read.
+    """
+    path = Path(name)
+    if path.is_dir() and (path / _SESSION).is_file() and not (path / CALIBRATION).is_file():
+        return Source(f"session {name}", session=Session.load(path))
+    if path.suffix.lower() == ".rrd":
+        # The codec takes half a second to import, which a robot need not wait for.
+        from visioncal.recording import read_calibration
+
+        calibration, session = read_calibration(path), Session.load(path)
+        return Source(f"recording {name}", calibration=calibration, session=session)
+    if path.is_dir() or _holds_a_result(path):
+        stored = load_stored(path)
+        return Source(f"calibration {name}", calibration=stored.calibration, session=stored.session)
+    return Source(f"robot {name}", robot=name)
+
+
+def begun_session(source: Source, words: CellWords, told: Progress) -> Begun:
+    """The session to which stops are added.
+
+    Raises:
+        DataError: There is none, or it tells too little to begin.
+    """
+    session = source.session
+    if session is None:
+        raise DataError(
+            f"--add: {source.words} holds no recorded session to which stops could be added.",
+            culprits=["--add"],
+            next_step="Name the session, or ask for a plan of its own with --stops.",
+        )
+    _refuse(words.given("target", "camera", "resolution", "mount"), "the session has its own")
+    if words.robot is not None:
+        session = _with_robot(session, words.robot)
+    guess = _guess(words) if words.given("cam", "board") else None
+    found = so_far(session, progress=told)
+    begun = begin(found, guess=guess, limits=words.limits, boxes=words.boxes)
+    return replace(begun, cell=_with_noise(begun.cell, words))
+
+
+def cell_of(source: Source, words: CellWords) -> PlanCell:
+    """The cell of a plan of its own, from a calibration or from options.
+
+    Raises:
+        DataError: Something is missing or cannot be read.
+    """
+    if source.calibration is not None:
+        return _with_noise(_calibrated(source.calibration, source.session, words), words)
+    missing = [
+        f"--{it}" for it in ("target", "camera", "cam", "board") if getattr(words, it) is None
+    ]
+    if missing:
+        raise DataError(
+            f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
+            "know the cell.",
+            culprits=missing,
+            next_step="Or plan from a session or a calibration of the cell, which say it all.",
+        )
+    _refuse(words.given("robot") if source.robot else [], "the robot is named already")
+    camera = _camera(str(words.camera), words.resolution)
+    guess = _guess(words)
+    cell = PlanCell(
+        words.mount or "eye-in-hand",
+        load_robot(str(source.robot)),
+        camera,
+        _target(str(words.target)),
+        guess.x,
+        guess.z,
+        guess.sigma_rad,
+        guess.sigma_m,
+        TYPICAL_NOISE,
+        TYPICAL_PX,
+        words.limits,
+        words.boxes,
+    )
+    return _with_noise(cell, words)
+
+
+def box_of(words: str, option: str = "--box") -> Box:
+    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm].
+
+    Raises:
+        DataError: It is written otherwise.
+    """
+    parts = words.split(":")
+    if len(parts) != 3 or not parts[0].strip():
+        raise DataError(
+            f"{option} is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the "
+            "base and the lengths in mm.",
+            culprits=[option],
+        )
+    centre = numbers_in(parts[1], option, "x,y,z")
+    size = numbers_in(parts[2], option, "sx,sy,sz")
+    return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
+
+
+def pose_of(words: str, option: str) -> FloatArray:
+    """Reads a rough pose: x, y, z [mm], then angles about the fixed axes x, y, z [deg]; (4, 4).
+
+    Raises:
+        DataError: It is not six numbers.
+    """
+    numbers = numbers_in(",".join(words.replace(",", " ").split()), option, "x,y,z,rx,ry,rz")
+    turn = Rotation.from_euler("xyz", numbers[3:], degrees=True).as_matrix()
+    return compose(turn, 1e-3 * np.array(numbers[:3]))
+
+
+def _holds_a_result(path: Path) -> bool:
+    """Tells a calibration.json from other files, such as an arm's."""
+    if not path.is_file() or path.suffix.lower() != ".json":
+        return False
+    try:
+        document = json.loads(read_bytes(path))
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(document, dict) and "transforms" in document
+
+
+def _refuse(given: list[str], why: str) -> None:
+    if given:
+        verb = "has" if len(given) == 1 else "have"
+        raise DataError(
+            f"{some_of(given)} {verb} no use here: {why}.",
+            culprits=given,
+            next_step="Leave it out.",
+        )
+
+
+def _with_robot(session: Session, name: str) -> Session:
+    document = {**session.document, "robot": {**session.document.get("robot", {}), "model": name}}
+    return Session.assemble(
+        document,
+        session.columns,
+        [[view.cell(it) for it in session.columns] for view in session.views],
+        session.images,
+        target_document=session.target_document,
+        robot_document=load_robot(name).document,
+    )
+
+
+def _calibrated(calibration: Calibration, session: Session | None, words: CellWords) -> PlanCell:
+    _refuse(words.given("camera", "resolution", "mount"), "the calibration has its own")
+    if words.target is not None:
+        target = _target(words.target)
+    elif session is not None and session.target is not None:
+        target = session.target
+    else:
+        raise DataError(
+            f"calibration {calibration.session_name!r} does not say which board it was made with, "
+            "and its recording is not there.",
+            culprits=["--target"],
+            next_step="Name the board with --target.",
+        )
+    robot = None if words.robot is None else load_robot(words.robot)
+    cell = cell_of_calibration(calibration, target, words.limits, words.boxes, robot=robot)
+    if words.cam is not None:
+        cell = replace(cell, x=pose_of(words.cam, "--cam"))
+    if words.board is not None:
+        cell = replace(cell, z=pose_of(words.board, "--board"))
+    if not words.given("cam", "board"):
+        return cell
+    return replace(
+        cell, sigma_m=1e-3 * words.guess_mm, sigma_rad=float(np.deg2rad(words.guess_deg))
+    )
+
+
+def _guess(words: CellWords) -> Guess:
+    missing = [f"--{it}" for it in ("cam", "board") if getattr(words, it) is None]
+    if missing:
+        raise DataError(
+            f"{missing[0]} is needed too: a guess is one of both, the camera and the board.",
+            culprits=missing,
+        )
+    return Guess(
+        pose_of(str(words.cam), "--cam"),
+        pose_of(str(words.board), "--board"),
+        float(np.deg2rad(words.guess_deg)),
+        1e-3 * words.guess_mm,
+    )
+
+
+def _with_noise(cell: PlanCell, words: CellWords) -> PlanCell:
+    for name in ("noise_px", "noise_mm", "noise_deg"):
+        value = getattr(words, name)
+        option = f"--{name.replace('_', '-')}"
+        if value is not None and not 0.0 <= value < np.inf:
+            raise DataError(
+                f"{option} is {value}; zero or more is needed.",
+                culprits=[option],
+            )
+    noise = cell.noise
+    sigma_m = noise.sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
+    sigma_rad = noise.sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))
+    pixel_px = cell.pixel_px if words.noise_px is None else words.noise_px
+    return replace(cell, noise=Noise(sigma_rad, sigma_m), pixel_px=pixel_px)
+
+
+def _target(words: str) -> Target:
+    return target_from_document(described_target(words), words)
+
+
+def _camera(words: str, resolution: str | None) -> Camera:
+    if "," in words and not Path(words).exists():
+        matrix = numbers_in(words, "--camera", "fx,fy,cx,cy")
+        return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
+    path = Path(words)
+    if path.is_dir() or path.suffix.lower() == ".rrd" or _holds_a_result(path):
+        found = load_stored(path).calibration.camera
+        if found is None:
+            raise DataError(
+                f"--camera: {words} was made from measured poses and knows no camera.",
+                culprits=["--camera"],
+            )
+        return found.camera
+    lens, _ = read_intrinsics(path)
+    width, height = lens["resolution"] if "resolution" in lens else _size(resolution)
+    distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)
+    return Camera(lens["model"], (int(width), int(height)), np.array(lens["matrix"]), distortion)
+
+
+def _size(words: str | None) -> tuple[int, int]:
+    if words is None:
+        raise DataError(
+            "--resolution is needed beside this --camera: width and height of the images [px].",
+            culprits=["--resolution"],
+        )
+    width, height = numbers_in(words, "--resolution", "w,h")
+    if min(width, height) < 1 or width != int(width) or height != int(height):
+        raise DataError(
+            f"--resolution is {words[:80]!r}; two whole numbers above 0 are needed, as 1280,800.",
+            culprits=["--resolution"],
+        )
+    return int(width), int(height)

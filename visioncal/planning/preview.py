@@ -1,0 +1,82 @@
+"""A plan as it is drawn and told."""
+
+import numpy as np
+
+from visioncal.figures import figure
+from visioncal.planning.design import Accuracy
+from visioncal.planning.plan import Plan, PlannedStop
+from visioncal.recording.preview import Obstacle, Preview, PreviewStop
+
+
+def accuracy_words(found: Accuracy) -> str:
+    """Says what is predicted: `0.12 mm and 0.02 deg`."""
+    if found.is_open:
+        return "not determined"
+    return f"{figure(found.mm)} mm and {figure(found.deg)} deg"
+
+
+def summary_of(plan: Plan) -> str:
+    """Says in a sentence what a plan gives."""
+    count, design = len(plan.stops), plan.design
+    stops = f"{count} stop{'s' if count != 1 else ''}"
+    wanted = f"{plan.request.purpose.errors}, predicted sigma"
+    if plan.begun is None:
+        return (
+            f"{stops} from {plan.found} possible ones; {wanted}: {accuracy_words(design.predicted)}"
+        )
+    return (
+        f"{stops} to add, from {plan.found} possible ones; {wanted}: "
+        f"{accuracy_words(design.before)} before, {accuracy_words(design.predicted)} after"
+    )
+
+
+def preview_of(plan: Plan, name: str) -> Preview:
+    """What is drawn of a plan, under a name."""
+    cell = plan.cell
+    history = [np.nan if it.is_open else it.mm for it in plan.design.history]
+    return Preview(
+        name,
+        cell.mount,
+        cell.robot,
+        cell.camera,
+        cell.target,
+        cell.x,
+        cell.z,
+        tuple(PreviewStop(it.view, it.q, it.via, _note(it)) for it in plan.stops),
+        np.array(history),
+        tuple(Obstacle(it.name, it.base_from_box, it.size_m) for it in cell.boxes),
+        cell.limits.floor_m,
+        plan.map_m,
+        1e3 * plan.map_sigma_m,
+        _plan_note(plan, name),
+    )
+
+
+def _note(stop: PlannedStop) -> str:
+    degrees = ", ".join(f"{it:.1f}" for it in np.rad2deg(stop.q))
+    x, y, z = 1e3 * stop.base_from_flange[:3, 3]
+    distance = 1e3 * float(np.linalg.norm(stop.cam_from_target[:3, 3]))
+    return "\n\n".join(
+        [
+            f"**View {stop.view}** (number {stop.rank} by what it tells): {stop.words}",
+            f"Joints ({degrees}) deg; flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm; board's origin at "
+            f"{distance:.0f} mm from the camera. The whole board is in the image in "
+            f"{100 * stop.seen:.0f} % of what the cell may be.",
+        ]
+    )
+
+
+def _plan_note(plan: Plan, name: str) -> str:
+    lines = [f"# {len(plan.stops)} stops for {plan.request.purpose.name}", name, ""]
+    lines.append(f"{summary_of(plan)}.")
+    if plan.shortfall:
+        lines += ["", f"**{plan.shortfall}**"]
+    lines += ["", "| view | predicted sigma | what it is good for |", "| --- | --- | --- |"]
+    ranked = sorted(plan.stops, key=lambda it: it.rank)
+    lines += [f"| {it.view} | {accuracy_words(it.after)} | {it.words} |" for it in ranked]
+    lines += [
+        "",
+        "The most telling first; each sigma is that of a stop and all above it. Views are numbered "
+        "as the arm drives to them.",
+    ]
+    return "\n".join(lines)
