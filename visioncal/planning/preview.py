@@ -71,12 +71,14 @@ def _plan_note(plan: Plan, name: str) -> str:
     lines.append(f"{summary_of(plan)}.")
     if plan.shortfall:
         lines += ["", f"**{plan.shortfall}**"]
-    lines += ["", "| view | predicted sigma | what it is good for |", "| --- | --- | --- |"]
-    ranked = sorted(plan.stops, key=lambda it: it.rank)
-    lines += [f"| {it.view} | {accuracy_words(it.after)} | {it.words} |" for it in ranked]
+    if plan.begun is not None and plan.begun.refusal:
+        lines += ["", f"So far: {plan.begun.refusal}"]
     lines += [
         "",
-        "The most telling first; each sigma is that of a stop and all above it. Views are numbered "
-        "as the arm drives to them.",
+        "The most telling first, each with what is predicted of it and all above it. Views are "
+        "numbered as the arm drives to them.",
+        "",
     ]
+    ranked = sorted(plan.stops, key=lambda it: it.rank)
+    lines += [f"- **view {it.view}** ({accuracy_words(it.after)}): {it.words}" for it in ranked]
     return "\n".join(lines)

@@ -29,6 +29,8 @@ _AXIS, _LINE, _POINT = 0.12, 0.002, 0.004
 _STEP_RAD = 0.05
 # A piece of floor is drawn, so many times as wide as the cell.
 _FLOOR = 1.3
+# A lens bends the board's sides: they are drawn with so many points.
+_SIDE_POINTS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +167,10 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
     for entity in ("links", "joints"):
         stream.log(f"{paths.ROBOT}/{entity}", in_base, static=True)
     log_image_plane(stream, preview.camera, size_m)
+    width, height = preview.camera.resolution
+    border = rr.Boxes2D(mins=[[0.0, 0.0]], sizes=[[width, height]], colors=colours.GRID)
+    in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
+    stream.log(f"{paths.IMAGE}/border", in_image, border, static=True)
     sheet = board.sheet(preview.target)
     on_target = rr.CoordinateFrame(paths.TARGET_FRAME)
     stream.log(f"{paths.TARGET}/sheet", on_target, sheet, static=True)
@@ -272,12 +278,27 @@ def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
         step += 1
         cam_from_target = _log_cell(stream, preview, stop.q)
         charts.log_view(stream, stop.view)
-        px = _corners_px(preview, cam_from_target)
-        points = rr.Points2D(px, colors=colours.PREDICTED, radii=rr.Radius.ui_points(3.0))
-        stream.log(paths.PREDICTED, points)
+        _log_image(stream, preview, cam_from_target)
         text = rr.TextDocument(stop.note, media_type="text/markdown")
         stream.log(paths.STOP_NOTE, text)
     recorder.keep()
+
+
+def _log_image(
+    stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray
+) -> None:
+    """Draws the board as the camera will see it."""
+    frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
+    outline = board.closed_outline(preview.target)
+    shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
+    sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
+    seen = sides @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    # Rerun counts from the image's corner, not from the first pixel's centre.
+    rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
+    stream.log(f"{paths.IMAGE}/board", frame, rim)
+    px = _corners_px(preview, cam_from_target) + 0.5
+    points = rr.Points2D(px, colors=colours.PREDICTED, radii=rr.Radius.ui_points(2.5))
+    stream.log(paths.PREDICTED, frame, points)
 
 
 def _log_cell(stream: rr.RecordingStream, preview: Preview, q: FloatArray) -> FloatArray:
