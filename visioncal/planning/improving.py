@@ -153,7 +153,8 @@ def _motion(cell: PlanCell, there: FloatArray, pose: FloatArray, names: Sequence
         flange_from_cam = invert(there[nearest]) @ cell.x
     if abs(axis @ flange_from_cam[:3, 2]) > _NEARLY_AXIS:
         return f"turn about the optical axis {degrees}"
-    return f"tilt about the tool's {_axes(axis)} {degrees}"
+    verb = "turn" if abs(axis[2]) > np.linalg.norm(axis[:2]) else "tilt"
+    return f"{verb} about the tool's {_axes(axis)} {degrees}"
 
 
 def _effect(

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.errors import DataError
+from visioncal.figures import figure
+from visioncal.files import some_of
 from visioncal.planning.candidates import Candidates, candidates
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.design import Accuracy, Criterion, Design, Wish, chosen, shortfall
@@ -14,7 +16,7 @@ from visioncal.planning.information import WORLDS, World, place_sigmas, worlds_o
 from visioncal.planning.path import Route, ordered
 from visioncal.planning.purposes import Purpose
 from visioncal.planning.recorded import Begun
-from visioncal.types import FloatArray, Progress
+from visioncal.types import FloatArray, IntArray, Progress
 
 # Stops without a safe way to them are chosen anew so often; then a plan goes without them.
 _ROUNDS = 4
@@ -85,8 +87,7 @@ class Plan:
         request: What was asked.
         stops: The stops.
         design: What is predicted of them.
-        length_rad: How far the joints turn in all, each segment counted by the joint that turns
-            most [rad].
+        length_rad: How far the joints travel in all, as the sum of the ways' norms [rad].
         begun: What was recorded already; None for nothing.
         found: How many possible stops they were chosen from.
         lost: What kept how many tries from being possible.
@@ -150,8 +151,8 @@ def make_plan(
     world, route = worlds[0], chosen_stops.route
     design = chosen_stops.design
     first = 1 if begun is None else 1 + max(begun.views)
-    numbers = np.empty(len(design.rows), dtype=int)
-    numbers[route.order] = first + np.arange(len(design.rows))
+    numbers = np.empty(len(design.rows), dtype=np.int64)
+    numbers[list(route.order)] = first + np.arange(len(design.rows))
     stops = _stops(cell, request, found, world, chosen_stops, numbers, begun)
     map_m, map_sigma_m = np.zeros((0, 3)), np.zeros(0)
     if request.purpose.judged == "workspace" and not design.predicted.is_open:
@@ -194,22 +195,31 @@ def _with_a_way(
     left = np.arange(len(q))
     given_up: list[str] = []
     for turn in range(_ROUNDS):
-        count = min(request.count, len(left))
         few = tuple(replace(it, factors=it.factors[left]) for it in worlds)
-        design = chosen(few, count, criterion=request.criterion, wish=request.wish)
+        design = chosen(few, request.count, criterion=request.criterion, wish=request.wish)
+        if not len(design.rows):
+            raise _needless(design)
         design = replace(design, rows=left[design.rows])
         told("path", turn, _ROUNDS)
-        route = ordered(cell, request.start_q, q[design.rows])
-        if len(route.order) == len(design.rows):
+        route = ordered(cell, request.start_q, q[design.rows], request.seed)
+        if not route.unreachable:
             return _Chosen(design, route, tuple(given_up))
-        lost = np.setdiff1d(np.arange(len(design.rows)), route.order)
-        given_up += route.unreachable
-        left = np.setdiff1d(left, design.rows[lost])
+        given_up += route.unreachable.values()
+        left = np.setdiff1d(left, design.rows[list(route.unreachable)])
     raise DataError(
-        f"plan: no safe way through {len(design.rows)} stops was found in {_ROUNDS} choices; given "
-        f"up were {', '.join(given_up)}.",
-        culprits=given_up,
+        f"plan: no safe way through {request.count} stops was found in {_ROUNDS} choices; in the "
+        f"way were {some_of(list(dict.fromkeys(given_up)))}.",
+        culprits=tuple(dict.fromkeys(given_up)),
         next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
+    )
+
+
+def _needless(design: Design) -> DataError:
+    found = design.before
+    return DataError(
+        f"plan: the wish is met by what was recorded, which predicts {figure(found.mm)} mm and "
+        f"{figure(found.deg)} deg; no stop needs to be added.",
+        next_step="Wish for more, or leave the wish out to see what further stops would give.",
     )
 
 
@@ -219,7 +229,7 @@ def _stops(
     found: Candidates,
     world: World,
     taken: _Chosen,
-    numbers: FloatArray,
+    numbers: IntArray,
     begun: Begun | None,
 ) -> tuple[PlannedStop, ...]:
     """The stops in driving order; `numbers` are their views' in the order of the design."""
@@ -254,7 +264,7 @@ def _stops(
             design.history[at],
             design.history[at + 1],
         )
-        for at, via in zip(route.order.tolist(), segments, strict=True)
+        for at, via in zip(route.order, segments, strict=True)
     )
 
 

@@ -284,9 +284,7 @@ def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
     recorder.keep()
 
 
-def _log_image(
-    stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray
-) -> None:
+def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray) -> None:
     """Draws the board as the camera will see it."""
     frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
     outline = board.closed_outline(preview.target)
