@@ -19,6 +19,7 @@ from visioncal.cli.planned_cell import (
 )
 from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
+from visioncal.files import some_of
 from visioncal.outputs import write_plan
 from visioncal.planning.cell import Limits, PlanCell
 from visioncal.planning.design import Wish
@@ -150,15 +151,20 @@ def _tell(plan: Plan) -> None:
         console.print(escape(f"  so far: {plan.begun.refusal}"))
     for stop in sorted(plan.stops, key=lambda it: it.rank):
         console.print(escape(f"  view {stop.view}: {stop.words}"))
-    for words in plan.left_out:
-        console.print(f"[bold yellow]left out:[/] {escape(words)}")
+    if plan.in_the_way:
+        count, obstacles = len(plan.in_the_way), some_of(list(dict.fromkeys(plan.in_the_way)))
+        stops = "1 stop was" if count == 1 else f"{count} stops were"
+        console.print(escape(f"{stops} exchanged for want of a safe way ({obstacles})"))
     if plan.shortfall:
         console.print(f"[bold yellow]warning:[/] {escape(plan.shortfall)}")
     elif plan.design.met:
         after = accuracy_words(plan.design.predicted)
         console.print(escape(f"that meets the wish, with {len(plan.stops)} stops: {after}"))
     if plan.request.start_q is None:
-        console.print("the way to the first stop is not looked at: --start-joints says where it is")
+        console.print(
+            "the way from where the arm stands to the first stop was not looked at; --start-joints "
+            "says where that is"
+        )
 
 
 def _start(words: str | None, cell: PlanCell) -> FloatArray | None:

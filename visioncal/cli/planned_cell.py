@@ -18,7 +18,7 @@ from visioncal.outputs import CALIBRATION
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.recorded import Begun, Guess, begin, so_far
 from visioncal.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibration
-from visioncal.robot import load_robot
+from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.stored import load_stored
 from visioncal.targets import target_from_document
@@ -58,13 +58,13 @@ class Source:
 
     Attributes:
         words: What it is, for people.
-        robot: A robot's name or file; None where it is something else.
+        robot: A robot, if it is one.
         calibration: An earlier result, if it is one.
         session: What was recorded, if that was kept.
     """
 
     words: str
-    robot: str | None = None
+    robot: Robot | None = None
     calibration: Calibration | None = None
     session: Session | None = None
 
@@ -84,10 +84,17 @@ def find_source(name: str) -> Source:
 
         calibration, session = read_calibration(path), Session.load(path)
         return Source(f"recording {name}", calibration=calibration, session=session)
-    if path.is_dir() or _holds_a_result(path):
+    if (path / CALIBRATION).is_file() or _holds_a_result(path):
         stored = load_stored(path)
         return Source(f"calibration {name}", calibration=stored.calibration, session=stored.session)
-    return Source(f"robot {name}", robot=name)
+    try:
+        return Source(f"robot {name}", robot=load_robot(name))
+    except DataError as error:
+        raise DataError(
+            f"{name[:200]} is no session and no calibration, and as a robot: {error.message}",
+            culprits=[name[:200]],
+            next_step=error.next_step,
+        ) from error
 
 
 def begun_session(source: Source, words: CellWords, told: Progress) -> Begun:
@@ -119,23 +126,24 @@ def cell_of(source: Source, words: CellWords) -> PlanCell:
         DataError: Something is missing or cannot be read.
     """
     if source.calibration is not None:
+        _refuse(words.given("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words), words)
     missing = [
         f"--{it}" for it in ("target", "camera", "cam", "board") if getattr(words, it) is None
     ]
-    if missing:
+    if missing or source.robot is None:
         raise DataError(
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
             "know the cell.",
             culprits=missing,
             next_step="Or plan from a session or a calibration of the cell, which say it all.",
         )
-    _refuse(words.given("robot") if source.robot else [], "the robot is named already")
+    _refuse(words.given("robot"), f"{source.words} is named already")
     camera = _camera(str(words.camera), words.resolution)
     guess = _guess(words)
     cell = PlanCell(
         words.mount or "eye-in-hand",
-        load_robot(str(source.robot)),
+        source.robot,
         camera,
         _target(str(words.target)),
         guess.x,
@@ -213,7 +221,6 @@ def _with_robot(session: Session, name: str) -> Session:
 
 
 def _calibrated(calibration: Calibration, session: Session | None, words: CellWords) -> PlanCell:
-    _refuse(words.given("camera", "resolution", "mount"), "the calibration has its own")
     if words.target is not None:
         target = _target(words.target)
     elif session is not None and session.target is not None:

@@ -91,7 +91,8 @@ class Plan:
         begun: What was recorded already; None for nothing.
         found: How many possible stops they were chosen from.
         lost: What kept how many tries from being possible.
-        left_out: Which stops were given up for want of a safe way, in words.
+        in_the_way: What kept stops from being driven to, one for each that was exchanged for
+            another.
         shortfall: Why the wished accuracy is not met, in words; empty where it is or none was
             wished.
         map_m: (w, 3) places all over the workspace, in the base [m]; empty where the purpose does
@@ -107,7 +108,7 @@ class Plan:
     begun: Begun | None
     found: int
     lost: Mapping[str, int]
-    left_out: tuple[str, ...]
+    in_the_way: tuple[str, ...]
     shortfall: str
     map_m: FloatArray
     map_sigma_m: FloatArray
@@ -168,7 +169,7 @@ def make_plan(
         begun,
         len(found),
         found.lost,
-        chosen_stops.left_out,
+        chosen_stops.in_the_way,
         "" if wish is None else shortfall(design, wish, request.count),
         map_m,
         map_sigma_m,
@@ -181,7 +182,7 @@ class _Chosen:
 
     design: Design
     route: Route
-    left_out: tuple[str, ...]
+    in_the_way: tuple[str, ...]
 
 
 def _with_a_way(

@@ -87,8 +87,8 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         "candidates": {"found": plan.found, "lost_to": dict(plan.lost)},
         **inputs,
     }
-    if plan.left_out:
-        document["left_out"] = list(plan.left_out)
+    if plan.in_the_way:
+        document["exchanged_because_of"] = list(plan.in_the_way)
     return document
 
 
