@@ -24,6 +24,7 @@ from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES
 from visioncal.stages.kinematics import ASKED
+from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
 from visioncal.types import FloatArray, Progress, SolverName
@@ -110,13 +111,17 @@ def run(
 
 
 def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
-    """Adds to an error, once the target's poses are known, how the robot's should be read."""
-    hint = "" if seen is None else reading_hint(seen)
-    if not hint:
+    """Adds to an error, once the target's poses are known, what leads on.
+
+    That is how the robot's poses should be read, or else what proposes the views that are missing.
+    """
+    if seen is None:
         return error
-    return type(error)(
-        error.message, culprits=error.culprits, next_step=f"{hint} {error.next_step}".strip()
-    )
+    hint, (planned,) = reading_hint(seen), with_proposal([error.next_step])
+    next_step = error.next_step if seen.camera is None else planned
+    if hint:
+        next_step = f"{hint} {error.next_step}".strip()
+    return type(error)(error.message, culprits=error.culprits, next_step=next_step)
 
 
 def _with_reading(known: Known, seen: Known | None) -> Known:

@@ -13,7 +13,7 @@ from visioncal.stages.judge import JudgeOptions
 # Views whose residual is this many times the median are named, as by the verdict.
 _STANDS_OUT = JudgeOptions.outlier
 # Sentences of a verdict that start so say what to do.
-_IMPERATIVE = re.compile("(Add|Check|Compare|Look|Measure|Move|Print|Record|Take|Use) ")
+_IMPERATIVE = re.compile("(Add|Check|Compare|Let|Look|Measure|Move|Print|Record|Take|Use) ")
 # And one that starts so is about views that disagree.
 _CAUSES = "Possible causes: "
 # So begins the reason of a view that was left out because pose and image do not go together.

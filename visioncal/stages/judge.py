@@ -10,6 +10,7 @@ from visioncal.estimator.closure import Noise
 from visioncal.figures import figure
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult
+from visioncal.stages.proposing import with_proposal
 from visioncal.types import Mount, Rejection
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
@@ -139,7 +140,10 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
         return Verdict("good", (_praise(findings), *findings.notes))
     status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
     ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
-    return Verdict(status, (*(doubt.sentence for doubt in ordered), *findings.notes))
+    sentences = tuple(doubt.sentence for doubt in ordered)
+    if findings.pixel_px is not None:
+        sentences = with_proposal(sentences)
+    return Verdict(status, (*sentences, *findings.notes))
 
 
 def is_scattered(findings: Findings, options: JudgeOptions | None = None) -> bool:

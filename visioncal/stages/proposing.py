@@ -1,0 +1,26 @@
+"""Where advice to add views is given: which command proposes them."""
+
+import re
+from collections.abc import Sequence
+
+# Advice to add stops or views of any kind; of the first, those that are about the arm.
+_ADD = re.compile(r"\bAdd (?:stops|views|\d+ or more)\b")
+_ARM = re.compile(r"\bAdd (?:stops|views in which the arm)\b")
+
+
+def with_proposal(sentences: Sequence[str]) -> tuple[str, ...]:
+    """Points to `visioncal plan` behind the first advice to add views; once is enough.
+
+    Args:
+        sentences: Advice, reasons of a verdict; changed is the first that asks for views.
+    """
+    for at, sentence in enumerate(sentences):
+        if _ADD.search(sentence):
+            told = f"{sentence} {_proposal(' '.join(sentences))}"
+            return (*sentences[:at], told, *sentences[at + 1 :])
+    return tuple(sentences)
+
+
+def _proposal(words: str) -> str:
+    purpose = " --for kinematics" if _ARM.search(words) else ""
+    return f"Let visioncal plan SESSION --add 5{purpose} propose them."
