@@ -21,8 +21,8 @@ from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.files import some_of
 from visioncal.outputs import write_plan
+from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Limits, PlanCell
-from visioncal.planning.design import Wish
 from visioncal.planning.plan import Plan, Request, make_plan
 from visioncal.planning.preview import accuracy_words, summary_of
 from visioncal.planning.purposes import purpose_of

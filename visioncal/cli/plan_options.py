@@ -5,7 +5,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from visioncal.planning.design import Criterion
+from visioncal.planning.selection import Criterion
 from visioncal.types import Mount
 
 _WHAT = "What is planned"

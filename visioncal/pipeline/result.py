@@ -118,7 +118,7 @@ def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
     if seen is None:
         return error
     hint, (planned,) = reading_hint(seen), with_proposal([error.next_step])
-    next_step = error.next_step if seen.camera is None else planned
+    next_step = error.next_step if seen.scene is None else planned
     if hint:
         next_step = f"{hint} {error.next_step}".strip()
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)

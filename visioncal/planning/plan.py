@@ -8,14 +8,16 @@ import numpy as np
 from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.files import some_of
+from visioncal.planning.accuracy import Accuracy, Wish
 from visioncal.planning.candidates import Candidates, candidates
 from visioncal.planning.cell import Box, PlanCell
-from visioncal.planning.design import Accuracy, Criterion, Design, Wish, chosen, shortfall
+from visioncal.planning.design import Design, chosen, shortfall
 from visioncal.planning.improving import helps
 from visioncal.planning.information import WORLDS, World, place_sigmas, worlds_of
 from visioncal.planning.path import Route, ordered
 from visioncal.planning.purposes import Purpose
 from visioncal.planning.recorded import Begun
+from visioncal.planning.selection import Criterion
 from visioncal.types import FloatArray, IntArray, Progress
 
 # Stops without a safe way to them are chosen anew so often; then a plan goes without them.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from visioncal.figures import figure
-from visioncal.planning.design import Accuracy
+from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.plan import Plan, PlannedStop
 from visioncal.recording.preview import Obstacle, Preview, PreviewStop
 

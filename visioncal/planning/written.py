@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.files import one_line, sha256
+from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.cell import Box, Limits, PlanCell
-from visioncal.planning.design import Accuracy
 from visioncal.planning.plan import Plan, PlannedStop, Request
 from visioncal.session.columns import POSE
 from visioncal.targets import target_document
