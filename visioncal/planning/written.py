@@ -29,20 +29,26 @@ _UR_JOINTS = 6
 
 
 def stops_table(plan: Plan) -> str:
-    """Writes the stops as a table with the columns of views.csv.
+    """Writes the stops as a views.csv, with names for the images that are to be taken there.
 
     The poses are those of the robot's model at these joints.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     joints = [f"q{it + 1}_rad" for it in range(plan.cell.robot.joint_count)]
-    writer.writerow(["view", *joints, *POSE, "why"])
+    writer.writerow(["view", "image", *joints, *POSE, "why"])
     for stop in plan.stops:
         pose = stop.base_from_flange
         turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
         numbers = [*stop.q.tolist(), *pose[:3, 3].tolist(), *turn.tolist()]
-        writer.writerow([stop.view, *(f"{it:.9f}" for it in numbers), stop.words])
+        cells = [f"{it:.9f}" for it in numbers]
+        writer.writerow([stop.view, image_of(stop), *cells, stop.words])
     return text.getvalue()
+
+
+def image_of(stop: PlannedStop) -> str:
+    """The name of the image that is to be taken at a stop."""
+    return f"images/{stop.view:03d}.png"
 
 
 def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
@@ -127,7 +133,7 @@ def _heading(plan: Plan) -> Iterator[str]:
     if plan.request.start_q is None:
         yield "The way from where the arm stands now to the first stop was not looked at: bring it"
         yield "there by hand first."
-    yield "At each stop the program waits: take an image, write down the pose, and continue."
+    yield "At each stop the program waits: take the image that it names, write down the pose."
 
 
 def _stop_lines(stop: PlannedStop) -> Iterator[str]:
@@ -136,7 +142,7 @@ def _stop_lines(stop: PlannedStop) -> Iterator[str]:
     yield _move(stop.q, f"view {stop.view}")
     yield "sleep(settling)"
     yield (
-        f'popup("View {stop.view}: take an image, then continue.", title="visioncal", '
+        f'popup("View {stop.view}: take {image_of(stop)}, then continue.", title="visioncal", '
         "blocking=True)"
     )
 
