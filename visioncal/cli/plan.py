@@ -24,7 +24,7 @@ from visioncal.outputs import write_plan
 from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Limits, PlanCell
 from visioncal.planning.plan import Plan, Request, make_plan
-from visioncal.planning.preview import accuracy_words, summary_of
+from visioncal.planning.preview import accuracy_words, looks_note, summary_of
 from visioncal.planning.purposes import purpose_of
 from visioncal.planning.recorded import Begun
 from visioncal.planning.written import plan_document
@@ -33,6 +33,7 @@ from visioncal.types import FloatArray, Progress
 # Stops of a plan of its own: with more, each is worth little.
 _STOPS = {"hand-eye": 12, "offsets": 20}
 _MANY_STOPS = 30
+_SHOWN = 12
 
 
 def plan_command(
@@ -149,15 +150,19 @@ def _tell(plan: Plan) -> None:
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
     if plan.begun is not None and plan.begun.refusal:
         console.print(escape(f"  so far: {plan.begun.refusal}"))
-    for stop in sorted(plan.stops, key=lambda it: it.rank):
+    for stop in sorted(plan.stops, key=lambda it: it.rank)[:_SHOWN]:
         console.print(escape(f"  view {stop.view}: {stop.words}"))
+    if len(plan.stops) > _SHOWN:
+        console.print(f"  and {len(plan.stops) - _SHOWN} more, in plan.json and in the preview")
     if plan.in_the_way:
         count, obstacles = len(plan.in_the_way), some_of(list(dict.fromkeys(plan.in_the_way)))
         stops = "1 stop was" if count == 1 else f"{count} stops were"
         console.print(escape(f"{stops} exchanged for want of a safe way ({obstacles})"))
     if plan.shortfall:
         console.print(f"[bold yellow]warning:[/] {escape(plan.shortfall)}")
-    elif plan.design.met:
+    elif note := looks_note(plan):
+        console.print(escape(note))
+    if plan.design.met:
         after = accuracy_words(plan.design.predicted)
         console.print(escape(f"that meets the wish, with {len(plan.stops)} stops: {after}"))
     if plan.request.start_q is None:

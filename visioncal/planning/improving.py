@@ -24,6 +24,8 @@ from visioncal.types import FloatArray
 _NEARLY_AXIS, _ASIDE = 0.95, 0.4
 # Smaller turns from a stop that is there are no new direction [rad].
 _TURN_RAD = 0.17
+# What takes less than a hundredth off an error is not worth a figure.
+_LITTLE_SHARE = 0.99
 # What a rotation counts beside an offset: its effect at this distance [m].
 _LEVER_M = 0.5
 
@@ -204,6 +206,8 @@ def _change(what: str, then: float, now: float, *, is_rotation: bool) -> str:
         return f"determines what was open; {what} is now {figure(now * scale)} {unit}"
     figures = f"({figure(then * scale)} -> {figure(now * scale)} {unit})"
     share = now / then
+    if share > _LITTLE_SHARE:
+        return f"takes little off {what} {figures}"
     if share > 0.72:
         return f"takes {100 * (1 - share):.0f} % off {what} {figures}"
     for least, verb in (

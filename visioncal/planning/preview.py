@@ -7,6 +7,9 @@ from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.plan import Plan, PlannedStop
 from visioncal.recording.preview import Obstacle, Preview, PreviewStop
 
+# More stops are no help where this many times the error is the board's.
+_LIMITED = 1.5
+
 
 def accuracy_words(found: Accuracy) -> str:
     """Says what is predicted: `0.12 mm and 0.02 deg`."""
@@ -27,6 +30,18 @@ def summary_of(plan: Plan) -> str:
     return (
         f"{stops} to add, from {plan.found} possible ones; {wanted}: "
         f"{accuracy_words(design.before)} before, {accuracy_words(design.predicted)} after"
+    )
+
+
+def looks_note(plan: Plan) -> str:
+    """Says that more stops would not help where lens or board limit a plan; else nothing."""
+    best, exact = plan.design.best, plan.design.best_look
+    if best.is_open or best.mm < _LIMITED * exact.mm:
+        return ""
+    return (
+        f"All candidates together give {figure(best.mm)} mm, and {figure(exact.mm)} mm if the "
+        "board's size were known exactly: measure its squares over the whole board, and state "
+        "square_sigma_m."
     )
 
 
@@ -71,6 +86,8 @@ def _plan_note(plan: Plan, name: str) -> str:
     lines.append(f"{summary_of(plan)}.")
     if plan.shortfall:
         lines += ["", f"**{plan.shortfall}**"]
+    elif note := looks_note(plan):
+        lines += ["", note]
     if plan.begun is not None and plan.begun.refusal:
         lines += ["", f"So far: {plan.begun.refusal}"]
     lines += [

@@ -29,6 +29,8 @@ _AXIS, _LINE, _POINT = 0.12, 0.002, 0.004
 _STEP_RAD = 0.05
 # A piece of floor is drawn, so many times as wide as the cell.
 _FLOOR = 1.3
+# And a little lower, so that a board on it is seen [m].
+_BELOW_M = 0.004
 # A lens bends the board's sides: they are drawn with so many points.
 _SIDE_POINTS = 9
 
@@ -197,7 +199,7 @@ def _log_obstacles(stream: rr.RecordingStream, preview: Preview, size_m: float) 
     if preview.floor_m is not None:
         half = _FLOOR * size_m
         floor = rr.Boxes3D(
-            centers=[[0.0, 0.0, preview.floor_m]],
+            centers=[[0.0, 0.0, preview.floor_m - _BELOW_M]],
             half_sizes=[[half, half, 0.0]],
             colors=colours.GRID,
         )
@@ -243,6 +245,7 @@ def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) ->
         colors=colours.USED,
         radii=_POINT * size_m,
         labels=[str(it.view) for it in preview.stops],
+        show_labels=True,
     )
     stream.log(f"{paths.STOPS}/{paths.USED}", frame, points, static=True)
     way = np.array([q for _, steps in _way(preview) for q in steps])

@@ -14,9 +14,9 @@ from visioncal.session import Session
 from visioncal.types import FloatArray
 
 # Distance of the eye from the cell's centre, in extents of all that the cell holds.
-_EYE_DISTANCE = 0.8
+EYE_DISTANCE = 0.8
 # And in extents of the workspace, whose corners are empty.
-_MAP_DISTANCE = 0.55
+MAP_DISTANCE = 0.55
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
 def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
     """What the calibrated arm is worth, how views left out speak for it, and its parameters."""
     # The places are all around the base, farther out than the views.
-    wider = eye if found.workspace is None else eye_on(found.workspace.places_m, _MAP_DISTANCE)
+    wider = eye if found.workspace is None else eye_on(found.workspace.places_m, MAP_DISTANCE)
     cell = rrb.Spatial3DView(
         name="Sigma of a tool's place over the workspace",
         origin="/",
@@ -229,7 +229,7 @@ def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D
     return eye_on(np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed]))
 
 
-def eye_on(places: FloatArray, distance: float = _EYE_DISTANCE) -> rrb.EyeControls3D:
+def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControls3D:
     """Looks at (k, 3) places from where all of them fill the view [m]."""
     low, high = places.min(axis=0), places.max(axis=0)
     centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))

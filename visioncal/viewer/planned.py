@@ -6,7 +6,8 @@ import rerun.blueprint as rrb
 
 from visioncal.recording import paths
 from visioncal.recording.preview import Preview
-from visioncal.viewer.layout import disc_views, eye_on
+from visioncal.types import FloatArray
+from visioncal.viewer.layout import EYE_DISTANCE, MAP_DISTANCE, disc_views, eye_on
 
 
 def plan_blueprint(preview: Preview) -> rrb.Blueprint:
@@ -32,7 +33,9 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
     )
 
 
-def _cell(name: str, places: np.ndarray, *more: str) -> rrb.Spatial3DView:
+def _cell(
+    name: str, places: FloatArray, *more: str, distance: float = EYE_DISTANCE
+) -> rrb.Spatial3DView:
     entities = (
         paths.BASE,
         paths.ROBOT,
@@ -51,14 +54,14 @@ def _cell(name: str, places: np.ndarray, *more: str) -> rrb.Spatial3DView:
             f"- {paths.IMAGE}/**",
             f"+ {paths.IMAGE}",
         ],
-        eye_controls=eye_on(places),
+        eye_controls=eye_on(places, distance),
         spatial_information=rrb.SpatialInformation(
             paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
         ),
     )
 
 
-def _overview(places: np.ndarray) -> rrb.Container:
+def _overview(places: FloatArray) -> rrb.Container:
     note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
     stop = rrb.TextDocumentView(name="This stop", origin=paths.STOP_NOTE)
     image = rrb.Spatial2DView(
@@ -70,7 +73,12 @@ def _overview(places: np.ndarray) -> rrb.Container:
 
 
 def _workspace(preview: Preview) -> rrb.Container:
-    cell = _cell("Predicted sigma of a tool's place", preview.places_m, paths.WORKSPACE)
+    cell = _cell(
+        "Predicted sigma of a tool's place",
+        preview.places_m,
+        paths.WORKSPACE,
+        distance=MAP_DISTANCE,
+    )
     return rrb.Horizontal(cell, name="Workspace")
 
 
