@@ -24,9 +24,9 @@ from visioncal.outputs import write_plan
 from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Limits, PlanCell
 from visioncal.planning.plan import Plan, Request, make_plan
-from visioncal.planning.preview import accuracy_words, looks_note, summary_of
 from visioncal.planning.purposes import purpose_of
 from visioncal.planning.recorded import Begun
+from visioncal.planning.telling import accuracy_words, looks_note, summary_of
 from visioncal.planning.written import plan_document
 from visioncal.types import FloatArray, Progress
 

@@ -1,48 +1,10 @@
-"""A plan as it is drawn and told."""
+"""A plan as it is drawn."""
 
 import numpy as np
 
-from visioncal.figures import figure
-from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.plan import Plan, PlannedStop
+from visioncal.planning.telling import accuracy_words, looks_note, summary_of
 from visioncal.recording.preview import Obstacle, Preview, PreviewStop
-
-# More stops are no help where this many times the error is the board's.
-_LIMITED = 1.5
-
-
-def accuracy_words(found: Accuracy) -> str:
-    """Says what is predicted: `0.12 mm and 0.02 deg`."""
-    if found.is_open:
-        return "not determined"
-    return f"{figure(found.mm)} mm and {figure(found.deg)} deg"
-
-
-def summary_of(plan: Plan) -> str:
-    """Says in a sentence what a plan gives."""
-    count, design = len(plan.stops), plan.design
-    stops = f"{count} stop{'s' if count != 1 else ''}"
-    wanted = f"{plan.request.purpose.errors}, predicted sigma"
-    if plan.begun is None:
-        return (
-            f"{stops} from {plan.found} possible ones; {wanted}: {accuracy_words(design.predicted)}"
-        )
-    return (
-        f"{stops} to add, from {plan.found} possible ones; {wanted}: "
-        f"{accuracy_words(design.before)} before, {accuracy_words(design.predicted)} after"
-    )
-
-
-def looks_note(plan: Plan) -> str:
-    """Says that more stops would not help where lens or board limit a plan; else nothing."""
-    best, exact = plan.design.best, plan.design.best_look
-    if best.is_open or best.mm < _LIMITED * exact.mm:
-        return ""
-    return (
-        f"All candidates together give {figure(best.mm)} mm, and {figure(exact.mm)} mm if the "
-        "board's size were known exactly: measure its squares over the whole board, and state "
-        "square_sigma_m."
-    )
 
 
 def preview_of(plan: Plan, name: str) -> Preview:
