@@ -34,6 +34,8 @@ from visioncal.types import FloatArray, Progress
 _STOPS = {"hand-eye": 12, "offsets": 20}
 _MANY_STOPS = 30
 _SHOWN = 12
+# The cosine of a board's z to the base's, from which on only a camera below would see it.
+_FACE_DOWN = 0.7
 
 
 def plan_command(
@@ -106,6 +108,11 @@ def plan_command(
     wish = None if wish_mm is None and wish_deg is None else Wish(wish_mm, wish_deg)
     with shown_progress(quiet=as_json) as told:
         cell, begun = _begin(start, words, add, stops, told)
+        if board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
+            messages().print(
+                "[bold yellow]warning:[/] this --board lies face down: its z points into the "
+                "paper, and a board that lies face up ends in 180 0 0"
+            )
         request = Request(
             wanted,
             add or stops or _STOPS.get(wanted.name, _MANY_STOPS),

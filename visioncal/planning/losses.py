@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visioncal.errors import DataError
+from visioncal.files import some_of
 from visioncal.types import Mask
 
 IMAGE = "the whole board in the image"
@@ -30,6 +31,10 @@ _ADVICE = {
     CLEARANCE: "Move one of the two, lower clearance_m, or look whether boxes, floor_m and guesses "
     "are right.",
 }
+
+
+# So many limits are named in a message, those that most was lost to.
+_TOLD = 6
 
 
 @dataclass
@@ -75,7 +80,7 @@ class Losses:
         own = {name: it for name, it in self.counts().items() if name.startswith(f"{worst} (")}
         culprit = max(own, key=lambda name: own[name], default=worst)
         tried = max(self.tried.values())
-        told = ", ".join(f"{times} to {what}" for what, times in self.counts().items())
+        told = some_of([f"{times} to {what}" for what, times in self.counts().items()], _TOLD)
         share = 100.0 * self.lost[worst] / self.tried[worst]
         return DataError(
             f"plan: {found} of {wished} possible stops were found in {tried} tries. Lost were "
