@@ -37,8 +37,8 @@ _SPARE = 10
 _SETTLED, _ROUNDS = 0.02, 8
 # What is stated is contradicted by so many standard deviations.
 _CONTRADICTION = 3.0
-# Errors of an arm are taken to be of one size; those few that a board's scale looks like may well
-# be so much larger.
+# Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
+# may well be so much larger.
 _UNEVEN = 2.0
 # Given intrinsics that are set free are known to so much without the session: the focal length and
 # the centre as shares of the focal length, and the distortion's coefficients.
@@ -340,7 +340,7 @@ def measured_scale(problem: Problem, arm: Arm, state: State, board: int = 0) -> 
     spread = covariance(information)
     at = 12 + int(np.searchsorted(state.seen.free.columns, place[0]))
     now = float(state.seen.free.after(state.fit.edges.shared).values[place[0]])
-    uneven = 1.0 if arm.errors is None else _UNEVEN
+    uneven = _UNEVEN if arm.errors is not None and arm.of_links else 1.0
     return MeasuredScale(
         board,
         now - float(spread[at] @ gradient),

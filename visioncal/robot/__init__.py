@@ -19,7 +19,7 @@ from visioncal.robot.files import (
     robot_file,
     robot_names,
 )
-from visioncal.robot.model import Robot
+from visioncal.robot.model import BODY_KEYS, Robot
 from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
     CONVENTIONS,
@@ -38,6 +38,7 @@ from visioncal.robot.writing import (
 )
 
 __all__ = [
+    "BODY_KEYS",
     "CONVENTIONS",
     "FUNCTION_NAMES",
     "PARALLEL_RAD",

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date, time
 
 from visioncal.files import sha256
-from visioncal.robot import ROBOT_SUFFIXES
+from visioncal.robot import BODY_KEYS, ROBOT_SUFFIXES
 from visioncal.session.images import ImageStore
 from visioncal.session.table import View
 
@@ -21,13 +21,14 @@ def digest_facts(
     """Computes the SHA-256 digest of a session's canonical content.
 
     It is equal for every storage of the same facts: folders, their formatting, the spelling of
-    numbers and the names of a target's or a robot's file do not enter, their contents do.
+    numbers and the names of a target's or a robot's file do not enter, their contents do. How thick
+    the robot's links are is no fact of what was recorded.
     """
     paths = sorted({view.image for view in views if view.image and images.exists(view.image)})
     facts = {
         "document": _without_paths(document),
         "target": target_document,
-        "robot": robot_document,
+        "robot": None if robot_document is None else _without_bodies(robot_document),
         "columns": columns,
         "rows": [[_fact(view, column) for column in columns] for view in views],
         "images": {path: sha256(images.read(path)) for path in paths},
@@ -52,6 +53,20 @@ def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
     if isinstance(robot, Mapping) and is_file(robot.get("model")):
         kept["robot"] = {key: value for key, value in robot.items() if key != "model"}
     return kept
+
+
+def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
+    """Leaves out the sizes by which a planner keeps the arm clear of things."""
+    joints = document.get("joint")
+    if not isinstance(joints, list | tuple):
+        return dict(document)
+    kept = [
+        {key: value for key, value in joint.items() if key not in BODY_KEYS}
+        if isinstance(joint, Mapping)
+        else joint
+        for joint in joints
+    ]
+    return {**document, "joint": kept}
 
 
 def _target_without_path(entry: object) -> object:
