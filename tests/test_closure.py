@@ -9,7 +9,6 @@ from cells import calibrated
 from visioncal.estimator.closure import (
     RATIO_PRIOR,
     Closure,
-    Shared,
     closure_jacobian,
     components_of,
     fit_closure,
@@ -19,6 +18,7 @@ from visioncal.estimator.closure import (
     residual_blocks,
     solve_closure,
 )
+from visioncal.estimator.shared import Shared
 from visioncal.estimator.variance import _likelihood
 from visioncal.simulation import CellOptions, fine_camera, simulate
 

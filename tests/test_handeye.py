@@ -12,13 +12,13 @@ from visioncal.estimator.closure import (
     Closure,
     Edges,
     Noise,
-    Shared,
     closure_jacobian,
     estimate_noise,
     fit_closure,
     solve_closure,
 )
 from visioncal.estimator.linalg import covariance, damped_step, spectrum
+from visioncal.estimator.shared import Shared
 from visioncal.simulation import CellOptions, exact, measured_poses, simulate
 from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.transforms import adjoint, compose, exp, invert, log

@@ -11,10 +11,11 @@ from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimator.closure import Closure, Shared, closure_information
+from visioncal.estimator.closure import Closure, closure_information
 from visioncal.estimator.indices import Indices, singular_values
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.parameters import free_parameters, parameter_moves
+from visioncal.estimator.shared import Shared
 from visioncal.estimator.workspace import postures, tool_slopes
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.result import result_of

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.camera import intrinsics, with_intrinsics
-from visioncal.estimator.closure import Shared
 from visioncal.estimator.corners import CornerStack, reproject
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.poses import fit_poses
+from visioncal.estimator.shared import Shared
 from visioncal.types import Camera, FloatArray, IntArray, Mask, Target
 
 SCALE, ASPECT = 0, 1

@@ -17,13 +17,13 @@ from visioncal.estimator.closure import (
     Closure,
     Edges,
     Noise,
-    Shared,
     flange_to_residual,
     noise_likelihood,
     normal_equations,
     residual_blocks,
 )
 from visioncal.estimator.linalg import covariance, gram
+from visioncal.estimator.shared import Shared
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray

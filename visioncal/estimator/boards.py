@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.closure import Closure, Edges, Shared, deviations
+from visioncal.estimator.closure import Closure, Edges, deviations
+from visioncal.estimator.shared import Shared
 from visioncal.transforms import adjoint, exp, invert
 from visioncal.types import FloatArray, IntArray
 

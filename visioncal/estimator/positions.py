@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.closure import Closure, Edges, Shared
+from visioncal.estimator.closure import Closure, Edges
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import damped_step
 from visioncal.estimator.procrustes import align
+from visioncal.estimator.shared import Shared
 from visioncal.transforms import adjoint, compose, exp, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 

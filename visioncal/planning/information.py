@@ -22,9 +22,10 @@ from visioncal.estimator.appearance import (
 )
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import ArmModel, block_size
-from visioncal.estimator.closure import Closure, Edges, Noise, Shared, whitened_slopes
+from visioncal.estimator.closure import Closure, Edges, Noise, whitened_slopes
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.shared import Shared
 from visioncal.estimator.workspace import pose_slopes, postures, tool_slopes
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.purposes import Purpose
