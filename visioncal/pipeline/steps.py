@@ -18,9 +18,9 @@ from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
+from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
-from visioncal.session import Session
 from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by
 from visioncal.stages.detect import detect
@@ -75,10 +75,10 @@ def _read_robot(known: Known) -> Known:
         lost_zero=None if matched is None else matched.zero,
         notes=(*known.notes, *reported.notes),
     )
-    warnings = (*known.session.warnings, *reported.warnings, *_not_used(known.session))
+    warnings = (*known.session.warnings, *reported.warnings, *not_used(known.session))
     known = known.noting(reported.rejections, warnings)
     if len(known.held_back) == len(known.session.views):
-        raise _all_held_back(known)
+        raise all_held_back(known)
     if not reported.base_from_flange:
         raise DataError(
             f"session {known.session.name!r}: no view has a pose of the robot.",
@@ -87,20 +87,6 @@ def _read_robot(known: Known) -> Known:
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
     return known
-
-
-def _not_used(session: Session) -> Iterator[str]:
-    """Says what the session declares and this version leaves aside."""
-    declared = session.declaration
-    if declared.prior:
-        yield f"[prior.{next(iter(declared.prior))}] was not used: this version knows no priors."
-    readings = sum(view.reading_m is not None for view in session.views)
-    if readings and session.mount != "instrument":
-        yield (
-            f"{readings} rows have an instrument's readings (meas_ columns), which were not used: "
-            "where images or measured poses (cft_ columns) are there, these are. A session with "
-            "the readings alone calibrates the arm by the instrument."
-        )
 
 
 def _readings(known: Known) -> Known:
@@ -121,7 +107,7 @@ def _readings(known: Known) -> Known:
             if view in known.base_from_flange and view not in known.held_back
         ]
         if not views:
-            raise _nothing_seen(known)
+            raise nothing_seen(known)
         readings = mounted(readings, views, known.base_from_flange, known.stops_of(views))
     return known.with_readings(readings)
 
@@ -162,31 +148,8 @@ def _pnp(known: Known) -> Known:
         known = replace(known, pixel_px=result.sigma_px).noting(result.rejections)
         poses = poses | seen
     if not poses:
-        raise _nothing_seen(known)
+        raise nothing_seen(known)
     return replace(known, poses=poses)
-
-
-def _all_held_back(known: Known) -> DataError:
-    return DataError(
-        f"session {known.session.name!r}: all views that could be used are held back (role = "
-        "holdout), and none is left to fit.",
-        next_step="Clear role in the rows that the fit may use.",
-    )
-
-
-def _nothing_seen(known: Known) -> DataError:
-    if known.corners and known.corners.keys() <= known.held_back:
-        return _all_held_back(known)
-    if not any(view.image for view in known.session.views):
-        return DataError(
-            f"session {known.session.name!r}: there are neither images nor measured poses.",
-            next_step="Give the views images, or cft_ or meas_ columns.",
-        )
-    return DataError(
-        f"session {known.session.name!r}: no view shows the target.",
-        next_step="Look at an image: is the board in it, and is it the one that the session "
-        "declares?",
-    )
 
 
 def _joints(known: Known) -> Known:
