@@ -1,0 +1,1 @@
+"""Recording a session: an arm and a camera, view by view onto the disk."""

@@ -1,0 +1,1 @@
+"""Devices behind two small protocols: an arm and a camera."""

@@ -1,0 +1,1 @@
+"""A simulated cell that the real client libraries talk to."""
