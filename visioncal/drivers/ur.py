@@ -151,7 +151,10 @@ class UrArm:
         self._check_safety()
         if not self._control.isProgramRunning():
             self._moves_before = None
-            raise self._explain("ended its program during a motion")
+            raise self._explain(
+                "ended its program during a motion, as it does where this computer is silent for "
+                f"{1.0 / _LEAST_HZ:.0f} s"
+            )
         progress = self._control.getAsyncOperationProgressEx()
         if progress.isAsyncOperationRunning():
             return True
@@ -216,8 +219,8 @@ class UrArm:
 
     def _kick(self) -> None:
         """Tells the controller's watchdog that this computer is there."""
-        if self._states.alive and self._control.isProgramRunning():
-            with suppress(RuntimeError):
+        with suppress(RuntimeError):
+            if self._states.alive and self._control.isProgramRunning():
                 self._control.kickWatchdog()
 
     def _start_program_again(self, line: Line) -> None:

@@ -98,15 +98,11 @@ class Dashboard:
         self._socket = connect(host, DASHBOARD_PORT, "the dashboard")
         self._socket.settimeout(answer_s)
         self._file = self._socket.makefile("rb")
-        banner = self._line()
-        if _BANNER not in banner:
+        try:
+            self._check_banner(self._line())
+        except DriverError:
             self.close()
-            raise DriverError(
-                f"{self._label} greets with {banner[:60]!r}, not as a {_BANNER}: this is no UR "
-                "controller.",
-                culprits=[self._label],
-                next_step="Give the address that the robot's pendant shows.",
-            )
+            raise
 
     def ask(self, line: str) -> str:
         """Sends a line and returns the answer.
@@ -135,6 +131,15 @@ class Dashboard:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _check_banner(self, banner: str) -> None:
+        if _BANNER not in banner:
+            raise DriverError(
+                f"{self._label} greets with {banner[:60]!r}, not as a {_BANNER}: this is no UR "
+                "controller.",
+                culprits=[self._label],
+                next_step="Give the address that the robot's pendant shows.",
+            )
 
     def _line(self) -> str:
         try:

@@ -20,6 +20,8 @@ READY, DONE = 1, 2
 _CONTINUOUS = frozenset((6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)))
 _STOP = 255
 _REGISTERS = 48
+# A pause between ticks that a busy computer makes [s].
+_ASLEEP_S = 0.1
 
 
 @dataclass
@@ -41,7 +43,7 @@ class ControlScript:
         self._waiting = False
         self._asynchronous = False
         self._operation, self._writes = 0, 0
-        self._least_hz, self._heard_s = 0.0, 0.0
+        self._least_hz, self._heard_s, self._ticked_s = 0.0, 0.0, 0.0
         self._commands: Mapping[int, Callable[[float], None]] = {
             1: self._move_joints,
             2: self._move_joints_to_pose,
@@ -77,6 +79,10 @@ class ControlScript:
     def tick(self, now_s: float) -> None:
         """Does what is due."""
         machine, registers = self._machine, self.registers
+        slept_s, self._ticked_s = now_s - self._ticked_s, now_s
+        if slept_s > _ASLEEP_S:
+            # What came in meanwhile is not read yet: who slept cannot call others silent.
+            self._heard_s = now_s
         if machine.program != "playing":
             self._finish_asynchronous(now_s)
             return
