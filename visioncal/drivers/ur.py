@@ -1,5 +1,6 @@
 """Arms of Universal Robots, through the client library ur-rtde."""
 
+import ctypes
 import threading
 import time
 from contextlib import suppress
@@ -188,15 +189,18 @@ class UrArm:
         if self._moves_before is not None:
             self.halt()
         self._closed = True
+        _keep(self._states.client)
         # Each disconnection sleeps for half a second, so they do it together; a client whose
         # controller is gone may not return at all.
         states = threading.Thread(target=self._states.client.disconnect, daemon=True)
         states.start()
+        ends_s = time.monotonic() + _CLOSE_S
         if self._line is not None:
+            _keep(self._control)
             with suppress(DriverError):
                 self._line.call(self._let_go, limit_s=_CLOSE_S, what="close")
             self._line.end()
-        states.join(_CLOSE_S)
+        states.join(max(0.0, ends_s - time.monotonic()))
 
     def _take_control(self, library: Any) -> None:  # noqa: ANN401
         """Sends the control script, and asks for the tool offset."""
@@ -289,6 +293,15 @@ def _check(host: str, *, moves: bool) -> Condition:
         condition.check_tells()
     check_states_come(host)
     return condition
+
+
+def _keep(client: Any) -> None:  # noqa: ANN401
+    """Keeps a client from being destroyed, ever.
+
+    Its destructor disconnects once more, sleeping for half a second with Python's lock held: the
+    whole program would stand still at a moment that the garbage collector chooses.
+    """
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
 
 
 def _check_goal(q: FloatArray, speed: float, acceleration: float) -> None:

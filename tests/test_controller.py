@@ -1,0 +1,404 @@
+"""The simulated controller: motions, frames, the script's commands, the truth and the ports."""
+
+import socket
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from visioncal.drivers.ur import UrArm
+from visioncal.drivers.ur_factory import factory_document, read_factory_dh, read_factory_file
+from visioncal.drivers.ur_net import check_states_come, connect, resolve
+from visioncal.drivers.ur_primary import read_tool_offset
+from visioncal.drivers.ur_status import read_condition
+from visioncal.errors import DataError, DriverError
+from visioncal.rehearsal.controller import free_host, main, spawn
+from visioncal.rehearsal.kinematics import matrix_of, pose_of, tool_pose
+from visioncal.rehearsal.machine import Machine
+from visioncal.rehearsal.motion import Brake, Profile, joint_way
+from visioncal.rehearsal.options import ControllerOptions, believed_arm
+from visioncal.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
+from visioncal.rehearsal.script import DONE, READY, ControlScript
+from visioncal.robot import Robot, load_robot
+from visioncal.simulation.arms import ArmErrors, forward
+
+MEASURED = ArmErrors(length_m=1e-3, angle_rad=1e-3, offset_rad=1e-3)
+
+
+@pytest.fixture(scope="module")
+def controller():
+    """A controller that knows its maker's calibration. Its faults are taken back by each test."""
+    options = ControllerOptions(seed=3, factory=MEASURED, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
+    with spawn(options) as running:
+        yield running
+
+
+@pytest.mark.parametrize("distance", [2.0, 0.05], ids=["trapezoid", "triangle"])
+def test_a_way_keeps_speed_and_acceleration_and_takes_the_shortest_time(distance):
+    profile = Profile(distance, speed=0.8, acceleration=1.5)
+    times = np.linspace(0.0, profile.duration_s, 2001)
+    place, speed = np.array([profile.at(it) for it in times]).T
+    assert place[0] == speed[0] == speed[-1] == 0.0
+    assert place[-1] == distance
+    assert speed.max() <= 0.8 + 1e-12
+    assert np.abs(np.diff(speed) / np.diff(times)).max() <= 1.5 * (1 + 1e-9)
+    # Central differences of a quadratic are exact but at the two kinks: a kink is off by a*dt/4.
+    slope = np.gradient(place, times)
+    assert np.abs(slope - speed).max() < 1.5 * times[1]
+    shortest = distance / 0.8 + 0.8 / 1.5 if distance > 1 else 2 * np.sqrt(distance / 1.5)
+    assert profile.duration_s == pytest.approx(shortest)
+
+
+def test_all_joints_arrive_together_and_the_farthest_keeps_the_speed():
+    start, goal = np.zeros(6), np.array([0.5, -1.0, 0.0, 0.2, 0.1, 0.3])
+    way = joint_way(start, goal, speed=0.7, acceleration=1.0)
+    q, dq = way.at(0.5 * way.duration_s)
+    assert q == pytest.approx(0.5 * goal)
+    assert np.abs(dq).max() == pytest.approx(0.7)
+    assert way.at(way.duration_s)[0] == pytest.approx(goal)
+
+
+def test_no_way_at_all_is_over_at_once():
+    way = joint_way(np.ones(6), np.ones(6), speed=1.0, acceleration=1.0)
+    assert way.duration_s == 0.0
+    assert way.at(0.0)[0] == pytest.approx(np.ones(6))
+
+
+def test_braking_goes_on_from_where_it_began():
+    brake = Brake(np.ones(6), np.array([0.5, -1.0, 0.0, 0.0, 0.0, 0.0]), 2.0)
+    assert brake.duration_s == 0.5
+    q, dq = brake.at(0.5)
+    # Half of speed times time.
+    assert q[:2] == pytest.approx([1.125, 0.75])
+    assert dq == pytest.approx(np.zeros(6))
+
+
+def test_a_frame_reads_back():
+    names = ("timestamp", "actual_q", "runtime_state", "joint_mode", "payload_cog", "flag", "bits")
+    types = ("DOUBLE", "VECTOR6D", "UINT32", "VECTOR6INT32", "VECTOR3D", "UINT8", "UINT64")
+    values = [1.5, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), 2, (1, -2, 3, 4, 5, 6), (7.0, 8.0, 9.0), 255]
+    values.append(1 << 60)
+    recipe = Recipe(9, names, types)
+    packed = recipe.pack(values)
+    kind, size = read_header(packed[:HEADER_BYTES])
+    assert (kind, size) == (Kind.DATA, len(packed) - HEADER_BYTES)
+    assert packed[HEADER_BYTES] == 9
+    assert recipe.unpack(packed[HEADER_BYTES:]) == dict(zip(names, values, strict=True))
+
+
+def test_poses_are_rotation_vectors_in_the_controllers_base():
+    machine = Machine(ControllerOptions(), 0.0)
+    q, _ = machine.joints(0.0)
+    expected = forward(machine.believed, q[None])[0] @ matrix_of(machine.tcp)
+    assert matrix_of(tool_pose(machine, q)) == pytest.approx(expected, abs=1e-12)
+    assert pose_of(matrix_of([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])) == pytest.approx(
+        [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    )
+
+
+class Client:
+    """What a client does with the registers, tick after tick of a time of its own."""
+
+    def __init__(self):
+        self.machine = Machine(ControllerOptions(), 0.0)
+        self.script = ControlScript(self.machine)
+        self.now_s = 0.0
+        self.script.begin(0.0)
+
+    @property
+    def registers(self):
+        """The script's registers."""
+        return self.script.registers
+
+    def tick(self, count=1):
+        """Lets ticks pass."""
+        for _ in range(count):
+            self.now_s += 0.008
+            self.script.tick(self.now_s)
+
+    def command(self, number, doubles=(), *, asynchronous=False, most=2000):
+        """Gives a command, waits and clears it; tells whether it was done."""
+        assert self.registers.int_out[0] == READY
+        self.registers.double_in[: len(doubles)] = doubles
+        self.registers.int_in[:2] = [number, int(asynchronous)]
+        for _ in range(most):
+            self.tick()
+            if self.registers.int_out[0] == DONE:
+                break
+        done = self.registers.int_out[0] == DONE
+        self.registers.int_in[0] = 0
+        self.tick()
+        return done
+
+
+def test_a_command_is_done_once_and_cleared():
+    client = Client()
+    q, _ = client.machine.joints(0.0)
+    goal = q + 0.3
+    assert client.command(1, [*goal, 1.0, 2.0])
+    assert client.registers.int_out[0] == READY
+    assert client.machine.joints(client.now_s)[0] == pytest.approx(goal)
+    # 0.3 rad at 1 rad/s and 2 rad/s^2 is a triangle of 0.77 s.
+    assert client.now_s == pytest.approx(2 * np.sqrt(0.3 / 2.0), abs=0.05)
+
+
+def test_an_asynchronous_motion_tells_of_its_begin_and_end():
+    client = Client()
+    q, _ = client.machine.joints(0.0)
+    assert client.command(1, [*(q + 0.3), 1.0, 2.0], asynchronous=True)
+    running = client.registers.int_out[2]
+    assert running >> 15 & 1
+    client.tick(200)
+    ended = client.registers.int_out[2]
+    assert not ended >> 15 & 1
+    assert ended >> 24 == running >> 24
+    assert ended >> 16 != running >> 16
+
+
+def test_a_straight_motion_keeps_the_tool_on_the_line():
+    client = Client()
+    machine = client.machine
+    begin = tool_pose(machine, machine.joints(0.0)[0])
+    goal = begin + np.array([0.0, 0.2, -0.1, 0.0, 0.0, 0.0])
+    assert client.command(3, [*goal, 0.25, 1.0])
+    assert tool_pose(machine, machine.joints(client.now_s)[0]) == pytest.approx(goal, abs=1e-9)
+    halfway = tool_pose(machine, machine.joints(0.5 * client.now_s)[0])
+    direction = (goal - begin)[:3] / np.linalg.norm((goal - begin)[:3])
+    # Between 64 knots of 3.5 mm, a chord is off the line by a few micrometres.
+    assert np.linalg.norm(np.cross(halfway[:3] - begin[:3], direction)) < 2e-5
+
+
+def test_a_stop_brakes_and_the_script_goes_on():
+    client = Client()
+    q, _ = client.machine.joints(0.0)
+    client.command(1, [*(q + 1.0), 1.0, 2.0], asynchronous=True)
+    client.tick(100)
+    assert client.command(34, [4.0])
+    assert not client.machine.moving(client.now_s)
+    assert client.machine.program == "playing"
+    assert np.abs(client.machine.joints(client.now_s)[0] - q).max() < 1.0
+
+
+def test_the_watchdog_stops_a_silent_client_and_no_other():
+    client = Client()
+    assert client.command(35, [1.0])
+    for _ in range(10):
+        client.tick(100)
+        client.script.heard(client.now_s)
+    assert client.machine.program == "playing"
+    client.tick(130)
+    assert client.machine.program == "stopped"
+
+
+def test_a_controller_that_slept_does_not_call_its_client_silent():
+    client = Client()
+    client.command(35, [1.0])
+    client.now_s += 5.0
+    client.tick()
+    assert client.machine.program == "playing"
+
+
+def test_a_safety_stop_ends_the_motion_where_it_is():
+    client = Client()
+    q, _ = client.machine.joints(0.0)
+    client.command(1, [*(q + 1.0), 1.0, 2.0], asynchronous=True)
+    client.tick(60)
+    client.machine.trip("protective-stop", client.now_s)
+    client.tick(60)
+    stood, speed = client.machine.joints(client.now_s)
+    assert speed == pytest.approx(np.zeros(6))
+    assert 0.0 < (stood - q)[0] < 1.0
+
+
+def test_the_truth_is_the_real_arm_and_stays_known(controller):
+    began = time.monotonic()
+    before = controller.truth.state([began])
+    goal = before.q[0] + 0.05
+    ends = controller.truth.guide(goal, speed=1.0, acceleration=4.0)
+    time.sleep(max(0.0, ends - time.monotonic()))
+    times = np.linspace(began, ends, 50)
+    past = controller.truth.state(times.tolist())
+    assert past.q[0] == pytest.approx(before.q[0])
+    # 1e-5 rad is the joints' repeatability; five sigma.
+    assert past.q[-1] == pytest.approx(goal, abs=1e-4)
+    # Fixed errors of 0.3 mm and 0.5 mrad a joint move the flange by a millimetre or so.
+    believed = believed_arm(ControllerOptions(seed=3, factory=MEASURED))
+    shift = past.base_from_flange[:, :3, 3] - forward(believed, past.q)[:, :3, 3]
+    assert 1e-4 < np.linalg.norm(shift, axis=1).max() < 1e-2
+
+
+def test_the_channel_of_the_truth_refuses_what_it_does_not_know(controller):
+    with pytest.raises(DriverError, match="there is no fault 'earthquake'"):
+        controller.truth.inject("earthquake")
+
+
+def test_a_healthy_controller_passes_every_check(controller):
+    condition = read_condition(controller.host)
+    condition.check_moves()
+    check_states_come(controller.host)
+    assert condition.model == "UR10e"
+    assert condition.version == (5, 11, 6)
+    assert read_tool_offset(controller.host) == [0.01, -0.02, 0.15, 0.1, 0.2, -0.3]
+
+
+FAULTS = [
+    ("protective-stop", "PROTECTIVE_STOP.*Enable Robot"),
+    ("emergency-stop", "EMERGENCY_STOP.*pull out the emergency-stop button"),
+    ("local-control", "local control.*Remote Control at the upper right"),
+    ("power-off", "mode is POWER_OFF.*circle at the lower left"),
+]
+
+
+@pytest.mark.parametrize(("fault", "message"), FAULTS, ids=[it for it, _ in FAULTS])
+def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fault, message):
+    controller.truth.inject(fault)
+    try:
+        with pytest.raises(DriverError, match=message):
+            read_condition(controller.host).check_moves()
+    finally:
+        controller.truth.inject("release")
+        controller.truth.inject("remote-control")
+    read_condition(controller.host).check_moves()
+
+
+def test_a_frozen_controller_is_said_to_be_silent(controller):
+    controller.truth.inject("freeze")
+    try:
+        with pytest.raises(DriverError, match="does not answer: timed out"):
+            read_condition(controller.host)
+        with pytest.raises(DriverError, match="sends no states"):
+            check_states_come(controller.host)
+    finally:
+        controller.truth.inject("thaw")
+
+
+@pytest.mark.parametrize(
+    ("banner", "message"),
+    [
+        ("URSoftware 1.8.16941", "answers 'URSoftware 1.8.16941'.*four numbers"),
+        ("URSoftware 3.2.0.1000", "has PolyScope 3.2.0; ur-rtde needs 3.4"),
+        ("URSoftware 10.7.0.1000", "has PolyScope 10.7.0"),
+    ],
+)
+def test_an_unfit_version_is_told(banner, message):
+    with spawn(ControllerOptions(polyscope=banner)) as old:
+        with pytest.raises(DriverError, match=message) as refusal:
+            read_condition(old.host)
+        assert refusal.value.next_step
+
+
+@contextmanager
+def listening(host, port, greeting):
+    """Something else that listens at a port of a controller."""
+    with socket.create_server((host, port)) as server:
+
+        def greet():
+            try:
+                link, _ = server.accept()
+            except OSError:
+                return
+            with link:
+                link.sendall(greeting)
+                # Until the client goes.
+                link.recv(1000)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        yield
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+def test_another_service_at_the_port_is_no_controller():
+    host = free_host()
+    with (
+        listening(host, 29999, b"SSH-2.0-OpenSSH_9.2\r\n"),
+        pytest.raises(DriverError, match="greets with 'SSH-"),
+    ):
+        read_condition(host)
+    with (
+        listening(host, 30004, b"HTTP/1.1 400 Bad Request\r\n\r\n" + b" " * 0x4854),
+        pytest.raises(DriverError, match="does not speak version 2 of RTDE"),
+    ):
+        check_states_come(host)
+
+
+def test_closed_ports_and_unknown_names_are_told_apart():
+    with pytest.raises(DriverError, match=r"port 29999 \(the dashboard\) is closed"):
+        read_condition(free_host())
+    with pytest.raises(DriverError, match=r"'no-such-robot.invalid' is not known"):
+        resolve("no-such-robot.invalid")
+
+
+def test_an_address_that_nobody_has_is_unreachable(monkeypatch):
+    def no_route(*_, **__):
+        raise OSError(113, "No route to host")
+
+    monkeypatch.setattr(socket, "create_connection", no_route)
+    with pytest.raises(DriverError, match=r"cannot be reached .* No route to host.*cable"):
+        connect("192.0.2.1", 29999, "the dashboard")
+
+
+def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rtde_receive", None)
+    with pytest.raises(DriverError, match="rtde_receive cannot be imported.*pip install 'ur-rtde"):
+        UrArm("127.0.0.1")
+
+
+def test_the_makers_calibration_gives_the_controllers_own_kinematics(controller):
+    table = read_factory_dh(controller.host)
+    robot = Robot.from_document(factory_document(table, "ur10e"))
+    q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
+    believed = believed_arm(ControllerOptions(seed=3, factory=MEASURED))
+    assert robot.base_from_flange(q) == pytest.approx(forward(believed, q), abs=1e-9)
+    assert np.abs(robot.base_from_flange(q) - load_robot("ur10e").base_from_flange(q)).max() > 1e-3
+
+
+def test_the_controllers_file_tells_the_same_calibration(tmp_path):
+    path = tmp_path / "calibration.conf"
+    path.write_text(
+        "[mounting]\n"
+        "delta_theta = [ 1e-4, -0.27, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "delta_a = [ 0.0, 2e-4, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "delta_d = [ 1e-5, 12.5, -12.5, 0.0, 0.0, 0.0 ]\n"
+        "delta_alpha = [ 0.0, 3e-4, 0.0, 0.0, 0.0, 0.0 ]\n"
+        "# 0 == notInitialized, 1 == Linearised\n"
+        "calibration_status = 1  # Linearised\n"
+        "joint_checksum = [ 0xa1, 0xb2, 0xc3, 0xd4, 0xe5, 0xf6 ]\n",
+        encoding="utf-8",
+    )
+    table = read_factory_file(path, "ur10e")
+    assert table.theta_rad[:2] == pytest.approx([1e-4, -0.27])
+    assert table.a_m[1] == pytest.approx(-0.6127 + 2e-4)
+    assert table.d_m[:3] == pytest.approx([0.1807 + 1e-5, 12.5, -12.5])
+    assert table.alpha_rad[:2] == pytest.approx([np.pi / 2, 3e-4])
+    assert table.checksum == (0xA1, 0xB2, 0xC3, 0xD4, 0xE5, 0xF6)
+    Robot.from_document(factory_document(table, "ur10e"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[other]\n", "is no calibration of a UR: 'mounting'"),
+        ("[mounting]\ndelta_theta = [ a ]\n", "could not convert"),
+    ],
+)
+def test_another_file_is_no_calibration(tmp_path, text, message):
+    path = tmp_path / "calibration.conf"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError, match=message):
+        read_factory_file(path, "ur10e")
+
+
+def test_a_taken_address_is_told(controller, capfd):
+    with pytest.raises(DriverError, match="did not start"):
+        spawn(host=controller.host)
+    assert "address already in use" in capfd.readouterr().err
+
+
+def test_options_that_are_none_are_refused(capsys):
+    assert main(["--options", '{"robots": "ur10e"}']) == 2
+    assert "--options is not a table" in capsys.readouterr().err
