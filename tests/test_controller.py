@@ -344,7 +344,7 @@ def test_an_address_that_nobody_has_is_unreachable(monkeypatch):
 
 def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
-    with pytest.raises(DriverError, match="rtde_receive cannot be imported.*pip install 'ur-rtde"):
+    with pytest.raises(DriverError, match=r"rtde_receive cannot be imported.*pip install 'ur-rtde"):
         UrArm("127.0.0.1")
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -50,6 +51,7 @@ def test_an_arm_moves_tells_where_it_is_and_stops(controller):
     with closing(UrArm(controller.host)) as arm:
         assert isinstance(arm, MovingArm)
         assert arm.name == f"UR10e at {controller.host}"
+        assert arm.model == "ur10e"
         before = arm.state()
         goal = before.q + STEP
         arm.start_move(goal, speed=0.5, acceleration=1.0)
@@ -173,6 +175,32 @@ def test_a_controller_that_falls_silent_in_a_motion_is_noticed():
         with pytest.raises(DriverError, match="has sent nothing for"):
             wait_while(arm.moving)
         arm.halt()
+
+
+def test_what_the_driver_does_not_use_is_served_too(controller):
+    """The dashboard's and the outputs' clients, waiting motions, and straight ones."""
+    dashboard = import_module("dashboard_client").DashboardClient(controller.host)
+    dashboard.connect()
+    assert dashboard.isInRemoteControl()
+    assert dashboard.robotmode() == "Robotmode: RUNNING"
+    dashboard.disconnect()
+    outputs = import_module("rtde_io").RTDEIOInterface(controller.host)
+    assert outputs.setStandardDigitalOut(1, True)
+    # Its destructor ends the program where the controller has gone before.
+    outputs.disconnect()
+    states = import_module("rtde_receive").RTDEReceiveInterface(controller.host, 125.0)
+    control = import_module("rtde_control").RTDEControlInterface(controller.host, 125.0)
+    start, pose = np.array(states.getActualQ()), np.array(states.getActualTCPPose())
+    assert control.getForwardKinematics(start.tolist(), list(TCP)) == pytest.approx(pose)
+    above = pose + np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
+    assert control.moveL(above.tolist(), 0.25, 1.0)
+    assert control.isSteady()
+    near = control.getInverseKinematics(pose.tolist())
+    assert near == pytest.approx(start)
+    assert control.moveJ(near, 1.0, 2.0)
+    control.stopScript()
+    control.disconnect()
+    states.disconnect()
 
 
 WALKER = f"""

@@ -62,7 +62,7 @@ class UrArm:
         control = None if watch_only else client_library("rtde_control", _EXTRA)
         self._host = resolve(host)
         condition = _check(self._host, moves=not watch_only)
-        self._name = f"{condition.model} at {host}"
+        self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
         self._states = StateStream(receive, self._host, condition.version)
         self._control: Any = None
         self._line: Line | None = None
@@ -82,6 +82,11 @@ class UrArm:
     def name(self) -> str:
         """The arm's model and address."""
         return self._name
+
+    @property
+    def model(self) -> str:
+        """The model by the name that visioncal has for it, as `ur10e`."""
+        return self._model
 
     def state(self) -> ArmState:
         """Waits for the next state that the controller sends.

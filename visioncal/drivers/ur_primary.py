@@ -17,7 +17,7 @@ from visioncal.types import FloatArray
 
 # The first only reads, and is open where the second is not.
 _PORTS = (30011, 30001)
-_WAIT_S = 1.5
+_WAIT_S = 1.0
 _HEADER = struct.Struct(">IB")
 _ROBOT_STATE, _CARTESIAN, _KINEMATICS = 16, 4, 5
 _TOOL = struct.Struct(">6d6d")

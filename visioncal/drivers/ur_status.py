@@ -13,6 +13,8 @@ _LEAST = {3: (3, 4), 5: (5, 4)}
 # From here on, the controller tells whether it is in remote control.
 _TELLS_REMOTE = (5, 6)
 _RUNNING = "RUNNING"
+# The dashboard tells the size alone of arms that there are, or could be, in two series.
+_BOTH_SERIES = ("UR3", "UR5", "UR10", "UR16")
 # In which modes joints tell where they are.
 _AWAKE = (_RUNNING, "IDLE", "BACKDRIVE")
 _MODE_STEPS = {
@@ -121,7 +123,7 @@ def read_condition(host: str) -> Condition:
         word = "safetystatus" if version >= (5, 4, 0) else "safetymode"
         safety = dashboard.ask(word).rpartition(":")[2].strip()
         remote = version < _TELLS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
-    series = "e" if version[0] == 5 else ""
+    series = "e" if version[0] == 5 and model in _BOTH_SERIES else ""
     return Condition(host, version, f"{model}{series}", mode, safety, remote)
 
 
