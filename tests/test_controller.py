@@ -1,6 +1,7 @@
 """The simulated controller: motions, frames, the script's commands, the truth and the ports."""
 
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -22,6 +23,7 @@ from visioncal.rehearsal.motion import Brake, Profile, joint_way
 from visioncal.rehearsal.options import ControllerOptions, believed_arm
 from visioncal.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
 from visioncal.rehearsal.script import DONE, READY, ControlScript
+from visioncal.rehearsal.truth import TruthClient
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation.arms import ArmErrors, forward
 
@@ -97,6 +99,15 @@ def test_poses_are_rotation_vectors_in_the_controllers_base():
     assert pose_of(matrix_of([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])) == pytest.approx(
         [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     )
+
+
+def answers(host):
+    """Whether a controller's port of the truth is open."""
+    try:
+        TruthClient(host).close()
+    except DriverError:
+        return False
+    return True
 
 
 class Client:
@@ -397,6 +408,26 @@ def test_a_taken_address_is_told(controller, capfd):
     with pytest.raises(DriverError, match="did not start"):
         spawn(host=controller.host)
     assert "address already in use" in capfd.readouterr().err
+
+
+def test_a_controller_ends_with_the_process_that_started_it():
+    code = (
+        "import os\n"
+        "from visioncal.rehearsal.controller import spawn\n"
+        "running = spawn()\n"
+        "print(running.host, flush=True)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    parent = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False
+    )
+    host = parent.stdout.strip()
+    assert host
+    # It ends within milliseconds; the limit is for a busy computer.
+    ends_s = time.monotonic() + 20.0
+    while answers(host):
+        assert time.monotonic() < ends_s
+        time.sleep(0.01)
 
 
 def test_options_that_are_none_are_refused(capsys):

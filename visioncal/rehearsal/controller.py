@@ -12,6 +12,7 @@ import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -76,7 +77,8 @@ def spawn(options: ControllerOptions | None = None, host: str | None = None) -> 
     options = ControllerOptions() if options is None else options
     host = free_host() if host is None else host
     command = [sys.executable, "-m", _MODULE, "--host", host, "--options", _text(options)]
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
+    pipe = subprocess.PIPE
+    process = subprocess.Popen([*command, "--until-input-ends"], stdin=pipe, stdout=pipe)
     try:
         _wait(process, host)
         return SimulatedController(host, process, TruthClient(host))
@@ -143,8 +145,9 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            pipe.close()
 
 
 def _text(options: ControllerOptions) -> str:
@@ -182,7 +185,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--robot", help="ur3e, ur5e or ur10e")
     parser.add_argument("--seed", type=int, help="of everything random")
     parser.add_argument("--options", default="{}", help="all options, as JSON")
+    parser.add_argument(
+        "--until-input-ends",
+        action="store_true",
+        help="end with the standard input, so that no parent that is killed leaves it behind",
+    )
     given = parser.parse_args(arguments)
+    if given.until_input_ends:
+        threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         options = _read(given.options, robot=given.robot, seed=given.seed)
         with suppress(KeyboardInterrupt):
@@ -191,6 +201,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"{error}\n")
         return 2
     return 0
+
+
+def _end_with_input() -> None:
+    sys.stdin.buffer.read()
+    os._exit(0)
 
 
 def _tell_ready() -> None:

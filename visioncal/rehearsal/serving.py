@@ -4,7 +4,7 @@ import asyncio
 import re
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -70,10 +70,10 @@ class ControllerServer:
             TRUTH_PORT: lambda r, w: _truth(TruthChannel(machine, self._silence.set), r, w),
         }
         handlers |= {it: lambda r, w: self._primary(machine, r, w) for it in PRIMARY_PORTS}
-        async with AsyncExitStack() as stack:
+        with ExitStack() as servers:
             for port, handler in handlers.items():
                 server = await asyncio.start_server(_quietly(handler), self._host, port)
-                await stack.enter_async_context(server)
+                servers.callback(server.close)
             ready()
             await self._tick(machine, script, rtde, began_s)
 
