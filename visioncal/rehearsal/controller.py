@@ -9,13 +9,13 @@ import asyncio
 import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -191,16 +191,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="end with the standard input, so that no parent that is killed leaves it behind",
     )
     given = parser.parse_args(arguments)
-    if given.until_input_ends:
-        threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         options = _read(given.options, robot=given.robot, seed=given.seed)
-        with suppress(KeyboardInterrupt):
-            asyncio.run(ControllerServer(options, given.host).run(_tell_ready))
+        _end_by(ends_with_input=given.until_input_ends)
+        asyncio.run(ControllerServer(options, given.host).run(_tell_ready))
     except (DataError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     return 0
+
+
+def _end_by(*, ends_with_input: bool) -> None:
+    """Chooses what ends the process; it has nothing to save.
+
+    Ctrl-C goes to all processes of a terminal: one that serves another waits for that one's word,
+    as a real controller does not end with its client.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN if ends_with_input else signal.SIG_DFL)
+    if ends_with_input:
+        threading.Thread(target=_end_with_input, daemon=True).start()
 
 
 def _end_with_input() -> None:
