@@ -94,6 +94,7 @@ class MovingArm(Arm, Protocol):
         """Brakes at once; harmless where nothing moves or the link is gone."""
 
 
+@runtime_checkable
 class CameraDevice(Protocol):
     """A camera that gives picture after picture."""
 
