@@ -130,7 +130,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
     true_base_from_flange = forward(true_arm, moved) @ exp(jitter)
     joints, wrong_stops = _misreport(options, arm, moved)
-    poses = [_cam_from_target(chain, true_base_from_flange) for chain in chains(transforms)]
+    poses = [before_camera(chain, true_base_from_flange) for chain in chains(transforms)]
     shown = shown_at(options, sheets, poses)
     cam_from_target = np.array(poses)[shown.boards, shown.stops]
     exact_corners = _see(options, [sheets[board] for board in shown.boards], cam_from_target)
@@ -204,10 +204,8 @@ def _flange(transforms: Mapping[str, FloatArray], cam_from_target: FloatArray) -
     return base_from_target @ invert(transforms["flange_from_target"])
 
 
-def _cam_from_target(
-    transforms: Mapping[str, FloatArray], base_from_flange: FloatArray
-) -> FloatArray:
-    """(m, 4, 4) poses of the board before the camera at these poses of the flange."""
+def before_camera(transforms: Mapping[str, FloatArray], base_from_flange: FloatArray) -> FloatArray:
+    """(m, 4, 4) `cam_from_target` of a chain at these poses of the flange."""
     if "flange_from_cam" in transforms:
         base_from_cam = base_from_flange @ transforms["flange_from_cam"]
         return invert(base_from_cam) @ transforms["base_from_target"]

@@ -10,7 +10,8 @@ from visioncal.errors import DataError
 from visioncal.simulation.boards import bow_depth_m, outline_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project, sees
-from visioncal.simulation.rasters import Float32Array, Patch, between, trace
+from visioncal.simulation.options import CellOptions
+from visioncal.simulation.rasters import Float32Array, Patch, Raster, between, trace
 from visioncal.simulation.silhouettes import draw_arm
 from visioncal.simulation.textures import (
     SheetTexture,
@@ -27,6 +28,8 @@ _SAMPLES = 3
 # Rows of pixels that are worked on at a time, so that they stay in the processor's cache.
 _BAND_PX = 48
 _BLACK_LEVEL, _FLOOR = 4.0, 118.0
+# No lens here looks so far aside: 84 degrees.
+_LEAST_COSINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,19 +123,50 @@ def render(scene: Scene, index: int) -> Image:
     count = len(scene.cell.corners)
     if not 0 <= index < count:
         raise DataError(f"simulation: there is no view {index} among {count}.")
+    light = light_on(scene, scene.cell.cam_from_target[index], scene.cell.joints[index])
+    return developed(light, options, stream(options, Stream.IMAGES, index))
+
+
+def light_on(
+    scene: Scene,
+    cam_from_target: FloatArray,
+    joints: FloatArray,
+    *,
+    samples: int = _SAMPLES,
+    shows_board: bool = True,
+) -> Float32Array:
+    """Computes what falls on the sensor.
+
+    Args:
+        scene: The prepared cell.
+        cam_from_target: (4, 4) the board before the camera.
+        joints: (n,) the arm's posture, which a camera beside the arm sees [rad].
+        samples: Sub-pixels along a pixel's side.
+        shows_board: Whether the board's face is before the camera, at least in part.
+
+    Returns:
+        (height, width) light, defocused and vignetted, without noise [grey levels].
+    """
     # Several BLAS threads on a busy machine wait for one another ten times as long as they work.
     with threadpool_limits(1, user_api="blas"):
-        light = _unlit(scene, index)
-    if options.blur_px > 0.0:
+        light, whole, shade = _behind(scene, cam_from_target, joints)
+        if shows_board:
+            _cover(light, scene, cam_from_target, samples)
+        light *= between(whole, shade)
+    blur_px = scene.cell.options.blur_px
+    if blur_px > 0.0:
         light = np.asarray(
-            cv2.GaussianBlur(light, (0, 0), options.blur_px, borderType=cv2.BORDER_REPLICATE),
-            np.float32,
+            cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE), np.float32
         )
     light += np.float32(_BLACK_LEVEL)
+    return light
+
+
+def developed(light: Float32Array, options: CellOptions, noise: np.random.Generator) -> Image:
+    """Reads the sensor out: light (height, width) with the cell's noise, in whole grey levels."""
     if options.image_noise > 0.0:
-        noise = stream(options, Stream.IMAGES, index)
         grain = noise.standard_normal(light.shape, dtype=np.float32)
-        light += np.float32(options.image_noise) * grain
+        light = light + np.float32(options.image_noise) * grain
     return np.asarray(np.clip(np.rint(light), 0.0, 255.0), np.uint8)
 
 
@@ -151,11 +185,12 @@ def encode(image: Image, jpeg_quality: int | None) -> bytes:
     return data.tobytes()
 
 
-def _unlit(scene: Scene, index: int) -> Float32Array:
-    """(height, width) light on the sensor before defocus and noise [grey levels]."""
+def _behind(
+    scene: Scene, cam_from_target: FloatArray, joints: FloatArray
+) -> tuple[Float32Array, Raster, FloatArray]:
+    """What is behind the board: its light, knots over the image, and how bright each lies."""
     cell = scene.cell
     camera = cell.options.camera
-    cam_from_target = cell.cam_from_target[index]
     whole = trace(camera, Patch(0, 0, *camera.resolution), 1)
     plane_from_cam = _plane_from_cam(scene.backdrop, cam_from_target)
     places = _strike(plane_from_cam, whole.directions, 0.0)
@@ -170,8 +205,7 @@ def _unlit(scene: Scene, index: int) -> Float32Array:
         np.uint8,
     )
     if not scene.backdrop.moves:
-        cam_from_base = invert(cell.transforms["base_from_cam"])
-        draw_arm(behind, camera, cell.arm, cell.joints[index], cam_from_base)
+        draw_arm(behind, camera, cell.arm, joints, invert(cell.transforms["base_from_cam"]))
     offset = (places - scene.backdrop.lamp_m * np.array([-0.3, -0.2])) / scene.backdrop.lamp_m
     distance2 = (offset**2).sum(axis=-1)
     light = behind.astype(np.float32)
@@ -180,12 +214,10 @@ def _unlit(scene: Scene, index: int) -> Float32Array:
         light -= np.float32(_FLOOR)
         light *= between(whole, np.exp(-((distance2 / 8.0) ** 2)))
         light += np.float32(_FLOOR)
-    _cover(light, scene, cam_from_target, _facing(scene, cam_from_target))
     middle = 0.5 * np.array(camera.resolution) - 0.5
     edge = ((whole.px - middle) ** 2).sum(axis=-1) / (middle**2).sum()
     lamp = 0.78 + 0.30 / (1.0 + distance2)
-    light *= between(whole, lamp * (1.0 - cell.options.vignetting * edge))
-    return light
+    return light, whole, lamp * (1.0 - cell.options.vignetting * edge)
 
 
 def _plane_from_cam(backdrop: Backdrop, cam_from_target: FloatArray) -> FloatArray:
@@ -205,23 +237,24 @@ def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
     return 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
 
 
-def _cover(
-    light: Float32Array, scene: Scene, cam_from_target: FloatArray, brightness: float
-) -> None:
+def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, samples: int) -> None:
     """Lays the sheet over what is behind it, in place."""
     cell, sheet = scene.cell, scene.sheet
     patch = _board_patch(cell, cam_from_target)
-    raster = trace(cell.options.camera, patch, _SAMPLES)
+    if min(patch.size) < 1:
+        return
+    brightness = _facing(scene, cam_from_target)
+    raster = trace(cell.options.camera, patch, samples)
     flat = _strike_sheet(cell, raster.directions, cam_from_target)
     # The texel that fits the sub-pixels best, over the whole board.
-    spacing = _spacing_m(flat, raster.px) / _SAMPLES
+    spacing = _spacing_m(flat, raster.px) / samples
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
     texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
     width, height = patch.size
     for top in range(0, height, _BAND_PX):
         rows = min(_BAND_PX, height - top)
-        band = slice(top * _SAMPLES, (top + rows) * _SAMPLES)
+        band = slice(top * samples, (top + rows) * samples)
         seen = cv2.remap(
             sheet.levels[level],
             between(raster, texels[..., 0], band),
@@ -230,7 +263,7 @@ def _cover(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(0, 0),
         ).astype(np.float32)
-        # Exactly _SAMPLES squared sub-pixels lie around each pixel's centre.
+        # Exactly `samples` squared sub-pixels lie around each pixel's centre.
         pixels = cv2.resize(seen, (width, rows), interpolation=cv2.INTER_AREA)
         window = light[patch.top + top : patch.top + top + rows, patch.left : patch.right]
         window *= 1.0 - pixels[..., 1] / np.float32(255.0)
@@ -243,8 +276,10 @@ def _board_patch(cell: Cell, cam_from_target: FloatArray) -> Patch:
     points = outline_m(cell.sheet, margin_m(cell.options.target))
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     width, height = camera.resolution
-    # A point so far outside that the lens model folds it back says nothing about the bounds.
-    if not sees(camera, points_cam, -np.inf).all():
+    # A point so far outside that the lens model folds it back says nothing about the bounds; one
+    # beside or behind the camera has no place in the image at all.
+    ahead = points_cam[:, 2] > _LEAST_COSINE * np.linalg.norm(points_cam, axis=1)
+    if not ahead.all() or not sees(camera, points_cam, -np.inf).all():
         return Patch(0, 0, width, height)
     px = project(camera, points_cam)
     left, top = np.maximum(np.floor(px.min(axis=0)).astype(int) - 2, 0)

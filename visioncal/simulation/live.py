@@ -1,0 +1,142 @@
+"""What the camera of a simulated cell sees while the arm stands or moves, picture by picture."""
+
+import cv2
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.simulation.arms import forward
+from visioncal.simulation.boards import centre_m, corners_m, outline_m
+from visioncal.simulation.cell import Cell, Stream, before_camera, stream
+from visioncal.simulation.optics import project, rays
+from visioncal.simulation.rasters import Float32Array, Patch, between, trace
+from visioncal.simulation.render import developed, light_on, prepare_scene
+from visioncal.simulation.textures import margin_m
+from visioncal.transforms import compose, invert, rotation_angle
+from visioncal.types import FloatArray, Image
+
+# No corner can be found so well that it tells such a shift [px].
+_STILL_PX = 0.003
+# A shorter smear may pass for rest, so it is made of exact pictures; a longer one of shifted ones.
+_SHORT_PX = 2.0
+_MOST_PARTS = 24
+# What stands in for the distance of the board where it is not before the camera [m].
+_FAR_M = 1.0
+
+
+class LiveView:
+    """Takes pictures of a cell's board from wherever its arm is.
+
+    Args:
+        cell: The cell, with one board. Its true arm, edges, lens and noise are what counts; the
+            views that it was built with do not matter.
+
+    Raises:
+        DataError: The cell has two boards, or OpenCV does not have the target's dictionary.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        if len(cell.sheets) != 1:
+            raise DataError(
+                f"simulation: the cell has {len(cell.sheets)} boards; live pictures show one."
+            )
+        self._cell = cell
+        self._scene = prepare_scene(cell)
+        self._count = 0
+        # The light of the last posture at rest; the noise alone is drawn anew for each picture.
+        self._rest: tuple[FloatArray, Float32Array] | None = None
+
+    def picture(self, joints: FloatArray) -> Image:
+        """Takes a picture.
+
+        Args:
+            joints: (k, n) where the arm's joints really are, at even steps from the beginning of
+                the exposure to its end; one row for an arm that stands [rad].
+
+        Returns:
+            (height, width) grey image, smeared by what moved, with noise of its own.
+        """
+        poses = self.cam_from_target(joints)
+        smear_px = float(self._moved_px(poses[:-1], poses[1:]).sum())
+        if smear_px < _STILL_PX:
+            light = self._still(poses[len(poses) // 2], joints[len(joints) // 2])
+        else:
+            light = self._smeared(joints, smear_px)
+        self._count += 1
+        options = self._cell.options
+        return developed(light, options, stream(options, Stream.IMAGES, 1, self._count))
+
+    def cam_from_target(self, joints: FloatArray) -> FloatArray:
+        """Where the board really is before the camera: (k, n) joints [rad] to (k, 4, 4)."""
+        return before_camera(self._cell.transforms, forward(self._cell.true_arm, joints))
+
+    def _still(self, pose: FloatArray, posture: FloatArray) -> Float32Array:
+        if self._rest is None or self._moved_px(self._rest[0][None], pose[None])[0] > _STILL_PX:
+            self._rest = (pose, self._light(pose, posture))
+        return self._rest[1]
+
+    def _light(self, pose: FloatArray, posture: FloatArray, **more: int) -> Float32Array:
+        shows_board = _faces(self._cell, pose)
+        return light_on(self._scene, pose, posture, shows_board=shows_board, **more)
+
+    def _smeared(self, joints: FloatArray, smear_px: float) -> Float32Array:
+        """The mean of what fell on the sensor in even parts of the exposure."""
+        parts = int(np.clip(np.ceil(smear_px), 3, _MOST_PARTS))
+        at = (np.arange(parts) + 0.5) / parts * (len(joints) - 1)
+        steps = np.arange(len(joints))
+        between_them = np.stack([np.interp(at, steps, it) for it in joints.T], axis=1)
+        poses = self.cam_from_target(between_them)
+        if smear_px < _SHORT_PX:
+            lights = (self._light(*it) for it in zip(poses, between_them, strict=True))
+        else:
+            middle = self.cam_from_target(joints[len(joints) // 2, None])[0]
+            whole = self._light(middle, joints[len(joints) // 2], samples=1)
+            lights = (self._shifted(whole, pose @ invert(middle), middle) for pose in poses)
+        total = next(lights).copy()
+        for light in lights:
+            total += light
+        return np.asarray(total / np.float32(parts))
+
+    def _shifted(
+        self, light: Float32Array, now_from_middle: FloatArray, middle: FloatArray
+    ) -> Float32Array:
+        """Moves a picture as if all that it shows were as far away as the board.
+
+        A smear is as long as it should be at the board's middle, and symmetric to the true place
+        of every corner everywhere.
+        """
+        camera = self._cell.options.camera
+        raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
+        depth = float((middle[:3, :3] @ centre_m(self._cell.sheet) + middle[:3, 3])[2])
+        plane = compose(np.eye(3), np.array([0.0, 0.0, depth if depth > 0.0 else _FAR_M]))
+        plane_from_now = invert(now_from_middle @ plane)
+        aims = raster.directions @ plane_from_now[:3, :3].T
+        start = plane_from_now[:3, 3]
+        struck = start - aims * (start[2] / aims[..., 2])[..., None]
+        px = project(camera, struck @ plane[:3, :3].T + plane[:3, 3])
+        across, down = between(raster, px[..., 0]), between(raster, px[..., 1])
+        moved = cv2.remap(light, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(moved, np.float32)
+
+    def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """(k,) bounds on how far the picture moves between poses (k, 4, 4) of the board [px]."""
+        centre = centre_m(self._cell.sheet)
+        ahead = first[:, :3, :3] @ centre + first[:, :3, 3]
+        behind = second[:, :3, :3] @ centre + second[:, :3, 3]
+        distance = np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
+        shift = np.linalg.norm(behind - ahead, axis=1) / distance
+        turn = rotation_angle(second @ invert(first))
+        return np.asarray(self._cell.options.camera.matrix[0] * (shift + turn))
+
+
+def _faces(cell: Cell, cam_from_target: FloatArray) -> bool:
+    """Tells whether the board's printed side may be in the picture, at least in part."""
+    points = np.concatenate(
+        [corners_m(cell.sheet), outline_m(cell.sheet, margin_m(cell.sheet.target))]
+    )
+    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    cosines = points_cam[:, 2] / np.linalg.norm(points_cam, axis=1)
+    camera = cell.options.camera
+    ends = np.array(np.meshgrid(*((0.0, it - 1.0) for it in camera.resolution))).reshape(2, 4).T
+    # The target's z points into the board.
+    in_front = invert(cam_from_target)[2, 3] < 0.0
+    return bool(in_front and cosines.max() > rays(camera, ends)[:, 2].min())
