@@ -1,0 +1,154 @@
+"""The live camera: as good as the simulator's own pictures at rest, honestly smeared in motion."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from visioncal.drivers.protocols import CameraDevice
+from visioncal.errors import DataError, DriverError
+from visioncal.finders.charuco import find_charuco
+from visioncal.finders.result import Seen
+from visioncal.rehearsal.camera import Clock, Pace, RehearsalCamera
+from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
+from visioncal.simulation.live import LiveView
+
+TARGET = CellOptions().target
+# How each joint shares in a motion, in no special direction.
+SWAY = np.array([1.0, 0.3, 0.3, 0.2, 0.4, 0.5])
+
+
+def a_cell(**options):
+    # No repeatability: the cell's own pictures are of the true arm at the reported joints.
+    still = {"robot_sigma_m": 0.0, "robot_sigma_rad": 0.0}
+    bent = {"dh_sigma_m": 3e-4, "dh_sigma_rad": 3e-4}
+    return simulate(CellOptions(views=3, seed=3, **{**still, **bent, **options}))
+
+
+def errors_px(image, exact):
+    found = find_charuco(image, TARGET)
+    assert isinstance(found, Seen)
+    ids, mine, theirs = np.intersect1d(found.ids, exact.ids, return_indices=True)
+    assert len(ids) > 0.8 * len(exact.ids)
+    return found.px[mine] - exact.px[theirs]
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
+    cell = a_cell(mount=mount)
+    scene, live = prepare_scene(cell), LiveView(cell)
+    written = [errors_px(render(scene, it), cell.exact_corners[it]) for it in range(3)]
+    taken = [
+        errors_px(live.picture(cell.joints[it, None]), cell.exact_corners[it]) for it in (0, 1, 2)
+    ]
+    # Both are the detector's noise on other grain: over 100 corners their rms differ by some 15 %.
+    assert np.std(np.vstack(taken)) < 1.3 * np.std(np.vstack(written))
+
+
+def test_each_picture_has_grain_of_its_own_and_nothing_else_differs():
+    cell = a_cell()
+    live = LiveView(cell)
+    first, second = (live.picture(cell.joints[0, None]).astype(float) for _ in range(2))
+    # The difference of two draws of the sensor's noise.
+    assert np.std(first - second) == pytest.approx(np.sqrt(2) * cell.options.image_noise, rel=0.03)
+
+
+def test_a_slow_motion_moves_corners_to_the_middle_of_the_exposure():
+    cell = a_cell(image_noise=0.0)
+    live = LiveView(cell)
+    for size in (2e-4, 1e-3):  # under 1 px, and some 4 px: made of exact and of shifted pictures
+        shares = np.linspace(-0.5, 0.5, 5)[:, None]
+        image = live.picture(cell.joints[0] + shares * size * SWAY)
+        # A smear is symmetric about its middle, so its corners stay; a mistake in its direction or
+        # middle would move them by a pixel.
+        assert np.abs(errors_px(image, cell.exact_corners[0]).mean(axis=0)).max() < 0.05
+
+
+def test_a_fast_motion_leaves_no_board_to_be_found():
+    cell = a_cell()
+    swept = cell.joints[0] + np.linspace(-0.5, 0.5, 5)[:, None] * 0.02 * SWAY
+    image = LiveView(cell).picture(swept)
+    found = find_charuco(image, TARGET)
+    assert not isinstance(found, Seen) or len(found.ids) < 0.8 * len(cell.exact_corners[0].ids)
+
+
+def test_an_arm_that_looks_elsewhere_sees_no_board():
+    cell = a_cell()
+    live = LiveView(cell)
+    for turn in (1.5, 2.5, -2.5):
+        away = cell.joints[0] + np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0])
+        assert not isinstance(find_charuco(live.picture(away[None]), TARGET), Seen)
+
+
+def test_two_boards_are_refused():
+    with pytest.raises(DataError, match="2 boards"):
+        LiveView(simulate(CellOptions(views=2, second=Second())))
+
+
+def a_camera(true_joints=None, **options):
+    """A camera, with a clock that passes only where somebody waits."""
+    cell, time = a_cell(**options), SimpleNamespace(at=100.003)
+
+    def sleep(seconds):
+        time.at += seconds
+
+    told = true_joints or (lambda _: cell.joints[0])
+    camera = RehearsalCamera(cell, told, pace=Pace(10.0, 0.02), clock=Clock(lambda: time.at, sleep))
+    return cell, time, camera
+
+
+def test_pictures_come_at_even_times_and_begin_after_the_call():
+    _, time, camera = a_camera()
+    assert isinstance(camera, CameraDevice)
+    stamps = []
+    for _ in range(3):
+        asked = time.at
+        frame = camera.frame()
+        assert frame.stamp_s - 0.5 * frame.exposure_s >= asked - 1e-9
+        stamps.append(frame.stamp_s)
+    assert np.diff(stamps) == pytest.approx([0.1, 0.1])
+
+
+def test_the_arm_is_asked_for_the_time_of_exposure():
+    asked = []
+
+    def told(moment):
+        asked.append(moment)
+        return cell.joints[0]
+
+    cell, _, camera = a_camera(told)
+    frame = camera.frame()
+    assert min(asked) == pytest.approx(frame.stamp_s - 0.01)
+    assert max(asked) == pytest.approx(frame.stamp_s + 0.01)
+
+
+def test_an_unplugged_camera_says_so_in_time_and_a_frozen_one_repeats_itself():
+    _, time, camera = a_camera()
+    first = camera.frame()
+    camera.fault = "frozen"
+    again = camera.frame()
+    assert np.array_equal(first.image, again.image)
+    assert again.stamp_s > first.stamp_s
+    camera.fault = "unplugged"
+    before = time.at
+    with pytest.raises(DriverError, match="no picture within"):
+        camera.frame(timeout_s=0.5)
+    assert time.at - before <= 0.5 + 1e-9
+
+
+def test_the_camera_outlives_a_controller_that_dies():
+    def told(moment):
+        if moment > 100.1:
+            raise DriverError("gone")
+        return cell.joints[0]
+
+    cell, _, camera = a_camera(told, image_noise=0.0)
+    first = camera.frame()
+    camera.frame()
+    assert np.array_equal(camera.frame().image, first.image)
+
+
+def test_intrinsics_are_told_only_where_the_cell_states_them():
+    assert np.array_equal(a_camera()[2].factory.matrix, a_cell().stated_camera.matrix)
+    _, _, camera = a_camera(state_intrinsics=False)
+    assert camera.factory is None
