@@ -4,6 +4,7 @@ import difflib
 import hashlib
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -172,6 +173,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def one_line(text: str) -> str:
     """Replaces by spaces what does not print, such as line ends."""
     return "".join(it if it.isprintable() else " " for it in text)
+
+
+def natural(path: Path) -> tuple[object, ...]:
+    """Orders names as people do: `view2` before `view10`."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return tuple((int(it), "") if it.isascii() and it.isdecimal() else (-1, it) for it in parts)
 
 
 def some_of(names: Sequence[str], most: int = 8) -> str:

@@ -6,16 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visioncal.errors import DataError
+from visioncal.files import natural
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Enough to tell what a text file is about.
 _HEAD_BYTES = 16_384
-
-
-def natural(path: Path) -> tuple[object, ...]:
-    """Orders names as people do: `view2` before `view10`."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return tuple((int(it), "") if it.isascii() and it.isdecimal() else (-1, it) for it in parts)
 
 
 def number_in(name: str) -> int | None:
