@@ -15,7 +15,7 @@ from visioncal.errors import DriverError
 from visioncal.types import Camera, Image
 
 # A picture that comes after as long a wait was not in the driver's queue [s].
-_WAITED_S = 0.004
+_WAITED_S = 0.008
 # Some cameras take their time for the first picture [s].
 _OPENING_S = 5.0
 # V4L2's and DirectShow's word for exposure that the user sets.
@@ -96,10 +96,9 @@ class UvcCamera:
             return Frame(first, asked)
         waits = 0
         while True:
-            before = time.monotonic()
-            self._grab(asked + timeout_s - before)
+            waited_s = self._grab(asked + timeout_s - time.monotonic())
             arrived = time.monotonic()
-            waits += arrived - before > _WAITED_S
+            waits += waited_s > _WAITED_S
             told = self._told_stamp(arrived)
             stamp = arrived if told is None else told
             # Where the driver tells no times, the first that was waited for began before the call.
@@ -117,16 +116,26 @@ class UvcCamera:
         told = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         return told if now - 1.0 < told <= now and not self._is_file else None
 
-    def _grab(self, timeout_s: float) -> None:
-        """Takes the next picture, in a thread: the driver of a lost camera may hang for long."""
-        answers: Queue[bool] = Queue()
-        threading.Thread(target=lambda: answers.put(self._capture.grab()), daemon=True).start()
+    def _grab(self, timeout_s: float) -> float:
+        """Takes the next picture and tells how long that took [s].
+
+        In a thread: the driver of a camera that is lost may hang for long.
+        """
+        answers: Queue[tuple[bool, float]] = Queue()
+
+        def grab() -> None:
+            began = time.monotonic()
+            is_there = self._capture.grab()
+            answers.put((is_there, time.monotonic() - began))
+
+        threading.Thread(target=grab, daemon=True).start()
         try:
-            is_there = answers.get(timeout=max(timeout_s, 0.0))
+            is_there, took_s = answers.get(timeout=max(timeout_s, 0.0))
         except Empty:
-            is_there = False
+            raise self._gone() from None
         if not is_there:
             raise self._gone()
+        return took_s
 
     def _retrieved(self) -> Image:
         read, image = self._capture.retrieve()
