@@ -27,7 +27,7 @@ from visioncal.types import Camera
 NAMES = [it.name for it in EXPORT_FORMATS]
 EDGE_NAMES = [it for it in NAMES if it not in readers.ARM_FORMATS]
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
-LENSES = {"camera-info", "kalibr"}
+LENSES = {"camera-info", "kalibr", "oak"}
 RNG = np.random.default_rng(3)
 SAMPLE = made_up(5).calibration
 

@@ -10,7 +10,7 @@ from visioncal.cli.console import messages
 from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
-from visioncal.files import check_free, write_atomically
+from visioncal.files import check_free, read_text, write_atomically
 from visioncal.stored import load_placed
 
 
@@ -69,6 +69,12 @@ def export_command(
         str | None,
         typer.Option("--hash", help="ur-kinematics: the hash that ur_calibration extracts."),
     ] = None,
+    onto: Annotated[
+        Path | None,
+        typer.Option(
+            "--onto", help="oak: the device's own calibration JSON, of which all else is kept."
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     _list: Annotated[
         bool,
@@ -81,7 +87,10 @@ def export_command(
     nothing was written, for the reason given.
     """
     load = _load(mass_kg, cog_mm)
-    selection = Selection(edge, inverse, parent, child, number, load, convention, calibration_hash)
+    kept = None if onto is None else read_text(onto)
+    selection = Selection(
+        edge, inverse, parent, child, number, load, convention, calibration_hash, kept
+    )
     written = document(load_placed(source), to, selection)
     for it in written.warnings:
         messages().print(f"[bold red]warning:[/] {escape(it)}")

@@ -166,6 +166,7 @@ def _check_said(selection: Selection, form: ArmFormat) -> None:
         "--mass-kg and --cog-mm": selection.load is not None,
         "--convention": selection.convention is not None and "convention" not in form.takes,
         "--hash": selection.calibration_hash is not None and "hash" not in form.takes,
+        "--onto": selection.onto is not None,
     }
     said = [option for option, there in given.items() if there]
     if said:

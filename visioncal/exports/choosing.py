@@ -69,6 +69,7 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
         rotation_of,
         selection.number,
         selection.load,
+        selection.onto,
     )
 
 
@@ -107,6 +108,7 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
         "load": selection.load is not None,
         "convention": selection.convention is not None,
         "hash": selection.calibration_hash is not None,
+        "onto": selection.onto is not None,
     }
     for what in sorted(it for it, there in given.items() if there and it not in form.takes):
         raise DataError(

@@ -33,6 +33,7 @@ class Selection:
         load: What the tool weighs.
         convention: In which form the joints of an arm are tabulated.
         calibration_hash: The `hash` of a UR's own kinematics.
+        onto: The document of the reader's own that is to be written onto.
     """
 
     edge: str | None = None
@@ -43,6 +44,7 @@ class Selection:
     load: Load | None = None
     convention: str | None = None
     calibration_hash: str | None = None
+    onto: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,7 @@ class Content:
             the rotation was measured.
         number: Which of the controller's tools or bases it becomes, where that was said.
         load: What the tool weighs, where that was said.
+        onto: The document that is to be written onto, where there is one.
     """
 
     name: str
@@ -77,6 +80,7 @@ class Content:
     rotation_of: str | None = None
     number: int | None = None
     load: Load | None = None
+    onto: str | None = None
 
     @property
     def matrix(self) -> FloatArray:

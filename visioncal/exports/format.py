@@ -10,7 +10,7 @@ from visioncal.exports.content import Content
 # the flange; or where something stands in the base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
 # What of a selection a format has a use for, beside the transform and its frames' names.
-Takes: TypeAlias = Literal["number", "load", "convention", "hash"]
+Takes: TypeAlias = Literal["number", "load", "convention", "hash", "onto"]
 
 
 def _nothing_amiss(_: Content) -> str:

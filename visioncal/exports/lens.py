@@ -14,8 +14,12 @@ _CAMERA = {"cam": "camera"}
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
 
 
-def _camera_of(content: Content) -> Camera:
-    """Gives the camera, whose lens is one of `_ROS_MODELS`."""
+def camera_of(content: Content) -> Camera:
+    """Gives the camera, whose lens is one of `_ROS_MODELS`.
+
+    Raises:
+        DataError: There is none, or it has another number of coefficients.
+    """
     if content.lens is None:
         raise DataError(
             "This calibration has no camera: its session brought measured poses of the target, "
@@ -48,7 +52,7 @@ def _write_camera_info(content: Content) -> str:
     Models by sensor_msgs/distortion_models.hpp. A single camera is not rectified: R is the
     identity, and P repeats the camera matrix.
     """
-    camera = _camera_of(content)
+    camera = camera_of(content)
     matrix = matrix_3x3(camera)
     document = {
         "image_width": camera.resolution[0],
@@ -69,7 +73,7 @@ def _write_kalibr(content: Content) -> str:
     Without `T_cam_imu`, which carries points of an inertial sensor into the camera: none was
     calibrated.
     """
-    camera = _camera_of(content)
+    camera = camera_of(content)
     coefficients = numbers(camera.distortion)
     if camera.model == "brown":
         coefficients = _radtan(coefficients)

@@ -13,6 +13,7 @@ from visioncal.exports.format import ExportFormat
 from visioncal.exports.launch import MOVEIT, ROS_LAUNCH
 from visioncal.exports.lens import CAMERA_INFO, KALIBR
 from visioncal.exports.matrices import OPENCV, TEXT, ZIVID
+from visioncal.exports.oak import OAK
 from visioncal.exports.programs import PROGRAMS
 from visioncal.exports.robots import ROBOTS
 from visioncal.exports.ros import EASY_HANDEYE2, ROS
@@ -28,6 +29,7 @@ EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     URDF,
     CAMERA_INFO,
     KALIBR,
+    OAK,
     OPENCV,
     ZIVID,
     TEXT,
