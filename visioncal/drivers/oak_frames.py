@@ -70,9 +70,13 @@ class FrameEnd:
         Raises:
             DriverError: The pipeline has ended, or the device is gone.
         """
-        with told_by(self._dai, self._name):
-            message = self._queue.get(timedelta(seconds=max(timeout_s, 0.0)))
+        message = self.message(timeout_s)
         return None if message is None else _frame(self._dai, message)
+
+    def message(self, timeout_s: float) -> Handle | None:
+        """Takes the next frame as depthai has it, with all that the camera says of it."""
+        with told_by(self._dai, self._name):
+            return self._queue.get(timedelta(seconds=max(timeout_s, 0.0)))
 
     def close(self) -> None:
         """Stops the pipeline once all that it records is written; may be called twice."""

@@ -21,4 +21,6 @@ def depthai() -> ModuleType:
     os.environ["DEPTHAI_TELEMETRY"] = "0"
     # Its warnings about USB in containers are no news to a user of a recording or a rehearsal.
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
+    # It looks for a device for 10 s; one that is there is found within one.
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "3000")
     return client_library("depthai", "oak")
