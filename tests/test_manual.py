@@ -1,0 +1,167 @@
+"""Poses typed from a pendant: what each maker's form means, and what is asked back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rotations import CASES
+from samples import made_up
+from scipy.spatial.transform import Rotation
+
+from visioncal.calibration import Edge
+from visioncal.documents.pendants import is_marked_pose, possible_forms, read_pose
+from visioncal.drivers.manual import ManualArm
+from visioncal.drivers.protocols import Arm
+from visioncal.errors import DataError, DriverError
+from visioncal.exports import export
+from visioncal.transforms import compose
+
+SAMPLE = made_up(5).calibration
+SHIFT = np.array([0.4, -0.1, 0.3])
+
+
+def a_pose(rotation):
+    return compose(rotation.as_matrix(), SHIFT)
+
+
+# By the makers' own definitions, written with scipy's rotations alone.
+LINES = {
+    "p[0.4, -0.1, 0.3, 0.1, -0.2, 3.0]": Rotation.from_rotvec([0.1, -0.2, 3.0]),
+    "pose: p[.4,-1e-1,.3,0.1,-0.2,3.0] ": Rotation.from_rotvec([0.1, -0.2, 3.0]),
+    "X 400 mm Y -100 mm Z 300 mm RX 0.1 rad RY -0.2 rad RZ 3 rad": Rotation.from_rotvec(
+        [0.1, -0.2, 3.0]
+    ),
+    "{X 400.0, Y -100, Z 300.0, A 10, B -20, C 170}": Rotation.from_euler(
+        "ZYX", [10, -20, 170], degrees=True
+    ),
+    "{E6POS: X 400.0,Y -100,Z 300.0,A 10,B -20,C 170,S 6,T 50,E1 0.0,E2 0.0}": Rotation.from_euler(
+        "ZYX", [10, -20, 170], degrees=True
+    ),
+    "X = 400.000 mm, Y = -100 mm, Z = 300 mm,  W = 10 deg, P = -20 deg, R = 170 deg": (
+        Rotation.from_euler("xyz", [10, -20, 170], degrees=True)
+    ),
+    "X: 400 Y: \N{MINUS SIGN}100 Z: 300 W: 10° P: \N{MINUS SIGN}20° R: 170°": Rotation.from_euler(
+        "xyz", [10, -20, 170], degrees=True
+    ),
+    "[[400,-100,300],[0.5,-0.5,0.5,0.5]]": Rotation.from_quat([-0.5, 0.5, 0.5, 0.5]),
+    "CONST robtarget p10:=[[400,-100,300],[0.5,-0.5,0.5,0.5],[0,-1,0,1],[9E9,9E9,9E9,9E9]];": (
+        Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
+    ),
+    "posx(400, -100, 300, 10, 20, 170)": Rotation.from_euler("ZYZ", [10, 20, 170], degrees=True),
+    "x_m 0.4 y_m -0.1 z_m 0.3 qx 0.5 qy -0.5 qz 0.5 qw 0.5": Rotation.from_quat(
+        [0.5, -0.5, 0.5, 0.5]
+    ),
+    "0.4, -0.1, 0.3, 0.5, -0.5, 0.5, 0.5": Rotation.from_quat([0.5, -0.5, 0.5, 0.5]),
+}
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_line_means_what_its_maker_says(line):
+    found = read_pose(line, "the line")
+    # To rounding.
+    assert np.abs(found.pose - a_pose(LINES[line])).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("form", "rotation"),
+    [
+        ("ur", Rotation.from_rotvec([0.1, -0.2, 3.0])),
+        ("rpy", Rotation.from_euler("xyz", [0.1, -0.2, 3.0])),
+    ],
+)
+def test_bare_numbers_are_what_the_user_says(form, rotation):
+    found = read_pose("0.4 -0.1 0.3 0.1 -0.2 3.0", "the line", form)
+    assert np.abs(found.pose - a_pose(rotation)).max() < 1e-12
+
+
+@pytest.mark.parametrize("form", ["ur", "kuka", "fanuc", "abb", "doosan"])
+def test_what_is_exported_can_be_pasted_back(form):
+    for rotation in CASES["any"]:
+        matrix = compose(rotation, SHIFT)
+        edges = {**SAMPLE.edges, "flange_from_cam": Edge(matrix, np.eye(6))}
+        lines = export(replace(SAMPLE, edges=edges), form).splitlines()
+        pose = " ".join(it for it in lines if not it.startswith(("#", ";", "!")))
+        found = read_pose(pose, "the line")
+        assert found.form.name == form
+        # Exports are written to the nanometre and to 1e-8 deg.
+        assert np.abs(found.pose - matrix).max() < 2e-9
+
+
+@pytest.mark.parametrize(
+    ("line", "form", "words"),
+    [
+        ("1 2 3", None, "is no pose"),
+        ("hello", None, "is no pose"),
+        ("X 1 mm Y 2 m Z 3 mm A 4 B 5 C 6", None, "is no pose"),
+        ("J1 10 deg J2 20 deg", None, "is no pose"),
+        ("1 2 3 4 5 6", None, "ur, kuka, fanuc, yaskawa, staubli, doosan"),
+        ("X 1 Y 2 Z 3 Rx 4 Ry 5 Rz 6", None, "ur, yaskawa, staubli"),
+        ("p[0.4, 0, 0, 0, 0, 0]", "kuka", "a pose of ur, not of 'kuka'"),
+        ("p[400, 0, 0, 0, 0, 0]", None, "400 m from the base"),
+        ("p[0.4, 0, 0, 0, 0, 170]", None, "too large for radians"),
+        ("[[400,0,0],[0.5,0.5,0.5,0.4]]", None, "not a quaternion w, x, y, z"),
+    ],
+)
+def test_what_cannot_be_or_may_be_several_things_is_refused(line, form, words):
+    with pytest.raises(DataError) as caught:
+        read_pose(line, "the line", form)
+    assert words in str(caught.value)
+
+
+def test_only_marks_and_names_make_a_pose_of_a_line():
+    assert is_marked_pose("{X 1, Y 2, Z 3, A 4, B 5, C 6}")
+    assert not is_marked_pose("1 2 3 4 5 6")
+    assert possible_forms("hello") == ()
+
+
+def asked(lines):
+    """What asks, and the questions that it asked."""
+    questions, left = [], iter(lines)
+
+    def ask(question):
+        questions.append(question)
+        line = next(left, None)
+        if line is None:
+            raise EOFError
+        return line
+
+    return ask, questions
+
+
+def test_a_pose_is_shown_back_and_taken_when_the_person_agrees():
+    ask, questions = asked(["{X 400, Y -100, Z 300, A 10, B -20, C 170}", ""])
+    arm: Arm = ManualArm(ask)
+    state = arm.state()
+    wanted = a_pose(Rotation.from_euler("ZYX", [10, -20, 170], degrees=True))
+    assert np.abs(state.base_from_flange - wanted).max() < 1e-12
+    assert "KUKA" in questions[1]
+    assert "x 400.00, y -100.00, z 300.00 mm" in questions[1]
+    with pytest.raises(DriverError, match="at their end"):
+        arm.state()
+
+
+def test_a_slip_can_be_corrected_before_it_counts():
+    ask, questions = asked(["p[0.4, 0.1", "p[0.5,0,0,0,0,0]", "p[0.4,0,0,0,0,0]", ""])
+    state = ManualArm(ask).state()
+    assert state.base_from_flange[0, 3] == 0.4
+    assert "is no pose" in questions[1]
+
+
+def test_bare_numbers_are_asked_for_once():
+    first, second = "400 -100 300 10 -20 170", "410 -100 300 10 -20 170"
+    ask, questions = asked([first, "kukka", "kuka", "", second, ""])
+    arm = ManualArm(ask)
+    wanted = a_pose(Rotation.from_euler("ZYX", [10, -20, 170], degrees=True))
+    assert np.abs(arm.state().base_from_flange - wanted).max() < 1e-12
+    assert arm.state().base_from_flange[0, 3] == pytest.approx(0.41)
+    assert sum("Which is it?" in it for it in questions) == 2
+
+
+def test_the_form_can_be_said_beforehand():
+    ask, questions = asked(["400 -100 300 10 -20 170", ""])
+    ManualArm(ask, "fanuc").state()
+    assert "FANUC" in questions[1]
+    ask, _ = asked(["0.4, -0.1, 0.3, 0.5, -0.5, 0.5, 0.5", ""])
+    ManualArm(ask, "ours").state()
+    with pytest.raises(DriverError, match="no form of poses 'kukka'"):
+        ManualArm(ask, "kukka")
