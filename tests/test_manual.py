@@ -14,6 +14,8 @@ from visioncal.drivers.manual import ManualArm
 from visioncal.drivers.protocols import Arm
 from visioncal.errors import DataError, DriverError
 from visioncal.exports import export
+from visioncal.formats import PoseWishes, Wishes
+from visioncal.formats.columns import foreign_from, read_fields
 from visioncal.transforms import compose
 
 SAMPLE = made_up(5).calibration
@@ -40,6 +42,7 @@ LINES = {
     "X = 400.000 mm, Y = -100 mm, Z = 300 mm,  W = 10 deg, P = -20 deg, R = 170 deg": (
         Rotation.from_euler("xyz", [10, -20, 170], degrees=True)
     ),
+    "X400.0 Y-100. Z300 W10 P-20 R170": Rotation.from_euler("xyz", [10, -20, 170], degrees=True),
     "X: 400 Y: \N{MINUS SIGN}100 Z: 300 W: 10° P: \N{MINUS SIGN}20° R: 170°": Rotation.from_euler(
         "xyz", [10, -20, 170], degrees=True
     ),
@@ -92,6 +95,9 @@ def test_what_is_exported_can_be_pasted_back(form):
     [
         ("1 2 3", None, "is no pose"),
         ("hello", None, "is no pose"),
+        # Such a line must not take for ever.
+        (40 * "1" + "x", None, "is no pose"),
+        (2000 * "x1", None, "is no pose"),
         ("X 1 mm Y 2 m Z 3 mm A 4 B 5 C 6", None, "is no pose"),
         ("J1 10 deg J2 20 deg", None, "is no pose"),
         ("1 2 3 4 5 6", None, "ur, kuka, fanuc, yaskawa, staubli, doosan"),
@@ -106,6 +112,49 @@ def test_what_cannot_be_or_may_be_several_things_is_refused(line, form, words):
     with pytest.raises(DataError) as caught:
         read_pose(line, "the line", form)
     assert words in str(caught.value)
+
+
+def a_file(path, rotations, form="kuka", images=True):
+    """A pose a line, as a form of the exports writes it, with an image before it."""
+    lines = ["# poses of the morning"]
+    for at, rotation in enumerate(rotations):
+        edges = {**SAMPLE.edges, "flange_from_cam": Edge(compose(rotation, SHIFT), np.eye(6))}
+        text = export(replace(SAMPLE, edges=edges), form).splitlines()[-1]
+        lines.append(f'img{at}.png; "{text}"' if images else text)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("form", ["ur", "kuka", "abb", "doosan"])
+def test_a_file_with_a_pose_a_line_says_itself_what_it_means(tmp_path, form):
+    rotations = CASES["any"][:4]
+    for images in (True, False):
+        fields = read_fields(a_file(tmp_path / "poses.txt", rotations, form, images))
+        foreign = foreign_from(fields, Wishes())
+        assert foreign.notes == ()
+        # Exports are written to the nanometre and to 1e-8 deg.
+        assert np.abs(foreign.robot.poses() - compose(np.array(rotations), SHIFT)).max() < 2e-9
+    assert read_fields(a_file(tmp_path / "b.txt", rotations)).texts["image"][3] == "img3.png"
+
+
+def test_a_file_of_poses_names_the_line_that_is_wrong(tmp_path):
+    path = a_file(tmp_path / "poses.txt", CASES["any"][:3])
+    path.write_text(path.read_text() + "img9.png; {X 1, Y 2}\n")
+    with pytest.raises(DataError, match=r"poses\.txt, line 5.*is no pose"):
+        read_fields(path)
+    path.write_text("{X 1,Y 2,Z 3,A 4,B 5,C 6}\np[0.1, 0.2, 0.3, 0, 0, 1]\n")
+    with pytest.raises(DataError, match="line 2: another maker's form than KUKA"):
+        read_fields(path)
+    path.write_text("p[0,0,0,0,0,1]\np[0,0,0,0,0,1] p[0.1,0,0,0,0,1]\n")
+    with pytest.raises(DataError, match=r"line 2.*is no pose"):
+        read_fields(path)
+
+
+def test_another_form_than_the_lines_have_is_refused(tmp_path):
+    fields = read_fields(a_file(tmp_path / "poses.txt", CASES["any"][:3]))
+    foreign_from(fields, Wishes(robot=PoseWishes(form="kuka")))
+    with pytest.raises(DataError, match="written as KUKA"):
+        foreign_from(fields, Wishes(robot=PoseWishes(form="fanuc")))
 
 
 def test_only_marks_and_names_make_a_pose_of_a_line():

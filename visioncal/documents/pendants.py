@@ -18,9 +18,9 @@ from visioncal.types import FloatArray
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _UNIT = r"(?:mm|m|deg|rad)"
 _NAMED = re.compile(
-    rf"(?<![\w.])([A-Za-z][A-Za-z0-9]*)(?:_m)?\s*[:=]?\s*({_NUMBER})\s*({_UNIT})?(?![\w.])"
+    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*({_NUMBER})\s*({_UNIT})?(?![\w.])"
 )
-_BARE = re.compile(rf"[\s\[\]{{}}(),;]*(?:{_NUMBER}[\s\[\]{{}}(),;]*)+")
+_BETWEEN = re.compile(r"[\s\[\]{}(),;]+")
 # What stands around the numbers of a pose, and in which form it is then.
 _MARKED = (
     ("ur", re.compile(r"(?<!\w)p\s*\[([^\[\]]*)\]")),
@@ -126,9 +126,10 @@ def _written(line: str) -> _Written | None:
 
 def _marked(line: str) -> _Written | None:
     for form, pattern in _MARKED:
-        found = pattern.search(line)
-        if found:
-            words = re.split(r"[\s,\[\]]+", found[1].strip())
+        found = pattern.findall(line)
+        # Of two poses in a line nobody tells which is meant.
+        if len(found) == 1:
+            words = re.split(r"[\s,\[\]]+", found[0].strip())
             if all(re.fullmatch(_NUMBER, it) for it in words):
                 return _Written(tuple(map(float, words)), (form,))
     return None
@@ -139,7 +140,10 @@ def _named(line: str) -> _Written | None:
     values = {name: float(number) for name, number, _ in found}
     units = {name: unit for name, _, unit in found if unit}
     for names, forms in _NAMED_ROTATIONS.items():
-        if {"x", "y", "z", *names} <= values.keys():
+        needed = {"x", "y", "z", *names}
+        if needed <= values.keys():
+            if sum(name in needed for name, _, _ in found) > len(needed):
+                return None  # two poses in a line
             numbers = tuple(values[it] for it in ("x", "y", "z", *names))
             lengths = {units[it] for it in "xyz" if it in units}
             angles = {units[it] for it in names if it in units}
@@ -153,10 +157,10 @@ def _named(line: str) -> _Written | None:
 
 
 def _bare(line: str) -> _Written | None:
-    if not _BARE.fullmatch(line):
+    words = [it for it in _BETWEEN.split(line) if it]
+    if len(words) not in _BARE_FORMS or not all(re.fullmatch(_NUMBER, it) for it in words):
         return None
-    numbers = tuple(float(it) for it in re.findall(_NUMBER, line))
-    return _Written(numbers, _BARE_FORMS[len(numbers)]) if len(numbers) in _BARE_FORMS else None
+    return _Written(tuple(map(float, words)), _BARE_FORMS[len(words)])
 
 
 def _form(written: _Written, wished: str | None, where: str) -> str:

@@ -31,6 +31,7 @@ from visioncal.formats.finding import images_beside, images_named, is_image_name
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
 from visioncal.formats.pairing import with_camera_file
+from visioncal.formats.pendants import pendant_fields
 from visioncal.formats.poses import (
     CAMERA_KEYS,
     JOINT_KEYS,
@@ -62,6 +63,9 @@ def read_fields(path: Path) -> Fields:
         return fields_of_arrays({"value": read_npy(path)}, path)
     if suffix in DOCUMENTS:
         return _fields_of_document(read_document(path), path)
+    lines = pendant_fields(path)
+    if lines is not None:
+        return lines
     table = read_table(path)
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
         raise DataError(

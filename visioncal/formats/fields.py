@@ -35,6 +35,8 @@ class Fields:
         texts: (n,) texts by name, of every column of a table and of single numbers.
         views: (n,) the rows' numbers, where their files' names have them.
         ragged: What is wrong with fields whose rows differ in shape.
+        form: A name among `POSE_FORMS` where the rows themselves say in which form the robot's
+            poses are.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Fields:
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     views: tuple[int, ...] = ()
     ragged: Mapping[str, str] = field(default_factory=dict)
+    form: str = ""
 
     def __len__(self) -> int:
         return len(self.places)

@@ -146,6 +146,8 @@ def poses_from(
     Raises:
         DataError: There are no such fields, or their numbers make up no pose.
     """
+    if whose == "robot" and fields.form:
+        wishes = _with_own_form(fields, wishes)
     blocks = [fields.column(it) for it in names]
     sizes = [it.shape[1] for it in blocks]
     places = fields.places
@@ -165,6 +167,18 @@ def poses_from(
     if names[0].endswith("_m"):
         wishes = replace(wishes, unit=wishes.unit or "m")
     return _checked(wishes.applied_to(numbers), wishes, whose, notes)
+
+
+def _with_own_form(fields: Fields, wishes: PoseWishes) -> PoseWishes:
+    """Reads the robot's poses in the form that their rows say."""
+    if wishes.form not in (None, fields.form):
+        raise DataError(
+            f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not as "
+            f"{wishes.form}.",
+            culprits=[fields.places[0]],
+            next_step="Leave --robot-form out.",
+        )
+    return replace(wishes, form=fields.form)
 
 
 def joints_from(fields: Fields, names: Sequence[str], *, degrees: bool) -> FloatArray:
