@@ -92,7 +92,7 @@ def a_camera(true_joints=None, **options):
     def sleep(seconds):
         time.at += seconds
 
-    told = true_joints or (lambda _: cell.joints[0])
+    told = true_joints or (lambda moments: np.tile(cell.joints[0], (len(moments), 1)))
     camera = RehearsalCamera(cell, told, pace=Pace(10.0, 0.02), clock=Clock(lambda: time.at, sleep))
     return cell, time, camera
 
@@ -112,9 +112,9 @@ def test_pictures_come_at_even_times_and_begin_after_the_call():
 def test_the_arm_is_asked_for_the_time_of_exposure():
     asked = []
 
-    def told(moment):
-        asked.append(moment)
-        return cell.joints[0]
+    def told(moments):
+        asked.extend(moments)
+        return np.tile(cell.joints[0], (len(moments), 1))
 
     cell, _, camera = a_camera(told)
     frame = camera.frame()
@@ -137,10 +137,10 @@ def test_an_unplugged_camera_says_so_in_time_and_a_frozen_one_repeats_itself():
 
 
 def test_the_camera_outlives_a_controller_that_dies():
-    def told(moment):
-        if moment > 100.1:
+    def told(moments):
+        if moments[0] > 100.1:
             raise DriverError("gone")
-        return cell.joints[0]
+        return np.tile(cell.joints[0], (len(moments), 1))
 
     cell, _, camera = a_camera(told, image_noise=0.0)
     first = camera.frame()

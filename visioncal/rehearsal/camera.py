@@ -48,10 +48,11 @@ class RehearsalCamera:
     """A camera device that sees a simulated cell.
 
     Args:
-        cell: The cell: its true arm, edges and lens, its board and its noise.
-        true_joints: Tells the arm's true joints (n,) [rad] at a past moment of the monotonic clock.
-            Where it raises DriverError the arm is taken to stand where it was last known: a camera
-            works on when a controller dies.
+        cell: The cell: its true arm, edges and lens, its board and its noise. Its true arm must be
+            the one whose joints are told.
+        true_joints: Tells the arm's true joints, (k, n) [rad], at k past moments of the monotonic
+            clock, (k,) [s]. Where it raises DriverError the arm is taken to stand where it was last
+            known: a camera works on when a controller dies.
         pace: When it takes pictures.
         clock: The time.
     """
@@ -59,7 +60,7 @@ class RehearsalCamera:
     def __init__(
         self,
         cell: Cell,
-        true_joints: Callable[[float], FloatArray],
+        true_joints: Callable[[FloatArray], FloatArray],
         *,
         pace: Pace | None = None,
         clock: Clock | None = None,
@@ -122,7 +123,7 @@ class RehearsalCamera:
             return self._last[1].copy()
         moments = np.linspace(begins, begins + self._pace.exposure_s, _MOMENTS)
         try:
-            joints = np.array([self._true_joints(float(it)) for it in moments])
+            joints = self._true_joints(moments)
         except DriverError:
             if self._last is None:
                 raise
