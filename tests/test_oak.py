@@ -2,6 +2,7 @@
 
 import json
 import time
+from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -141,7 +142,7 @@ class Device:
         """Its sensors."""
         return [self.sensor]
 
-    def readCalibration(self):  # noqa: N802
+    def readCalibrationOrDefault(self):  # noqa: N802
         """What its factory wrote."""
         return self.calibration
 
@@ -265,6 +266,7 @@ def test_it_focuses_where_the_factory_calibrated(monkeypatch):
     camera.close()
     assert seen.initial.getLensPosition() == 120
     assert camera.settings["focus"] == 120
+    assert camera.settings["factory_intrinsics"].endswith("for focus 120")
 
 
 def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
@@ -275,6 +277,31 @@ def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
     assert camera.factory.matrix == pytest.approx([1500.25, 1500.75, 1015.125, 569.25], abs=1e-3)
     assert camera.factory.distortion == pytest.approx([-0.1, 0.05, 1e-3, -1e-3, 0.01], abs=1e-8)
     assert camera.settings["factory_intrinsics"] == "read from the device"
+
+
+def test_a_device_without_calibration_is_used_without(monkeypatch):
+    device, _ = a_device(monkeypatch)
+    device.calibration = dai.CalibrationHandler()
+    camera = OakCamera(DeviceWishes((640, 400)))
+    camera.close()
+    assert camera.factory is None
+    assert "no calibration of CAM_A" in camera.settings["factory_intrinsics"]
+
+
+def test_a_devices_raw_frames_are_recorded(monkeypatch, tmp_path):
+    a_device(monkeypatch)
+    raw = tmp_path / "raw.mkv"
+    camera = OakCamera(DeviceWishes((64, 48), more={"raw": str(raw)}))
+    frame = camera.frame(timeout_s=PATIENT_S)
+    camera.close()
+    replayed, stamps = ReplayedOak(raw), []
+    with suppress(DriverError):  # which ends it
+        while True:
+            stamps.append(replayed.frame(timeout_s=PATIENT_S).stamp_s)
+    replayed.close()
+    # All of them, whether or not anybody took them.
+    assert np.abs(np.array(stamps) - frame.stamp_s).min() < 2e-6
+    assert len(stamps) > 2
 
 
 def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):

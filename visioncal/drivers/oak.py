@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 
@@ -22,7 +23,7 @@ _RATE_HZ = 10.0
 # first picture of all may take [s].
 _SETTLE_S, _FIRST_S = 1.5, 5.0
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
-_OPTIONS = ("socket", "rate_hz")
+_OPTIONS = ("socket", "rate_hz", "raw")
 
 
 class OakCamera:
@@ -33,42 +34,39 @@ class OakCamera:
     went. All of it is in `settings`.
 
     Args:
-        wishes: What is asked of it; `more` may name the `socket` (CAM_A) and `rate_hz`.
+        wishes: What is asked of it; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`, a
+            file to record every frame into, `.avi` or `.mkv`.
         device: Which OAK, by its id, its address or its USB path; None for the only one.
-        raw: A file to record every frame into, `.avi` or `.mkv`.
 
     Raises:
         DriverError: depthai or the device is missing, or the device has no such camera.
         DataError: Frames cannot be recorded into that file.
     """
 
-    def __init__(
-        self,
-        wishes: DeviceWishes | None = None,
-        *,
-        device: str | None = None,
-        raw: Path | None = None,
-    ) -> None:
+    def __init__(self, wishes: DeviceWishes | None = None, *, device: str | None = None) -> None:
         dai = depthai()
         wishes = wishes or DeviceWishes()
         self._socket, rate_hz = _options(wishes.more)
         with ExitStack() as closing:
             opened = _opened(dai, device)
             closing.callback(opened.close)
-            with told_by(dai, "The OAK"):
+            with told_by(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened, self._socket)
                 self._name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
                 self._resolution = wishes.resolution or _fitting(sensor.width, sensor.height)
-                calibration = opened.readCalibration()
+                calibration = opened.readCalibrationOrDefault()
                 wishes = _focused(wishes, calibration, sensor)
                 pipeline = dai.Pipeline(opened)
                 node = pipeline.create(dai.node.Camera).build(sensor.socket)
                 output = self._output(dai, node, wishes, sensor, rate_hz)
                 control = node.inputControl.createInputQueue()
-            self._end = FrameEnd(dai, pipeline, output, self._name, raw=raw)
+            raw = wishes.more.get("raw")
+            self._end = FrameEnd(
+                dai, pipeline, output, self._name, raw=None if raw is None else Path(raw)
+            )
             closing.callback(self._end.close)
             held = self._held(dai, wishes, sensor, control)
-            self._factory, known = self._intrinsics(calibration)
+            self._factory, known = self._intrinsics(calibration, sensor)
             self._settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
             self._closing = closing.pop_all()
 
@@ -156,13 +154,17 @@ class OakCamera:
         control_queue.send(control)
         return held
 
-    def _intrinsics(self, calibration: Handle) -> tuple[Camera | None, dict[str, str | float]]:
+    def _intrinsics(
+        self, calibration: Handle, sensor: Handle
+    ) -> tuple[Camera | None, dict[str, str | float]]:
         """The factory's intrinsics; where they cannot be used, why, as a setting."""
         try:
             camera = factory_intrinsics(calibration, self._socket, self._resolution)
         except DriverError as error:
             return None, {"factory_intrinsics": f"not used: {error.message}"}
-        return camera, {"factory_intrinsics": "read from the device"}
+        focus = _calibrated_focus(calibration, sensor)
+        at = "" if focus is None else f", for focus {focus}"
+        return camera, {"factory_intrinsics": f"read from the device{at}"}
 
 
 def _options(more: Mapping[str, str]) -> tuple[str, float]:
@@ -228,6 +230,12 @@ def _focused(wishes: DeviceWishes, calibration: Handle, sensor: Handle) -> Devic
     """Focuses where the factory calibrated, unless another focus is wished."""
     if wishes.focus is not None or not sensor.hasAutofocus:
         return wishes
-    calibrated = int(calibration.getLensPosition(sensor.socket))
-    focus = calibrated if calibrated > 0 else None
-    return DeviceWishes(wishes.resolution, wishes.exposure_us, wishes.gain, focus, wishes.more)
+    return replace(wishes, focus=_calibrated_focus(calibration, sensor))
+
+
+def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:
+    """The position of the lens for which the factory's intrinsics are; None for a fixed lens."""
+    if not sensor.hasAutofocus or not calibration.hasCameraCalibration(sensor.socket):
+        return None
+    position = int(calibration.getLensPosition(sensor.socket))
+    return position if position > 0 else None

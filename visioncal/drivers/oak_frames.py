@@ -54,7 +54,7 @@ class FrameEnd:
         self._dai, self._name = dai, name
         self._recorder = None if raw is None else _recorder(dai, pipeline, output, raw)
         self._queue = output.createOutputQueue(maxSize=4, blocking=keeps_all)
-        with told_by(dai, name):
+        with told_by(dai, name, "does not start"):
             pipeline.start()
         # A pipeline that still runs when Python ends aborts the process.
         self._stop = weakref.finalize(self, _stop, pipeline)
@@ -99,7 +99,7 @@ def began_after(frame: Frame, asked: float) -> bool:
 
 
 @contextmanager
-def told_by(dai: ModuleType, name: str) -> Iterator[None]:
+def told_by(dai: ModuleType, name: str, what: str = "gives no frames any more") -> Iterator[None]:
     """Words what depthai raises: RuntimeError of devices and pipelines, and of closed queues.
 
     Raises:
@@ -109,7 +109,7 @@ def told_by(dai: ModuleType, name: str) -> Iterator[None]:
         yield
     except (RuntimeError, dai.MessageQueue.QueueException) as error:
         raise DriverError(
-            f"{name} gives no frames any more: {error}.",
+            f"{name} {what}: {error}.",
             culprits=[name],
             next_step="Look at its cable and its power; then go on with --resume.",
         ) from error

@@ -27,10 +27,12 @@ class UvcCamera:
     """A camera device through OpenCV's VideoCapture.
 
     What is asked for is set where the camera can; `settings` tell what it then says of itself.
+    Autofocus, which would move the intrinsics, is switched off. Exposure that is not wished stays
+    as the camera has it, which is automatic for most.
 
     Args:
         source: The camera's index, the path of its device, a URL, or a video file.
-        wishes: What is asked of it. Focus and exposure that are not wished are held as they are.
+        wishes: What is asked of it.
 
     Raises:
         DriverError: It cannot be opened or gives no picture, or refuses the resolution.
@@ -162,7 +164,7 @@ class UvcCamera:
 
 
 def _set(capture: cv2.VideoCapture, wishes: DeviceWishes) -> dict[str, str | float]:
-    """Sets what is wished, stops what would change by itself, and asks what came of it."""
+    """Sets what is wished, stops the focus from moving by itself, and asks what came of it."""
     if wishes.resolution is not None:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, wishes.resolution[0])
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wishes.resolution[1])
