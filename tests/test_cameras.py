@@ -166,3 +166,16 @@ def test_a_camera_that_hangs_is_told_in_time(monkeypatch):
     camera = a_camera_with(Hanging(is_stamped=False), monkeypatch)
     with pytest.raises(DriverError, match="unplugged"):
         camera.frame(timeout_s=0.05)
+    # Nobody touches it again while its driver hangs.
+    with pytest.raises(DriverError, match="unplugged"):
+        camera.frame(timeout_s=10.0)
+    camera.close()
+
+
+def test_a_stream_that_nobody_serves_is_told_in_seconds(capfd):
+    began = time.monotonic()
+    with pytest.raises(DriverError, match="cannot be opened"):
+        UvcCamera("rtsp://127.0.0.1:9/none")
+    # Refused at once here; a lost host takes its 5 s, where OpenCV would wait for 30.
+    assert time.monotonic() - began < 25.0
+    capfd.readouterr()

@@ -18,7 +18,9 @@ from visioncal.types import Camera, Image
 _WAITED_S = 0.008
 # Some cameras take their time for the first picture [s].
 _OPENING_S = 5.0
-# V4L2's and DirectShow's word for exposure that the user sets.
+# How long a stream may take to open, and for a picture [ms].
+_OPEN_MS, _READ_MS = 5000, 1500
+# V4L2's word for exposure that the user sets, and its unit [s].
 _MANUAL_EXPOSURE = 1.0
 _EXPOSURE_UNIT_S = 1e-4
 
@@ -40,7 +42,8 @@ class UvcCamera:
 
     def __init__(self, source: int | str, wishes: DeviceWishes | None = None) -> None:
         self._source = source
-        self._capture = cv2.VideoCapture(source)
+        self._capture = _opened(source)
+        self._is_lost = False
         if not self._capture.isOpened():
             self._capture.release()
             raise DriverError(
@@ -111,7 +114,9 @@ class UvcCamera:
 
     def close(self) -> None:
         """Lets go of it; may be called twice."""
-        self._capture.release()
+        # What hangs in its driver holds it until this process ends.
+        if not self._is_lost:
+            self._capture.release()
 
     def _told_stamp(self, now: float) -> float | None:
         """When a picture had come, by the clock of the kernel; only Linux' V4L2 tells it."""
@@ -123,6 +128,8 @@ class UvcCamera:
 
         In a thread: the driver of a camera that is lost may hang for long.
         """
+        if self._is_lost:
+            raise self._gone()
         answers: Queue[tuple[bool, float]] = Queue()
 
         def grab() -> None:
@@ -134,6 +141,7 @@ class UvcCamera:
         try:
             is_there, took_s = answers.get(timeout=max(timeout_s, 0.0))
         except Empty:
+            self._is_lost = True
             raise self._gone() from None
         if not is_there:
             raise self._gone()
@@ -161,6 +169,14 @@ class UvcCamera:
             culprits=[str(self._source)],
             next_step="Ask for a resolution that it has (on Linux: v4l2-ctl --list-formats-ext).",
         )
+
+
+def _opened(source: int | str) -> cv2.VideoCapture:
+    if isinstance(source, int) or "://" not in source:
+        return cv2.VideoCapture(source)
+    # Of itself it waits for half a minute.
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+    return cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
 
 
 def _set(capture: cv2.VideoCapture, wishes: DeviceWishes) -> dict[str, str | float]:
