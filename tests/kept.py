@@ -17,7 +17,7 @@ from visioncal.calibration import (
     ViewResult,
 )
 from visioncal.evidence import ViewEvidence
-from visioncal.session import MemoryImages, Session, View
+from visioncal.session import MemoryImages, Session, Stream, View
 from visioncal.types import Corners
 
 KEPT = Path(__file__).with_name("data")
@@ -37,6 +37,10 @@ def assert_same(one: Session, other: Session) -> None:
             assert other.images.exists(a.image) == one.images.exists(a.image)
         if a.image and one.images.exists(a.image):
             assert other.images.read(a.image) == one.images.read(a.image)
+    assert list(other.streams) == list(one.streams)
+    for name, stream in one.streams.items():
+        assert other.streams[name].columns == stream.columns
+        np.testing.assert_array_equal(other.streams[name].values, stream.values)
     assert other.digest() == one.digest()
 
 
@@ -86,6 +90,12 @@ def kept_session() -> Session:
     return Session.assemble(
         document, columns, rows, MemoryImages(images), target_document=board, robot_document=arm
     )
+
+
+def kept_streams() -> dict[str, Stream]:
+    """What the newest of the kept recordings holds besides."""
+    samples = np.array([[0.0, 0.1, 20.5], [1e-3, -0.0, np.nan], [2e-3, 1e300, -5e-324]])
+    return {"robot": Stream(("stamp_s", "q1_rad", "temp1_c"), samples)}
 
 
 def kept_calibration() -> Calibration:

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from kept import KEPT, assert_same, kept_session
+from kept import KEPT, assert_same, kept_session, kept_streams
 from rerun.chunk import OptimizationProfile, RrdReader
 from samples import Sample, made_up
 
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence, magnification
 from visioncal.recording import codec, notes, paths, read_session, write_recording
-from visioncal.session import MemoryImages, Session
+from visioncal.session import MemoryImages, Session, Stream
 from visioncal.types import Corners
 from visioncal.viewer import blueprint
 
@@ -91,11 +91,12 @@ def test_odd_facts_survive(tmp_path: Path) -> None:
     assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_recordings_of_all_formats_open(version: int) -> None:
+@pytest.mark.parametrize(("version", "streams"), [(1, {}), (2, {}), (3, kept_streams())])
+def test_recordings_of_all_formats_open(version: int, streams: dict[str, Stream]) -> None:
+    kept = kept_session().with_streams(streams)
     again = read_session(KEPT / f"recording_format_{version}.rrd")
-    assert_same(kept_session(), again)
-    assert again.warnings == kept_session().warnings
+    assert_same(kept, again)
+    assert again.warnings == kept.warnings
 
 
 def test_newer_format_names_the_version_that_it_needs(

@@ -449,12 +449,6 @@ def test_millimetres_and_degrees_are_noticed(folder: Path) -> None:
     assert "It looks like degrees" in wide
 
 
-def test_streams_that_are_not_read_are_mentioned(folder: Path) -> None:
-    (folder / "streams").mkdir()
-    (folder / "streams" / "robot.csv").write_text("stamp_s\n1\n")
-    assert "streams/robot.csv is not read" in Session.load(folder).warnings[0]
-
-
 @pytest.mark.parametrize("extra", ["point", "meas_x_m,meas_y_m,meas_z_m"])
 def test_touches_and_readings_need_no_image(folder: Path, extra: str) -> None:
     cells = "tip" if extra == "point" else "1,2,3"

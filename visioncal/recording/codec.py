@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import rerun as rr
 import tomli_w
@@ -20,17 +21,18 @@ import tomli_w
 from visioncal.errors import DataError
 from visioncal.files import sha256
 from visioncal.recording import paths
-from visioncal.session import Session, View
+from visioncal.session import Session, Stream, View
 from visioncal.session.columns import is_number
 from visioncal.version import __version__
 
-# 2: the writer's version, a mark behind the last view, and seals on the results.
-FORMAT = 2
+# 2: the writer's version, a mark behind the last view, and seals on the results; 3: streams.
+FORMAT = 3
 # In place of the number of views where that was not known from the start.
 UNKNOWN = -1
 
 _BLOB = "EncodedImage:blob"
 _HEADER, _ROW, _END = "visioncal.Session", "visioncal.Row", "visioncal.End"
+_STREAM = "visioncal.Stream"
 _MEDIA_TYPES = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
@@ -51,6 +53,7 @@ class Header:
         session_toml: The content of session.toml.
         target_json: The content of the target's file.
         robot_json: The robot's model.
+        streams: The names of the streams, and as many seals of them behind.
     """
 
     rows: int
@@ -59,6 +62,7 @@ class Header:
     session_toml: str
     target_json: str
     robot_json: str
+    streams: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, session: Session, announced: int) -> "Header":
@@ -70,11 +74,20 @@ class Header:
             tomli_w.dumps(session.document),
             _to_json(session.target_document),
             _to_json(session.robot_document),
+            (*session.streams, *map(stream_seal, session.streams.values())),
         )
 
     def seal(self) -> str:
         """SHA-256 of the content."""
-        return sha256(json.dumps(list(vars(self).values())).encode())
+        content = list(vars(self).values())
+        # Before the third format there were no streams.
+        return sha256(json.dumps(content if self.streams else content[:-1]).encode())
+
+    @property
+    def stream_seals(self) -> dict[str, str]:
+        """The seals of the streams by their names."""
+        count = len(self.streams) // 2
+        return dict(zip(self.streams[:count], self.streams[count:], strict=True))
 
     def cells(self, row: "Row") -> list[str]:
         """Writes a row as texts in the order of the columns, as `View.cell` does."""
@@ -129,6 +142,7 @@ def log_header(stream: rr.RecordingStream, header: Header) -> None:
         "session_toml": pa.array([header.session_toml], pa.string()),
         "target_json": pa.array([header.target_json], pa.string()),
         "robot_json": pa.array([header.robot_json], pa.string()),
+        "streams": pa.array(header.streams, pa.string()),
         "seal": pa.array([header.seal()], pa.string()),
     }
     stream.log(paths.SESSION, rr.DynamicArchetype(_HEADER, components=components), static=True)
@@ -153,6 +167,21 @@ def log_image(stream: rr.RecordingStream, name: str, image: bytes | None) -> Non
     else:
         media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix.lower())
         stream.log(paths.IMAGE, rr.EncodedImage(contents=image, media_type=media_type))
+
+
+def stream_seal(stream: Stream) -> str:
+    """SHA-256 of a stream's columns and numbers."""
+    return sha256(json.dumps(stream.fact()).encode())
+
+
+def log_samples(recording: rr.RecordingStream, name: str, samples: Stream) -> None:
+    """Logs a stream of the session at the recording's current time."""
+    components = {
+        "name": pa.array([name], pa.string()),
+        "columns": pa.array(samples.columns, pa.string()),
+        "values": pa.array(samples.values.ravel(), pa.float64()),
+    }
+    recording.log(paths.STREAMS, rr.DynamicArchetype(_STREAM, components=components))
 
 
 def log_end(stream: rr.RecordingStream, rows: int) -> None:
@@ -189,6 +218,7 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
         values["session_toml"][0],
         values["target_json"][0],
         values["robot_json"][0],
+        tuple(values.get("streams") or ()),
     )
     if header.seal() != values["seal"][0]:
         raise ValueError("the session's declaration was changed or damaged after it was written")
@@ -207,6 +237,20 @@ def read_rows(batch: pa.RecordBatch) -> dict[int, Row]:
         if row.seal() == seal[0]:
             rows[index] = row
     return rows
+
+
+def read_samples(batch: pa.RecordBatch) -> dict[str, Stream]:
+    """Reads streams by their names."""
+    streams = {}
+    for place in range(batch.num_rows):
+        name, columns = (
+            batch.column(f"{_STREAM}:{it}")[place].as_py() for it in ("name", "columns")
+        )
+        cells = batch.column(f"{_STREAM}:values")[place].values.to_numpy(zero_copy_only=False)
+        values = np.array(cells, dtype=float).reshape(-1, len(columns))
+        values.setflags(write=False)
+        streams[name[0]] = Stream(tuple(columns), values)
+    return streams
 
 
 def image_places(batch: pa.RecordBatch) -> dict[int, int]:

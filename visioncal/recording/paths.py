@@ -10,6 +10,7 @@ APPLICATION = "visioncal"
 # The facts of the session, to be read back.
 SESSION = "/session"
 ROWS = "/session/rows"
+STREAMS = "/session/streams"
 END = "/session/end"
 IMAGE = "/camera/image"
 

@@ -12,7 +12,7 @@ from visioncal.files import parse_toml, sha256
 from visioncal.recording import codec, paths
 from visioncal.recording.frames import CHUNK, Frame, Scan, read_payload, scan
 from visioncal.recording.messages import record_batch
-from visioncal.session import Session
+from visioncal.session import Session, Stream
 
 _AGAIN = "Take the recording again from its origin, or calibrate the session's folder."
 _SHOWN_ROWS = 10
@@ -46,7 +46,7 @@ def read_session(path: Path) -> Session:
         RecordedImages(path, records.images_by_name(complete)),
         target_document=codec.from_json(records.header.target_json),
         robot_document=codec.from_json(records.header.robot_json),
-    )
+    ).with_streams(_whole_streams(path, records))
     return replace(session, warnings=(*session.warnings, *_losses(scanned, records, len(complete))))
 
 
@@ -108,6 +108,7 @@ class _Records:
         header: What holds for all rows.
         rows: The rows, by their places in the session.
         images: The images, by the places of their rows.
+        streams: What was read many times a second, by name.
         closed: How many rows there are by the mark behind the last one; None without the mark.
         damaged: How many chunks could not be read.
     """
@@ -115,6 +116,7 @@ class _Records:
     header: codec.Header
     rows: Mapping[int, codec.Row]
     images: Mapping[int, _Image]
+    streams: Mapping[str, Stream]
     closed: int | None
     damaged: int
 
@@ -162,13 +164,16 @@ def _read_records(scanned: Scan) -> _Records:
     found: tuple[int, codec.Header] | None = None
     rows: dict[int, codec.Row] = {}
     images: dict[int, _Image] = {}
+    streams: dict[str, Stream] = {}
     damaged: list[Frame] = []
     closed: int | None = None
-    entities = (paths.SESSION, paths.ROWS, paths.IMAGE, paths.END)
+    entities = (paths.SESSION, paths.STREAMS, paths.ROWS, paths.IMAGE, paths.END)
     for frame, entity, batch in chunks(scanned, entities, damaged):
         try:
             if entity == paths.SESSION:
                 found = codec.read_header(batch, scanned.path)
+            elif entity == paths.STREAMS:
+                streams |= codec.read_samples(batch)
             elif entity == paths.ROWS:
                 # Of two rows at one place, the later one was damaged into being there.
                 rows = codec.read_rows(batch) | rows
@@ -184,7 +189,7 @@ def _read_records(scanned: Scan) -> _Records:
     if version == 1 and scanned.finished:
         # The first format had no mark of its own.
         closed = header.rows
-    return _Records(header, rows, images, closed, len(damaged))
+    return _Records(header, rows, images, streams, closed, len(damaged))
 
 
 def _images(frame: Frame, batch: pa.RecordBatch) -> dict[int, _Image]:
@@ -203,6 +208,28 @@ def _no_header(scanned: Scan, damaged: Sequence[Frame]) -> DataError:
     else:
         what = "was cut off before the session's declaration was complete: no view is in it"
     return DataError(f"{scanned.path} {what}.", culprits=[str(scanned.path)], next_step=next_step)
+
+
+def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
+    """The streams that were written, in the order of the header.
+
+    Raises:
+        DataError: Streams were damaged; it names them.
+    """
+    found, seals = records.streams, records.header.stream_seals
+    damaged = [
+        name
+        for name, seal in seals.items()
+        if name not in found or codec.stream_seal(found[name]) != seal
+    ]
+    if damaged:
+        raise DataError(
+            f"{path} is damaged: the stream {', '.join(damaged)} cannot be read or was changed "
+            "after it was written.",
+            culprits=damaged,
+            next_step=_AGAIN,
+        )
+    return {name: found[name] for name in seals}
 
 
 def _complete_rows(path: Path, records: _Records) -> list[int]:

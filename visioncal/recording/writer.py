@@ -60,6 +60,9 @@ class RecordingWriter:
             self._recorder.stream.send_recording_name(session.name)
             header = codec.Header.of(session, codec.UNKNOWN if announced is None else announced)
             codec.log_header(self._recorder.stream, header)
+            for place, (name, samples) in enumerate(session.streams.items()):
+                self._recorder.at(place)
+                codec.log_samples(self._recorder.stream, name, samples)
             self._recorder.keep()
             self._recorder.lay_out(blueprint)
 

@@ -1,7 +1,6 @@
 """What a session's parts say about each other: contradictions, and what looks like a mistake."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -58,9 +57,3 @@ def view_warnings(views: Sequence[View]) -> Iterator[str]:
         key = (view.image, view.text.get("target", ""))
         if view.image and first.setdefault(key, view.number) != view.number:
             yield f"views.csv: views {first[key]} and {view.number} share {view.image}."
-
-
-def stream_warnings(folder: Path) -> Iterator[str]:
-    """Words what of a session's folder is left alone."""
-    for path in sorted(folder.glob("streams/*.csv")):
-        yield f"streams/{path.name} is not read by this version, nor copied with the session."

@@ -7,6 +7,7 @@ from datetime import date, time
 from visioncal.files import sha256
 from visioncal.robot import BODY_KEYS, ROBOT_SUFFIXES
 from visioncal.session.images import ImageStore
+from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
 
@@ -17,6 +18,7 @@ def digest_facts(
     columns: Sequence[str],
     views: Sequence[View],
     images: ImageStore,
+    streams: Mapping[str, Stream],
 ) -> str:
     """Computes the SHA-256 digest of a session's canonical content.
 
@@ -25,7 +27,7 @@ def digest_facts(
     the robot's links are is no fact of what was recorded.
     """
     paths = sorted({view.image for view in views if view.image and images.exists(view.image)})
-    facts = {
+    facts: dict[str, object] = {
         "document": _without_paths(document),
         "target": target_document,
         "robot": None if robot_document is None else _without_bodies(robot_document),
@@ -33,6 +35,8 @@ def digest_facts(
         "rows": [[_fact(view, column) for column in columns] for view in views],
         "images": {path: sha256(images.read(path)) for path in paths},
     }
+    if streams:
+        facts["streams"] = {name: stream.fact() for name, stream in streams.items()}
     return sha256(json.dumps(_canonical(facts), sort_keys=True).encode())
 
 

@@ -16,10 +16,18 @@ from visioncal.files import parse_toml, read_text, write_atomically
 from visioncal.robot import read_robot_document, robot_file
 from visioncal.session import columns as known
 from visioncal.session.boards import COLUMN, check_targets_named, read_targets, target_warnings
-from visioncal.session.checks import check_images_can_be_used, stream_warnings, view_warnings
+from visioncal.session.checks import check_images_can_be_used, view_warnings
 from visioncal.session.digest import digest_facts, is_file
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.images import FolderImages, ImageStore, inside_path
+from visioncal.session.streams import (
+    FOLDER,
+    Stream,
+    check_stream,
+    gap_warnings,
+    read_streams,
+    write_stream,
+)
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.types import Camera, CameraKind, Mount, Target
 
@@ -39,6 +47,7 @@ class Session:
         robot_document: The robot's model as `Robot.from_document` reads it; None where the session
             names no robot or one that is unknown, which a warning says.
         targets: Several printed targets by name, in the session's order; empty for one or none.
+        streams: What was read many times a second beside the views, by name.
     """
 
     document: Mapping[str, Any]
@@ -50,6 +59,7 @@ class Session:
     warnings: tuple[str, ...] = ()
     robot_document: Mapping[str, Any] | None = None
     targets: Mapping[str, Target] = field(default_factory=dict)
+    streams: Mapping[str, Stream] = field(default_factory=dict)
 
     @classmethod
     def load(
@@ -88,7 +98,7 @@ class Session:
             folder=path,
             target_document=target_document,
         )
-        return replace(session, warnings=(*session.warnings, *stream_warnings(path)))
+        return session.with_streams(read_streams(path))
 
     @classmethod
     def assemble(
@@ -124,6 +134,17 @@ class Session:
             target_document=target_document,
             robot_document=robot_document,
         )
+
+    def with_streams(self, streams: Mapping[str, Stream]) -> "Session":
+        """Returns the session with streams beside its views, in the order of their names.
+
+        Raises:
+            DataError: A stream is wrong; see `check_stream`.
+        """
+        for name, stream in streams.items():
+            check_stream(name, stream)
+        ordered = dict(sorted(streams.items()))
+        return replace(self, streams=ordered, warnings=(*self.warnings, *gap_warnings(ordered)))
 
     def save(self, folder: Path | str) -> None:
         """Writes the session as a folder that needs no other file; whole or not at all.
@@ -169,6 +190,7 @@ class Session:
             self.columns,
             self.views,
             self.images,
+            self.streams,
         )
 
     @cached_property
@@ -265,6 +287,7 @@ class Session:
             texts[model] = content
         texts["session.toml"] = tomli_w.dumps(document)
         texts["views.csv"] = write_csv(self.columns, self.views)
+        texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
         for path in self._image_paths():
             if self.images.exists(path):
                 _write_below(folder, path, self.images.read(path))

@@ -1,0 +1,250 @@
+"""streams/NAME.csv: what was read many times a second, beside the views."""
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from visioncal.errors import DataError
+from visioncal.files import read_text, sha256, some_of
+from visioncal.session import columns as known
+from visioncal.types import FloatArray, IntArray, Mask
+
+FOLDER, STAMP = "streams", "stamp_s"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+# Rounding to four digits leaves a unit quaternion's norm within this of 1, as in views.csv.
+_NORM_TOLERANCE = 1e-3
+# Samples farther apart than so many times the usual, and than so much [s], have others missing
+# between them.
+_GAP_RATIO, _GAP_S = 2.5, 0.02
+_SHOWN_PROBLEMS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """The rows of one stream, with their numbers as they were read.
+
+    Attributes:
+        columns: Their names; `stamp_s` is one of them.
+        values: (n, c) their numbers, in their columns' units; NaN where a cell is empty.
+    """
+
+    columns: tuple[str, ...]
+    values: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __contains__(self, column: object) -> bool:
+        return column in self.columns
+
+    def __getitem__(self, column: str) -> FloatArray:
+        """(n,) the numbers of a column; NaN where a cell is empty."""
+        return np.asarray(self.values[:, self.columns.index(column)])
+
+    @property
+    def stamps_s(self) -> FloatArray:
+        """(n,) the times [s], ascending."""
+        return self[STAMP]
+
+    def group(self, columns: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Takes the rows in which some columns are filled: (m,) times [s] and (m, k) numbers."""
+        if not columns or any(name not in self for name in columns):
+            return np.zeros(0), np.zeros((0, len(columns)))
+        numbers = np.stack([self[name] for name in columns], axis=1)
+        there = np.isfinite(numbers).all(axis=1)
+        return self.stamps_s[there], numbers[there]
+
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """The poses that the controller reported: (m,) times [s] and (m, 4, 4) [m]."""
+        stamps_s, numbers = self.group(known.POSE)
+        if not len(numbers):
+            return stamps_s, np.zeros((0, 4, 4))
+        rotations = Rotation.from_quat(numbers[:, 3:])
+        poses = RigidTransform.from_components(numbers[:, :3], rotations)
+        return stamps_s, np.asarray(poses.as_matrix())
+
+    def joints(self) -> tuple[FloatArray, FloatArray]:
+        """The joint angles: (m,) times [s] and (m, n) [rad]."""
+        return self.group(known.joint_columns(self.columns))
+
+    def gaps(self) -> IntArray:
+        """The rows behind which samples are missing, by how far apart the others are."""
+        steps = np.diff(self.stamps_s)
+        if not len(steps):
+            return np.zeros(0, dtype=np.int64)
+        return np.flatnonzero(steps > max(_GAP_RATIO * float(np.median(steps)), _GAP_S))
+
+    def fact(self) -> dict[str, object]:
+        """What of it counts for the session's digest, free of how the numbers are spelt."""
+        # Adding zero turns -0.0 into 0.0; every NaN gets the same bits.
+        values = np.where(np.isnan(self.values), np.nan, self.values + 0.0)
+        data = np.ascontiguousarray(values, dtype="<f8").tobytes()
+        return {"columns": self.columns, "rows": len(self), "values": sha256(data)}
+
+
+def read_streams(folder: Path) -> dict[str, Stream]:
+    """Reads the streams of a session's folder, by name.
+
+    Raises:
+        DataError: A cell is no number; it is named.
+    """
+    paths = sorted((folder / FOLDER).glob("*.csv"))
+    return {path.stem: parse_stream(read_text(path), f"{FOLDER}/{path.name}") for path in paths}
+
+
+def parse_stream(text: str, label: str) -> Stream:
+    """Reads the text of a stream.
+
+    Args:
+        text: A header row, and a row of numbers a sample.
+        label: The file's name, for messages.
+
+    Raises:
+        DataError: A cell is no number; it is named.
+    """
+    head, _, body = text.partition("\n")
+    columns = tuple(name.strip() for name in next(csv.reader([head]), []))
+    values = _plain_numbers(body, len(columns))
+    if values is None:
+        values = _numbers(body, columns, label)
+    values.setflags(write=False)
+    return Stream(columns, values)
+
+
+def _plain_numbers(body: str, count: int) -> FloatArray | None:
+    """Reads rows without empty cells, fast; None for what has to be looked at cell by cell."""
+    if not body.strip():
+        return None
+    try:
+        values = np.loadtxt(io.StringIO(body), delimiter=",", ndmin=2, comments=None)
+    except ValueError:
+        return None
+    return values if values.shape[1] == count and np.isfinite(values).all() else None
+
+
+def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
+    """Reads rows cell by cell, and names those that are wrong."""
+    rows: list[list[float]] = []
+    problems: list[str] = []
+    reader = csv.reader(io.StringIO(body))
+    for cells in reader:
+        place = f"{label}, line {reader.line_num + 1}"
+        if not any(cell.strip() for cell in cells):
+            continue
+        if len(cells) != len(columns):
+            problems.append(
+                f"{place}: it has {len(cells)} fields, but the header has {len(columns)} columns"
+            )
+            continue
+        rows.append([_number(cell.strip()) for cell in cells])
+        problems += [
+            f"{place}, column {name}: {cell.strip()!r} is no finite number"
+            for name, cell, value in zip(columns, cells, rows[-1], strict=True)
+            if cell.strip() and not np.isfinite(value)
+        ]
+        if len(problems) >= _SHOWN_PROBLEMS:
+            break
+    if problems:
+        raise DataError(
+            ".\n".join(problems) + ".",
+            culprits=[it.partition(": ")[0] for it in problems],
+            next_step="A stream holds numbers alone; leave other columns out.",
+        )
+    return np.array(rows, dtype=float).reshape(len(rows), len(columns))
+
+
+def _number(cell: str) -> float:
+    return float(cell) if _NUMBER.fullmatch(cell) else np.nan
+
+
+def write_stream(stream: Stream) -> str:
+    """Writes a stream so that reading it gives the same numbers again."""
+    rows = (",".join("" if it != it else repr(it) for it in row) for row in stream.values.tolist())
+    return "\n".join([",".join(stream.columns), *rows]) + "\n"
+
+
+def check_stream(name: str, stream: Stream) -> None:
+    """Checks what a stream's columns say.
+
+    Raises:
+        DataError: Its name is none, columns are missing or there twice, it has no rows, times are
+            missing or do not ascend, a pose is filled in part, or a quaternion is none.
+    """
+    label = f"{FOLDER}/{name}.csv"
+    if not _NAME.fullmatch(name):
+        raise DataError(
+            f"{label}: a stream's name has letters, digits, - and _ only.", culprits=[label]
+        )
+    # A stream needs no `view`, and may have it.
+    header = stream.columns if "view" in stream else ("view", *stream.columns)
+    known.check_header(header, f"{label}, header")
+    if STAMP not in stream:
+        raise DataError(
+            f"{label}, header: the column {STAMP}, the time of each row, is missing.",
+            culprits=[label],
+        )
+    if not len(stream):
+        raise DataError(f"{label} has a header row and no samples.", culprits=[label])
+    _check_times(stream, label)
+    for group in (*known.WHOLE_GROUPS, known.joint_columns(stream.columns)):
+        _check_whole(stream, group, label)
+    for group in known.QUATERNION_GROUPS:
+        rows = np.flatnonzero(_are_no_quaternions(stream, group))
+        if len(rows):
+            raise _wrong_rows(label, rows, f"{group[0]} ... {group[-1]} is no unit quaternion")
+
+
+def _check_times(stream: Stream, label: str) -> None:
+    stamps_s = stream.stamps_s
+    missing = np.flatnonzero(~np.isfinite(stamps_s))
+    if len(missing):
+        raise _wrong_rows(label, missing, f"{STAMP} is empty")
+    falls = np.flatnonzero(np.diff(stamps_s) <= 0) + 1
+    if len(falls):
+        raise _wrong_rows(label, falls, f"{STAMP} does not ascend from the row before")
+
+
+def _check_whole(stream: Stream, group: Sequence[str], label: str) -> None:
+    if not group or group[0] not in stream:
+        return
+    there = np.isfinite(np.stack([stream[name] for name in group], axis=1))
+    rows = np.flatnonzero(there.any(axis=1) & ~there.all(axis=1))
+    if len(rows):
+        raise _wrong_rows(label, rows, f"{group[0]} ... {group[-1]} are filled in part")
+
+
+def _are_no_quaternions(stream: Stream, group: Sequence[str]) -> Mask:
+    if group[0] not in stream:
+        return np.zeros(len(stream), dtype=bool)
+    norms = np.linalg.norm(np.stack([stream[name] for name in group], axis=1), axis=1)
+    return np.asarray(np.abs(norms - 1.0) > _NORM_TOLERANCE)
+
+
+def _wrong_rows(label: str, rows: IntArray, words: str) -> DataError:
+    named = [f"sample {row + 1}" for row in rows[:_SHOWN_PROBLEMS].tolist()]
+    return DataError(
+        f"{label}: {words} in {some_of(named, 3)}{', ...' if len(rows) > len(named) else ''}.",
+        culprits=[f"{label}, {it}" for it in named],
+    )
+
+
+def gap_warnings(streams: Mapping[str, Stream]) -> Iterator[str]:
+    """Words where samples of streams are missing."""
+    for name, stream in streams.items():
+        behind, stamps_s = stream.gaps(), stream.stamps_s
+        if len(behind):
+            steps = np.diff(stamps_s)
+            worst = int(behind[np.argmax(steps[behind])])
+            yield (
+                f"{FOLDER}/{name}.csv: samples are missing in {len(behind)} "
+                f"place{'s' if len(behind) > 1 else ''}; the widest gap is {steps[worst]:.3g} s, "
+                f"{stamps_s[worst] - stamps_s[0]:.6g} s from the start, where samples are usually "
+                f"{np.median(steps):.3g} s apart. Nothing is interpolated across them."
+            )
