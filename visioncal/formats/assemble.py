@@ -15,11 +15,11 @@ from visioncal.errors import DataError
 from visioncal.files import some_of
 from visioncal.finders.imaging import decode_image, looks_like_image
 from visioncal.formats.boards import described_target, target_name
-from visioncal.formats.foreign import Foreign, rows_of
+from visioncal.formats.foreign import Foreign, Sweep, rows_of
 from visioncal.formats.intrinsics import read_intrinsics
 from visioncal.formats.wishes import Wishes
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
-from visioncal.session import MemoryImages, Session
+from visioncal.session import MemoryImages, Session, Stream
 from visioncal.session import columns as known
 from visioncal.types import Mount
 
@@ -94,7 +94,7 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
             culprits=["mount"],
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
-    foreign = spoken(foreign)
+    foreign = spoken(foreign if foreign.sweep is None else _swept(foreign, foreign.sweep))
     rows = _written(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
     files = {path: file for row in rows for path, file in row.image.items()}
@@ -106,8 +106,6 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
-    if foreign.camera_minus_robot_s:
-        document["clock"] = {"camera_minus_robot_s": foreign.camera_minus_robot_s}
     columns = list(dict.fromkeys(name for row in rows for name in row.cells))
     cells = [[row.cells.get(name, "") for name in columns] for row in rows]
     session = Session.assemble(
@@ -118,12 +116,32 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
         target_document=target,
         robot_document=robot,
     )
-    if foreign.joints_rad is None and not foreign.robot.there.all():
+    if foreign.sweep is not None:
+        session = session.with_streams({"robot": _stream(foreign.sweep)})
+    elif foreign.joints_rad is None and not foreign.robot.there.all():
         absent = [foreign.robot.places[it] for it in np.flatnonzero(~foreign.robot.there)]
         notes.append(
             f"{len(absent)} of {len(rows)} rows have no pose of the robot: {some_of(absent)}."
         )
     return replace(session, warnings=(*notes, *session.warnings))
+
+
+def _swept(foreign: Foreign, sweep: Sweep) -> Foreign:
+    """All that the camera saw, without the robot's poses: those stay in a stream of their own."""
+    return replace(
+        foreign,
+        robot=PoseNumbers.nowhere(sweep.camera.places),
+        camera=sweep.camera,
+        stamps_s=sweep.camera_s,
+    )
+
+
+def _stream(sweep: Sweep) -> Stream:
+    rows = pose_cells(sweep.robot, known.POSE)
+    numbers = np.array([[float(row[name]) for name in known.POSE] for row in rows])
+    values = np.hstack([sweep.robot_s[:, None], numbers])
+    values.setflags(write=False)
+    return Stream(("stamp_s", *known.POSE), values)
 
 
 def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:

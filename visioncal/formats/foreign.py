@@ -10,6 +10,23 @@ from visioncal.types import FloatArray, IntArray, Mount
 
 
 @dataclass(frozen=True, eq=False)
+class Sweep:
+    """Two streams of one motion, each with a clock of its own.
+
+    Attributes:
+        robot_s: (n,) times [s], ascending.
+        robot: (n,) `base_from_flange`.
+        camera_s: (k,) times [s], ascending.
+        camera: (k,) `cam_from_target`.
+    """
+
+    robot_s: FloatArray
+    robot: PoseNumbers
+    camera_s: FloatArray
+    camera: PoseNumbers
+
+
+@dataclass(frozen=True, eq=False)
 class Foreign:
     """A recording in somebody else's form: n rows, each what was seen from one pose.
 
@@ -26,7 +43,7 @@ class Foreign:
         lens: The fields of `[camera]` in session.toml, where the source has intrinsics.
         arm: The fields of `[robot]` in session.toml, where the user names one.
         views: (n,) the rows' numbers in the source; 0, 1, ... where empty.
-        camera_minus_robot_s: What the camera's stamps are ahead of the robot's [s]; None where the
+        sweep: Two streams with clocks of their own, of which the rows are a sample; None where the
             source has one clock.
         columns: Further columns of views.csv with their (n,) cells.
         notes: What was assumed or left aside, in sentences for the user.
@@ -43,7 +60,7 @@ class Foreign:
     lens: Mapping[str, Any] | None = None
     arm: Mapping[str, Any] | None = None
     views: tuple[int, ...] = ()
-    camera_minus_robot_s: float | None = None
+    sweep: Sweep | None = None
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.conventions import PoseNumbers
 from visioncal.errors import DataError
 from visioncal.formats.fields import Fields, stamp_name, unnamed_columns
-from visioncal.formats.foreign import Foreign
+from visioncal.formats.foreign import Foreign, Sweep
 from visioncal.formats.poses import CAMERA_KEYS, ROBOT_KEYS, pose_names, poses_from
 from visioncal.formats.streams import pair_streams, seconds
 from visioncal.formats.wishes import PoseWishes, Wishes
@@ -72,22 +72,24 @@ def _by_time(
     camera: tuple[FloatArray, PoseNumbers],
     notes: tuple[str, ...],
 ) -> Foreign:
-    robot_s, robot_poses, _ = _known(*robot)
+    robot_s, robot_poses, robot_rows = _known(*robot)
     camera_s, camera_poses, camera_rows = _known(*camera)
     paired = pair_streams(robot_s, robot_poses, camera_s, camera_poses)
-    seen = camera[1].rows(camera_rows[paired.rows])
+    seen = camera[1].rows(camera_rows)
+    sampled = seen.rows(paired.rows)
     return Foreign(
         name=name,
-        robot=PoseNumbers.of_poses(paired.base_from_flange, seen.places),
-        camera=seen,
+        robot=PoseNumbers.of_poses(paired.base_from_flange, sampled.places),
+        camera=sampled,
         stamps_s=camera_s[paired.rows],
-        camera_minus_robot_s=paired.camera_minus_robot_s,
+        sweep=Sweep(robot_s, robot[1].rows(robot_rows), camera_s, seen),
         notes=(
             *notes,
-            f"The camera's clock is {paired.camera_minus_robot_s:+.4f} s ahead of the robot's, as "
-            f"both angular speeds agree there with a correlation of {paired.correlation:.2f}.",
-            f"{len(seen)} of {len(camera_s)} samples are taken, at moments when the robot turns by "
-            f"less than {np.rad2deg(paired.slow):.1f} deg/s; its poses are interpolated.",
+            f"The camera's clock is about {1e3 * paired.match.offset_s:+.0f} ms ahead of the "
+            "robot's, as both turn alike there with a correlation of "
+            f"{paired.match.correlation:.2f}; calibrate tells it finer.",
+            f"All {len(seen)} samples of the camera are kept as views, and the robot's as a stream "
+            "beside them: calibrate takes the robot's poses from there.",
         ),
     )
 

@@ -66,9 +66,13 @@ def reread(foreign: Foreign, candidate: Candidate) -> Foreign:
         if _go_together(chain, robot):
             order = taken.rows(len(joints))
             joints = np.where((order >= 0)[:, None], joints[order], np.nan)
-    target = foreign.target
+    target, sweep = foreign.target, foreign.sweep
+    if sweep is not None:
+        corrected = taken.robot.corrected(sweep.robot), taken.camera.corrected(sweep.camera)
+        sweep = replace(sweep, robot=corrected[0], camera=corrected[1])
     return replace(
         foreign,
+        sweep=sweep,
         robot=taken.robot_numbers(robot) if robot.there.any() else robot,
         camera=None if camera is None else taken.camera_numbers(camera),
         joints_rad=joints,
@@ -126,7 +130,7 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
         session.images,
         target_document=target,
         robot_document=session.robot_document,
-    )
+    ).with_streams(session.streams)
     said = dict.fromkeys((*_note(candidate), *session.warnings, *reread.warnings))
     return replace(reread, warnings=tuple(said))
 

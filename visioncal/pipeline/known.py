@@ -23,6 +23,7 @@ from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
+from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
@@ -33,6 +34,7 @@ from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, 
 
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
+SPARED = "not needed: slower views stand for it, at the same places"
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,8 @@ class Known:
         corners: What was found of the target, by view; those of several are numbered through.
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
+        clock: How the clocks of camera and robot go together; None where all poses were reported.
+        spared: The views of a long sweep that are not needed.
         readings: What an instrument read, where that is all that was observed.
         poses: The target's pose by view; several candidates until they are chosen from.
         pixel_px: Noise of a corner's coordinate [px].
@@ -91,6 +95,8 @@ class Known:
     corners: Mapping[int, Corners] = field(default_factory=dict)
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
+    clock: Clock | None = None
+    spared: frozenset[int] = frozenset()
     readings: Readings | None = None
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     pixel_px: float | None = None
@@ -252,6 +258,8 @@ class Known:
             still = np.zeros((len(poses), 6, len(self.free.columns)))
             data = replace(data, shared=self.free.shared(still))
         data = self.shown(views).brought(data)
+        if self.clock is not None and self.clock.speeds and poses:
+            data = data.with_more(self.clock.shared(views))
         if self.arm is not None and self.arm.is_estimated and poses:
             errors = replace(self.arm, basis=self.arm_basis(views))
             data = data.with_more(errors.shared(self.arm_values))

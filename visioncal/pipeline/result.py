@@ -190,6 +190,8 @@ def _edges_in_order(known: Known) -> tuple[tuple[str, ...], Placed]:
 def _further(known: Known) -> dict[str, Any]:
     """What was refined beside the edges, and where the uncertainty comes from."""
     documents: dict[str, Any] = {}
+    if known.clock is not None:
+        documents["clock"] = known.clock.document()
     if known.readings is not None:
         documents |= _instrument(known, known.readings)
     if known.free is not None and not known.session.targets:

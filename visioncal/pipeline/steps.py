@@ -21,14 +21,17 @@ from visioncal.pipeline.layout import middles, numbered_through, relaid, without
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
+from visioncal.session import Session
 from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by
+from visioncal.stages.clock import set_clock
 from visioncal.stages.detect import detect
 from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
+from visioncal.stages.motion import waits_for_clock
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
 from visioncal.stages.readings import mounted, read_instrument
@@ -60,25 +63,30 @@ class Stage:
 
 
 def _read_robot(known: Known) -> Known:
-    document = known.session.robot_document
+    session, document = known.session, known.session.robot_document
     robot = None if document is None else Robot.from_document(document)
-    reported = reported_poses(known.session, robot)
+    known = replace(known, robot=robot).noting((), (*session.warnings, *not_used(session)))
+    if len(known.held_back) == len(session.views):
+        raise all_held_back(known)
+    # Views that have a time alone get their poses once the camera's are known.
+    return known if waits_for_clock(session) else _reported(known, session)
+
+
+def _reported(known: Known, session: Session) -> Known:
+    """Takes up the robot's side of a session's views."""
+    reported = reported_poses(session, known.robot)
     matched = reported.matched
     if matched is not None and matched.misread:
         check_asked(known.level, can=False, misread=matched.misread)
     known = replace(
         known,
-        robot=robot if matched is None else matched.robot,
+        robot=known.robot if matched is None else matched.robot,
         base_from_flange=reported.base_from_flange,
         joints_rad=reported.joints_rad,
         matched=matched,
         lost_zero=None if matched is None else matched.zero,
         notes=(*known.notes, *reported.notes),
-    )
-    warnings = (*known.session.warnings, *reported.warnings, *not_used(known.session))
-    known = known.noting(reported.rejections, warnings)
-    if len(known.held_back) == len(known.session.views):
-        raise all_held_back(known)
+    ).noting(reported.rejections, reported.warnings)
     if not reported.base_from_flange:
         raise DataError(
             f"session {known.session.name!r}: no view has a pose of the robot.",
@@ -87,6 +95,21 @@ def _read_robot(known: Known) -> Known:
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
     return known
+
+
+def _clock(known: Known) -> Known:
+    """Gives views that have a time alone the robot's poses out of its stream."""
+    session = known.session
+    if not waits_for_clock(session):
+        return known
+    clocked = set_clock(session, known.poses, known.robot)
+    known = replace(
+        known,
+        clock=clocked.clock,
+        spared=clocked.spared,
+        notes=(*known.notes, *clocked.notes),
+    ).noting(clocked.rejections, clocked.warnings)
+    return _reported(known, replace(session, views=clocked.views))
 
 
 def _readings(known: Known) -> Known:
@@ -403,6 +426,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("detect", _detect),
     Stage("intrinsics", _intrinsics),
     Stage("pnp", _pnp),
+    Stage("clock", _clock),
     Stage("joints", _joints),
     Stage("choose", _choose),
     Stage("look", _look),

@@ -125,6 +125,9 @@ def _owners(
         for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
             if mask.any():
                 owners[name] = np.flatnonzero(mask)
+    behind = boards.begin + boards.unknowns
+    if data.mount != "instrument" and shared - errors > behind:
+        owners["clock"] = np.arange(behind, shared - errors)
     if arm is not None and arm.is_estimated:
         owners["arm"] = np.arange(shared - errors, shared)
     return owners

@@ -1,0 +1,232 @@
+"""Where the flange was when a view was taken, out of a stream with a clock of its own.
+
+A view that has a time and no pose of the robot gets it from the robot's stream. How far the
+camera's clock is ahead of the robot's is estimated from the motion that both have seen.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.estimator.clock import ClockFit, Frames, Match, fit_offset, turning_matches
+from visioncal.robot import Robot
+from visioncal.session import Session, View
+from visioncal.stages.motion import Motion, at_rest, is_open, motion_of, slow_and_new
+from visioncal.stages.offset import (
+    FEWEST_VIEWS,
+    LARGEST_SIGMA_S,
+    LEAST_CORRELATION,
+    Clock,
+    no_offset,
+    speed_words,
+    stated_doubts,
+    told_words,
+    why_untold,
+)
+from visioncal.stages.pnp import ViewPoses
+from visioncal.types import FloatArray, Rejection
+
+# A stated offset is taken to be known so well [s].
+_STATED_SIGMA_S = 1e-3
+_IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
+# So many views are all used; of more, slow ones.
+_MANY_VIEWS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Clocked:
+    """Views with the robot's poses at their time.
+
+    Attributes:
+        clock: The offset.
+        views: Those that have a pose now, or had one before, in the session's order.
+        rejections: Those that have none, and why.
+        spared: Those that are not needed.
+        warnings: What gives reason for doubt.
+        notes: What is good to know.
+    """
+
+    clock: Clock
+    views: tuple[View, ...]
+    rejections: tuple[Rejection, ...]
+    spared: frozenset[int]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def set_clock(session: Session, poses: Mapping[int, ViewPoses], robot: Robot | None) -> Clocked:
+    """Gives views the robot's poses at their time.
+
+    Args:
+        session: One that `waits_for_clock`.
+        poses: What the camera saw, by view.
+        robot: The session's nominal robot, where it names a known one.
+
+    Raises:
+        DataError: The stream has no poses, and no joints that the robot's model knows; or no view
+            lies within it.
+        DegenerateError: The motion does not tell the offset, it is not stated, and too few views
+            were taken at rest.
+    """
+    motion = motion_of(session, robot)
+    views = [view for view in session.views if is_open(view) and view.number in poses]
+    views.sort(key=lambda view: view.stamp_s or 0.0)
+    fitted = [view for view in views if not view.holdout]
+    stated_s = _stated_s(session)
+    frames = _frames(session, fitted, poses)
+    matches = turning_matches(motion.flange, frames)
+    sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
+    fit = None
+    if sound:
+        starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
+        fit = fit_offset(motion.flange, frames, starts)
+    if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
+        return _by_motion(session, motion, views, (fit, sound[0]), stated_s)
+    return _untold(session, motion, views, (fit, matches), stated_s)
+
+
+def _stated_s(session: Session) -> float | None:
+    """The stated offset; None where none is stated."""
+    clock = session.declaration.clock
+    return clock.camera_minus_robot_s if clock.model_fields_set else None
+
+
+def _frames(session: Session, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
+    """What the camera saw over time: of several boards one, and where it can be of clear poses."""
+    seen = [(view, poses[view.number]) for view in views]
+    boards = [it.board for _, it in seen]
+    most = max(sorted(set(boards)), key=boards.count, default=0)
+    seen = [it for it in seen if it[1].board == most]
+    clear = [it for it in seen if len(it[1].cam_from_target) == 1]
+    seen = clear if 2 * len(clear) > len(seen) else seen
+    measured = bool(seen) and all(it.corners is not None for _, it in seen)
+    return Frames(
+        "eye-in-hand" if session.mount == "eye-in-hand" else "eye-to-hand",
+        np.array([view.stamp_s for view, _ in seen], dtype=float),
+        np.array([it.cam_from_target[0] for _, it in seen]).reshape(-1, 4, 4),
+        np.array([it.covariance[0] for _, it in seen]) if measured else None,
+    )
+
+
+def _by_motion(
+    session: Session,
+    motion: Motion,
+    views: Sequence[View],
+    told: tuple[ClockFit, Match],
+    stated_s: float | None,
+) -> Clocked:
+    fit, match = told
+    clock = Clock(
+        fit.offset_s, fit.sigma_s, "motion", stated_s, fit.frames, match.correlation, speeds={}
+    )
+    words, warnings = told_words(fit, match, motion.name), list(stated_doubts(clock, views))
+    return _placed(session, motion, views, clock, warnings, [words])
+
+
+def _untold(
+    session: Session,
+    motion: Motion,
+    views: Sequence[View],
+    tried: tuple[ClockFit | None, Sequence[Match]],
+    stated_s: float | None,
+) -> Clocked:
+    """Does without an estimate: by what is stated, or with views at rest."""
+    why = why_untold(*tried)
+    offset_s = stated_s or 0.0
+    correlation = max((it.correlation for it in tried[1]), default=None)
+    stamps_s = np.array([view.stamp_s for view in views], dtype=float)
+    resting = at_rest(motion.flange, stamps_s - offset_s)
+    clock = Clock(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
+    if resting.all() and len(views):
+        note = (
+            f"The clocks of camera and robot are taken to be {1e3 * offset_s:+.4g} ms apart, "
+            f"{'as stated' if stated_s is not None else 'as nothing is stated'}: the views were "
+            "taken at rest, where this does not count."
+        )
+        return _placed(session, motion, views, clock, [], [note])
+    if stated_s is not None:
+        warning = (
+            f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
+            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
+        )
+        clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
+        return _placed(session, motion, views, clock, [warning], [])
+    if resting.sum() < FEWEST_VIEWS:
+        raise no_offset(motion, views, resting, why)
+    warning = (
+        f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
+        f"between the clocks is not known: {why}."
+    )
+    kept = [view for view, it in zip(views, resting, strict=True) if it]
+    placed = _placed(session, motion, kept, clock, [warning], [])
+    rejected = {it.view: it for it in placed.rejections} | {
+        view.number: Rejection(view.number, _IN_MOTION)
+        for view, it in zip(views, resting, strict=True)
+        if not it
+    }
+    return replace(placed, rejections=tuple(rejected.values()))
+
+
+def _placed(
+    session: Session,
+    motion: Motion,
+    views: Sequence[View],
+    clock: Clock,
+    warnings: list[str],
+    notes: list[str],
+) -> Clocked:
+    """Gives views their poses at an offset, and chooses among very many."""
+    at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
+    covered = motion.flange.covers(at_s)
+    inside = [view for view, it in zip(views, covered, strict=True) if it]
+    speeds = motion.flange.speeds(at_s[covered])
+    chosen = _chosen(inside, motion.flange.at(at_s[covered]), speeds)
+    spared = {view.number for at, view in enumerate(inside) if at not in chosen}
+    rows = motion.numbers(at_s[covered])
+    numbers = {inside[at].number: rows[at] for at in chosen}
+    known = {inside[at].number: speeds[at] for at in chosen}
+    if clock.method == "rest":
+        known = {}
+    else:
+        notes = [*notes, speed_words(clock, np.array([*known.values()]), len(inside))]
+    kept = [
+        replace(view, numbers={**view.numbers, **numbers[view.number]})
+        if view.number in numbers
+        else view
+        for view in session.views
+        if view.number in numbers or not is_open(view)
+    ]
+    return Clocked(
+        replace(clock, speeds=known),
+        tuple(kept),
+        tuple(_without_pose(session, motion, clock, {it.number for it in inside})),
+        frozenset(spared),
+        tuple(warnings),
+        tuple(notes),
+    )
+
+
+def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> set[int]:
+    """Which views to use: all of few, of many the slow ones, and those that are held back."""
+    if len(views) <= _MANY_VIEWS:
+        return set(range(len(views)))
+    free = np.array([at for at, view in enumerate(views) if not view.holdout], dtype=np.int64)
+    slow = free[slow_and_new(poses[free], speeds[free])]
+    return {*slow.tolist(), *(at for at, view in enumerate(views) if view.holdout)}
+
+
+def _without_pose(
+    session: Session, motion: Motion, clock: Clock, inside: set[int]
+) -> Iterator[Rejection]:
+    for view in session.views:
+        stamp_s, joints = view.stamp_s, view.joints_rad
+        if view.number in inside or joints is not None or view.base_from_flange() is not None:
+            continue
+        if stamp_s is None:
+            yield Rejection(view.number, "no pose of the robot: neither a pose nor a time is there")
+        elif not motion.flange.covers(np.array([stamp_s - clock.camera_minus_robot_s]))[0]:
+            yield Rejection(
+                view.number,
+                f"no pose of the robot: streams/{motion.name}.csv has no samples around its time",
+            )

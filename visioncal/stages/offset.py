@@ -1,0 +1,162 @@
+"""The offset between the clocks of camera and robot: what is known of it, and in words."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.errors import DataError, DegenerateError
+from visioncal.estimator.clock import ClockFit, Match, clock_shared
+from visioncal.estimator.shared import Shared
+from visioncal.figures import figure
+from visioncal.session import View
+from visioncal.stages.motion import Motion
+from visioncal.types import FloatArray, Mask
+
+# Angles that go along by less are of other motions; a larger sigma [s] is no answer.
+LEAST_CORRELATION, LARGEST_SIGMA_S = 0.5, 0.01
+# Fewer views at rest make no calibration.
+FEWEST_VIEWS = 3
+# A stated offset that is off by so many sigmas, and by this share of a frame, is told.
+_STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
+
+
+ClockMethod: TypeAlias = Literal["motion", "stated", "rest"]
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """How far the camera's clock is ahead of the robot's, and what that rests on.
+
+    Attributes:
+        camera_minus_robot_s: The offset [s].
+        sigma_s: Its standard deviation [s]; 0 where views at rest make it immaterial.
+        method: Told by the motion, stated by the session, or of no consequence.
+        stated_s: What the session states [s]; None where it states nothing.
+        frames: How many frames in motion told it.
+        correlation: Of the angles by which camera and robot turned; None where none was found.
+        speeds: (6,) how fast the flange moved, by view, in its own frame [rad/s, m/s].
+    """
+
+    camera_minus_robot_s: float
+    sigma_s: float
+    method: ClockMethod
+    stated_s: float | None
+    frames: int
+    correlation: float | None
+    speeds: Mapping[int, FloatArray]
+
+    def shared(self, views: Sequence[int]) -> Shared:
+        """The offset's error as an unknown of the chain of some views.
+
+        It is known beforehand as well as it was told: the few used views, slow ones, count twice in
+        that, and tell little of it.
+        """
+        still = np.zeros(6)
+        speeds = np.array([self.speeds.get(view, still) for view in views]).reshape(-1, 6)
+        return clock_shared(speeds, self.sigma_s)
+
+    def document(self) -> dict[str, object]:
+        """What calibration.json says of it."""
+        known: dict[str, object] = {
+            "camera_minus_robot_s": self.camera_minus_robot_s,
+            "method": self.method,
+        }
+        if self.method != "rest":
+            known["sigma_s"] = self.sigma_s
+        if self.stated_s is not None:
+            known["stated_s"] = self.stated_s
+        if self.method == "motion":
+            known |= {"frames": self.frames, "correlation": self.correlation}
+        return known
+
+
+def told_words(fit: ClockFit, match: Match, stream: str) -> str:
+    """Says what the motion tells."""
+    return (
+        f"The camera's clock is {1e3 * fit.offset_s:+.2f} ms ahead of the robot's (sigma "
+        f"{1e3 * fit.sigma_s:.2g} ms), as {fit.frames} frames and streams/{stream}.csv tell by "
+        "their motion (the turning of both goes along with a correlation of "
+        f"{match.correlation:.2f})."
+    )
+
+
+def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[str]:
+    """Says so where what the session states is not what the motion tells."""
+    if clock.stated_s is None:
+        return
+    away_s = abs(clock.stated_s - clock.camera_minus_robot_s)
+    frame_s = float(np.median(np.diff([view.stamp_s or 0.0 for view in views])))
+    if away_s > max(_STATED_SIGMAS * clock.sigma_s, _STATED_SHARE * frame_s):
+        yield (
+            f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
+            f"motion tells {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
+            f"{1e3 * clock.sigma_s:.2g} ms), which was taken. Correct session.toml, or look at how "
+            "the stamps are made."
+        )
+
+
+def why_untold(fit: ClockFit | None, matches: Sequence[Match]) -> str:
+    """Says why the motion does not tell the offset."""
+    best = max(matches, key=lambda it: it.correlation, default=None)
+    if best is None:
+        return "camera and robot are not seen to turn together for long enough"
+    if best.correlation < LEAST_CORRELATION:
+        return (
+            f"the turning of robot and camera goes along with a correlation of "
+            f"{best.correlation:.2f} at best ({LEAST_CORRELATION} is needed), so they are not of "
+            "the same motion, or it was too slow"
+        )
+    if best.at_end:
+        return (
+            f"the turning of robot and camera goes along best {best.offset_s:+.2f} s apart, where "
+            "the search ends"
+        )
+    if fit is None or not np.isfinite(fit.sigma_s):
+        return "the motion is too even: any offset explains it"
+    return (
+        f"the motion tells the offset to {1e3 * fit.sigma_s:.2g} ms only "
+        f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
+    )
+
+
+def no_offset(
+    motion: Motion, views: Sequence[View], resting: Mask, why: str
+) -> DegenerateError | DataError:
+    """What to raise where there is no way to the robot's poses."""
+    stamps_s = np.array([view.stamp_s for view in views], dtype=float)
+    begin_s, end_s = motion.flange.stamps_s[[0, -1]]
+    if not len(views):
+        return DataError("No view has both a time and a pose of the target.")
+    if not motion.flange.covers(stamps_s).any():
+        return DataError(
+            f"No view lies within streams/{motion.name}.csv: it goes from {begin_s:.6f} to "
+            f"{end_s:.6f} s, the views from {stamps_s[0]:.6f} to {stamps_s[-1]:.6f} s.",
+            culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
+            next_step="Stamp both with clocks that differ by seconds at most, or state [clock] "
+            "camera_minus_robot_s.",
+        )
+    return DegenerateError(
+        f"clock: the offset between the clocks of camera and robot is not told by {len(views)} "
+        f"views, of which {int(resting.sum())} were taken at rest: {why}.",
+        culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
+        next_step="Sweep the robot to and fro, about different axes, with the target in view; or "
+        f"take {FEWEST_VIEWS} views or more at rest; or state [clock] camera_minus_robot_s.",
+    )
+
+
+def speed_words(clock: Clock, speeds: FloatArray, inside: int) -> str:
+    """How fast the flange moved at most in the views that are used, and what that costs."""
+    if not len(speeds):
+        return "No view lies within the stream."
+    fastest_mm, fastest_deg = (
+        1e3 * float(np.linalg.norm(speeds[:, 3:], axis=1).max()),
+        float(np.rad2deg(np.linalg.norm(speeds[:, :3], axis=1).max())),
+    )
+    return (
+        f"{len(speeds)} of {inside} views with a time are used, taken while the flange moved by up "
+        f"to {figure(fastest_mm)} mm/s and {figure(fastest_deg)} deg/s: what is open about the "
+        f"clocks makes {figure(clock.sigma_s * fastest_mm)} mm and "
+        f"{figure(clock.sigma_s * fastest_deg)} deg of it, and counts in the covariance."
+    )
