@@ -1,6 +1,7 @@
 """What the commands share: messages to stderr, results to stdout, progress between."""
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,11 +13,13 @@ from rich.table import Table
 
 from visioncal.calibration import Calibration, Verdict
 from visioncal.errors import VisioncalError
+from visioncal.files import some_of
 from visioncal.transforms import pose_difference
 from visioncal.types import Progress as Told
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 _LISTED_CULPRITS = 10
+_SAME_REASON = 20  # more views of one reason share a line
 _SHORT = 12  # culprits of fewer letters share a line
 
 
@@ -96,11 +99,23 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         + ("" if held.deg is None else f", {held.deg:.2g} deg")
         + (f", {held.px:.2g} px" if held.px else "")
     )
-    for view in calibration.views:
-        if not view.used:
-            console.print(f"  view {view.view}: {escape(view.reason)}")
+    for words in _unused(calibration):
+        console.print(f"  {escape(words)}")
     if verbose:
         console.print(_solver_table(calibration))
+
+
+def _unused(calibration: Calibration) -> Iterator[str]:
+    """The views that are not used, each with its reason; many of one reason in one line."""
+    views = defaultdict(list)
+    for view in calibration.views:
+        if not view.used:
+            views[view.reason].append(view.view)
+    for reason, of_it in views.items():
+        if len(of_it) > _SAME_REASON:
+            yield f"{len(of_it)} views ({some_of([*map(str, of_it)], 3)}): {reason}"
+        else:
+            yield from (f"view {view}: {reason}" for view in of_it)
 
 
 def _solver_table(calibration: Calibration) -> Table:

@@ -34,7 +34,6 @@ from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, 
 
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
-SPARED = "not needed: slower views stand for it, at the same places"
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ class Known:
         resolution: Size of the images [px].
         camera: The intrinsics, where there are images.
         clock: How the clocks of camera and robot go together; None where all poses were reported.
-        spared: The views of a long sweep that are not needed.
+        spared: Why views of a sweep are not needed, by view.
         readings: What an instrument read, where that is all that was observed.
         poses: The target's pose by view; several candidates until they are chosen from.
         pixel_px: Noise of a corner's coordinate [px].
@@ -96,7 +95,7 @@ class Known:
     resolution: tuple[int, int] | None = None
     camera: CameraResult | None = None
     clock: Clock | None = None
-    spared: frozenset[int] = frozenset()
+    spared: Mapping[int, str] = field(default_factory=dict)
     readings: Readings | None = None
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     pixel_px: float | None = None

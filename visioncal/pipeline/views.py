@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration import Rms, ViewResult
 from visioncal.estimator.closure import distances
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.known import HELD_BACK, SPARED, Known, rms_of
+from visioncal.pipeline.known import HELD_BACK, Known, rms_of
 from visioncal.pipeline.layout import own_numbers
 from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import mean_transform
@@ -89,9 +89,7 @@ def _reason(known: Known, view: int) -> str:
         return ""
     if view in known.held_back and view not in known.reasons:
         return HELD_BACK
-    if view in known.spared:
-        return SPARED
-    return known.reasons.get(view, _NO_POSE)
+    return known.reasons.get(view) or known.spared.get(view, _NO_POSE)
 
 
 def _corners(known: Known, view: int) -> int | None:

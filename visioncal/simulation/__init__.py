@@ -19,10 +19,13 @@ from visioncal.simulation.records import (
     Truth,
     measured_poses,
     read_truth,
+    sweep_session,
     truth_path,
     write_session,
+    write_sweep,
 )
 from visioncal.simulation.render import Scene, prepare_scene, render, render_view
+from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
 
 __all__ = [
     "Arm",
@@ -31,6 +34,8 @@ __all__ = [
     "Motion",
     "Scene",
     "Second",
+    "Sweep",
+    "SweepOptions",
     "Truth",
     "charuco_target",
     "checkerboard_target",
@@ -46,8 +51,11 @@ __all__ = [
     "render",
     "render_view",
     "simulate",
+    "sweep",
+    "sweep_session",
     "truth_path",
     "ur_arm",
     "wide_camera",
     "write_session",
+    "write_sweep",
 ]

@@ -45,6 +45,7 @@ class Stream(IntEnum):
     BACKDROP = 7
     PAIRS = 8
     LENS = 9
+    SWEEP = 10
 
 
 # What another draw of the same cell draws anew.

@@ -18,6 +18,7 @@ from visioncal.simulation.optics import project
 from visioncal.simulation.options import charuco_target, checkerboard_target
 from visioncal.simulation.render import encode, prepare_scene, render
 from visioncal.simulation.second import BOARDS
+from visioncal.simulation.sweep import Sweep
 from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray, Target
 
@@ -79,6 +80,37 @@ def write_session(
     if progress is not None:
         progress(1.0)
     return folder
+
+
+def write_sweep(moved: Sweep, folder: Path | str) -> Path:
+    """Writes a sweep as a session's folder, and its truth beside it.
+
+    Each frame is a view with its time and `cam_from_target` as a PnP would measure it; the robot's
+    poses and joints are in `streams/robot.csv`, by another clock.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    folder = Path(folder)
+    sweep_session(moved, folder.name).save(folder)
+    clock = {"camera_minus_robot_s": moved.options.camera_minus_robot_s}
+    write_atomically(truth_path(folder), _truth_text(moved.cell, clock))
+    return folder
+
+
+def sweep_session(moved: Sweep, name: str) -> Session:
+    """The session of a sweep: frames with measured poses, and the robot's stream."""
+    numbers = [
+        {"stamp_s": stamp_s} | {f"cft_{key}": value for key, value in _pose_row(pose).items()}
+        for stamp_s, pose in zip(moved.frames_s.tolist(), measured_poses(moved.cell), strict=True)
+    ]
+    views = tuple(View(at, numbers=row) for at, row in enumerate(numbers))
+    columns, document = ("view", *numbers[0]), _document(moved.cell, name)
+    session = Session(document, columns, views, None, None, MemoryImages({}))
+    return session.with_streams({"robot": moved.robot})
 
 
 def truth_path(folder: Path | str) -> Path:
@@ -281,7 +313,7 @@ def _pose_row(pose: FloatArray) -> dict[str, float]:
     return dict(zip(_POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
 
-def _truth_text(cell: Cell) -> str:
+def _truth_text(cell: Cell, more: Mapping[str, Any] | None = None) -> str:
     options = asdict(cell.options)
     camera = options.pop("camera")
     arm = asdict(cell.true_arm)
@@ -295,5 +327,5 @@ def _truth_text(cell: Cell) -> str:
         "arm": arm,
         "base_from_flange": cell.true_base_from_flange,
         "cam_from_target": cell.cam_from_target,
-    }
+    } | dict(more or {})
     return json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n"

@@ -25,10 +25,14 @@ from visioncal.stages.offset import (
     why_untold,
 )
 from visioncal.stages.pnp import ViewPoses
-from visioncal.types import FloatArray, Rejection
+from visioncal.types import FloatArray, IntArray, Mask, Rejection
 
 # A stated offset is taken to be known so well [s].
 _STATED_SIGMA_S = 1e-3
+_SPARED = "not needed: slower views stand for it, at the same places"
+_NO_TIME = "no pose of the robot: neither a pose nor a time is there"
+_BEYOND = "no pose of the robot: it was taken before or after the robot's stream"
+_IN_A_GAP = "no pose of the robot: samples of its stream are missing around that time"
 _IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
 # So many views are all used; of more, slow ones.
 _MANY_VIEWS = 60
@@ -42,7 +46,7 @@ class Clocked:
         clock: The offset.
         views: Those that have a pose now, or had one before, in the session's order.
         rejections: Those that have none, and why.
-        spared: Those that are not needed.
+        spared: Why the others of very many are not needed, by view.
         warnings: What gives reason for doubt.
         notes: What is good to know.
     """
@@ -50,7 +54,7 @@ class Clocked:
     clock: Clock
     views: tuple[View, ...]
     rejections: tuple[Rejection, ...]
-    spared: frozenset[int]
+    spared: Mapping[int, str]
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -180,53 +184,53 @@ def _placed(
     at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
     covered = motion.flange.covers(at_s)
     inside = [view for view, it in zip(views, covered, strict=True) if it]
-    speeds = motion.flange.speeds(at_s[covered])
-    chosen = _chosen(inside, motion.flange.at(at_s[covered]), speeds)
-    spared = {view.number for at, view in enumerate(inside) if at not in chosen}
-    rows = motion.numbers(at_s[covered])
-    numbers = {inside[at].number: rows[at] for at in chosen}
-    known = {inside[at].number: speeds[at] for at in chosen}
-    if clock.method == "rest":
-        known = {}
-    else:
-        notes = [*notes, speed_words(clock, np.array([*known.values()]), len(inside))]
-    kept = [
-        replace(view, numbers={**view.numbers, **numbers[view.number]})
-        if view.number in numbers
-        else view
-        for view in session.views
-        if view.number in numbers or not is_open(view)
-    ]
+    poses, speeds = motion.flange.at(at_s[covered]), motion.flange.speeds(at_s[covered])
+    chosen = _chosen(inside, poses, speeds)
+    taken = [inside[at].number for at in chosen]
+    rows = dict(zip(taken, motion.numbers(at_s[covered][chosen]), strict=True))
+    if clock.method != "rest":
+        clock = replace(clock, speeds=dict(zip(taken, speeds[chosen], strict=True)))
+        notes = [*notes, speed_words(clock, speeds[chosen], len(inside))]
+    lost = dict(_uncovered(motion, views, at_s, covered))
+    # A sweep may be longer than the stream beside it.
+    beyond = {it for it, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
+    spared = {it.number: _SPARED for it in inside if it.number not in rows}
+    lost |= {it.number: _NO_TIME for it in session.views if _knows_nothing(it)}
     return Clocked(
-        replace(clock, speeds=known),
-        tuple(kept),
-        tuple(_without_pose(session, motion, clock, {it.number for it in inside})),
-        frozenset(spared),
+        clock,
+        tuple(
+            replace(it, numbers={**it.numbers, **rows.get(it.number, {})})
+            for it in session.views
+            if it.number in rows or not (is_open(it) or _knows_nothing(it))
+        ),
+        tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
+        spared | dict.fromkeys(beyond, _BEYOND),
         tuple(warnings),
         tuple(notes),
     )
 
 
-def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> set[int]:
+def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> IntArray:
     """Which views to use: all of few, of many the slow ones, and those that are held back."""
+    everything = np.arange(len(views))
     if len(views) <= _MANY_VIEWS:
-        return set(range(len(views)))
-    free = np.array([at for at, view in enumerate(views) if not view.holdout], dtype=np.int64)
-    slow = free[slow_and_new(poses[free], speeds[free])]
-    return {*slow.tolist(), *(at for at, view in enumerate(views) if view.holdout)}
+        return everything
+    held = np.array([view.holdout for view in views])
+    free = everything[~held]
+    return np.sort([*free[slow_and_new(poses[free], speeds[free])], *everything[held]])
 
 
-def _without_pose(
-    session: Session, motion: Motion, clock: Clock, inside: set[int]
-) -> Iterator[Rejection]:
-    for view in session.views:
-        stamp_s, joints = view.stamp_s, view.joints_rad
-        if view.number in inside or joints is not None or view.base_from_flange() is not None:
-            continue
-        if stamp_s is None:
-            yield Rejection(view.number, "no pose of the robot: neither a pose nor a time is there")
-        elif not motion.flange.covers(np.array([stamp_s - clock.camera_minus_robot_s]))[0]:
-            yield Rejection(
-                view.number,
-                f"no pose of the robot: streams/{motion.name}.csv has no samples around its time",
-            )
+def _uncovered(
+    motion: Motion, views: Sequence[View], at_s: FloatArray, covered: Mask
+) -> Iterator[tuple[int, str]]:
+    """The views about which the stream says nothing, and why."""
+    first_s, last_s = motion.flange.stamps_s[[0, -1]]
+    for view, it_s, there in zip(views, at_s, covered, strict=True):
+        if not there:
+            within = first_s <= it_s <= last_s
+            yield view.number, _IN_A_GAP if within else _BEYOND
+
+
+def _knows_nothing(view: View) -> bool:
+    """Whether neither a pose of the robot nor a time is there."""
+    return view.stamp_s is None and view.base_from_flange() is None and view.joints_rad is None

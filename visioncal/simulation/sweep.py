@@ -1,0 +1,122 @@
+"""A sweep: the robot moves without a rest, and camera and controller stamp by clocks of their own.
+
+The flange goes through a cell's stops on a smooth way, with joints of continuous acceleration. The
+camera takes frames at its rate, wherever the robot is; the controller tells its joints and poses at
+a higher one.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DataError
+from visioncal.session import Stream as Recorded
+from visioncal.simulation.arms import forward
+from visioncal.simulation.cell import Cell, Stream, simulate, stream
+from visioncal.simulation.options import CellOptions
+from visioncal.types import FloatArray
+
+POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+# A frame that shows less of the board gives no pose.
+_FEWEST_CORNERS = 8
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """How a sweep is made.
+
+    Attributes:
+        stops: Through how many postures it goes.
+        pace_s: How long it takes from one to the next [s].
+        robot_hz: Samples of the controller in a second.
+        frames_hz: Frames of the camera in a second.
+        camera_minus_robot_s: What the camera's stamps are ahead of the controller's [s].
+        jitter_s: Noise of the camera's stamps, as a standard deviation [s].
+        encoder_sigma_rad: Noise of the joint angles that the controller tells [rad].
+    """
+
+    stops: int = 12
+    pace_s: float = 1.7
+    robot_hz: float = 125.0
+    frames_hz: float = 30.0
+    camera_minus_robot_s: float = 0.0
+    jitter_s: float = 0.0
+    encoder_sigma_rad: float = 2e-6
+
+    def __post_init__(self) -> None:
+        if self.stops < 2 or min(self.pace_s, self.robot_hz, self.frames_hz) <= 0.0:
+            raise DataError("simulation: a sweep needs two stops, and times and rates above 0.")
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """A simulated sweep.
+
+    Attributes:
+        options: How it was made.
+        cell: The cell at the m frames, each of them a view.
+        frames_s: (m,) when they were taken, by the camera's clock [s].
+        robot: What the controller told: `stamp_s` by its own clock, poses and joints.
+    """
+
+    options: SweepOptions
+    cell: Cell
+    frames_s: FloatArray
+    robot: Recorded
+
+
+def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
+    """Sweeps a cell's robot through as many of its stops as are asked for.
+
+    Args:
+        options: The cell; `views` is set by the sweep.
+        how: How it is swept.
+
+    Raises:
+        DataError: As `simulate`; or fewer than two frames show the board.
+    """
+    how = how or SweepOptions()
+    stops = simulate(replace(options, views=how.stops, wrong_views=0)).joints
+    way = CubicSpline(how.pace_s * np.arange(how.stops), _in_turn(stops), bc_type="clamped")
+    end_s = how.pace_s * (how.stops - 1)
+    robot_s = np.arange(0.0, end_s, 1.0 / how.robot_hz)
+    taken_s = np.arange(0.5 / how.frames_hz, end_s, 1.0 / how.frames_hz)
+    options = replace(options, views=len(taken_s), wrong_views=0)
+    frames = simulate(options, way(taken_s))
+    seen = [at for at, it in enumerate(frames.exact_corners) if len(it.ids) >= _FEWEST_CORNERS]
+    if len(seen) < 2:
+        raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
+    taken_s = taken_s[seen]
+    rng = stream(options, Stream.SWEEP)
+    told = way(robot_s) + how.encoder_sigma_rad * rng.standard_normal(
+        (len(robot_s), stops.shape[1])
+    )
+    ahead_s = how.camera_minus_robot_s + how.jitter_s * rng.standard_normal(len(taken_s))
+    return Sweep(
+        how,
+        simulate(replace(options, views=len(seen)), way(taken_s)),
+        taken_s + ahead_s,
+        _recorded(robot_s, told, forward(frames.arm, told)),
+    )
+
+
+def _in_turn(stops: FloatArray) -> FloatArray:
+    """Orders postures so that each is the nearest to the one before of those that are left."""
+    left = list(range(1, len(stops)))
+    order = [0]
+    while left:
+        away = [float(np.abs(stops[at] - stops[order[-1]]).max()) for at in left]
+        order.append(left.pop(int(np.argmin(away))))
+    return stops[order]
+
+
+def _recorded(stamps_s: FloatArray, joints: FloatArray, poses: FloatArray) -> Recorded:
+    """The controller's stream; a quaternion does not jump to its negative."""
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+    quaternions[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
+    names = [f"q{at + 1}_rad" for at in range(joints.shape[1])]
+    values = np.hstack([stamps_s[:, None], poses[:, :3, 3], quaternions, joints])
+    return Recorded(("stamp_s", *POSE_COLUMNS, *names), values)
