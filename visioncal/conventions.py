@@ -225,6 +225,13 @@ class PoseNumbers:
         return cls(poses[:, :3, 3], rotations, Reading("matrix"), tuple(places))
 
     @classmethod
+    def written(cls, poses: FloatArray, reading: Reading, places: Sequence[str]) -> "PoseNumbers":
+        """Writes (n, 4, 4) transforms [m] so that a reading gives them again."""
+        meant = invert(poses) if reading.inverse else poses
+        rotations = ROTATION_FORMS[reading.rotation].write(meant[:, :3, :3])
+        return cls(meant[:, :3, 3] / UNITS_M[reading.unit], rotations, reading, tuple(places))
+
+    @classmethod
     def nowhere(cls, places: Sequence[str]) -> "PoseNumbers":
         """Rows without poses."""
         none = np.full((len(places), 7), np.nan)

@@ -1,15 +1,13 @@
 """What one clock is ahead of another, from one motion that was seen by both.
 
-A camera's turning between two frames and the robot's are equally large, whatever frames their poses
-are of: where these angles go along best, the clocks agree to a fraction of a frame. From there the
-offset is one more unknown of the chain of frames: it moves the flange along its way.
+From where both turn alike, the offset is one more unknown of the chain of frames: it moves the
+flange along its way.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from visioncal.estimator.closure import (
     Closure,
@@ -22,71 +20,20 @@ from visioncal.estimator.closure import (
 from visioncal.estimator.linalg import covariance, one_blas_thread, spectrum
 from visioncal.estimator.shared import Shared
 from visioncal.estimator.trajectory import Trajectory
+from visioncal.estimator.turned import NEAR_S, WINDOW_S, Frames
 from visioncal.solvers import SOLVERS
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray, IntArray, Mask, Mount
+from visioncal.transforms import invert
+from visioncal.types import FloatArray, IntArray, Mask
 
-# Clocks that are farther apart are not on one network [s].
-WIDEST_OFFSET_S = 5.0
-# The grid on which angles are compared, and over how long at least [s].
-_STEP_S, _WINDOW_S = 0.005, 0.2
-# Peaks of the comparison that stay within so much of the best are tried too, so many of them.
-_RIVAL_SHARE, _MOST_RIVALS, _APART_S = 0.9, 3, 0.1
-# A start from more frames is no better.
-_START_FRAMES, _MOST_FRAMES = 60, 1200
+# A start from more frames is no better; a fit of more takes long.
+_START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4
 _ROUNDS, _SETTLED_S = 12, 1e-7
-_FEWEST_FRAMES = 4
 # Frames that are off by so many times what is typical are wrong ones.
 _OUTLYING = 4.0
 # Errors of frames within this time of each other may be alike [s]; fewer stretches tell nothing.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
 # A ratio of eigenvalues below this is no information, only rounding.
 _NULL = 1e-10
-
-
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """What a camera saw, by its own clock.
-
-    Attributes:
-        mount: Which of the two trees it is.
-        stamps_s: (m,) times [s], ascending.
-        cam_from_target: (m, 4, 4) [m].
-        covariance: (m, 6, 6) of their right perturbations; None where unknown.
-    """
-
-    mount: Mount
-    stamps_s: FloatArray
-    cam_from_target: FloatArray
-    covariance: FloatArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.stamps_s)
-
-    def only(self, chosen: Mask | IntArray) -> "Frames":
-        """Returns some of them."""
-        known = self.covariance
-        return replace(
-            self,
-            stamps_s=self.stamps_s[chosen],
-            cam_from_target=self.cam_from_target[chosen],
-            covariance=None if known is None else known[chosen],
-        )
-
-
-@dataclass(frozen=True)
-class Match:
-    """An offset at which camera and robot turn alike.
-
-    Attributes:
-        offset_s: What the camera's clock is ahead of the robot's [s].
-        correlation: Of their angles there.
-        at_end: Whether the search ends there.
-    """
-
-    offset_s: float
-    correlation: float
-    at_end: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,87 +55,6 @@ class ClockFit:
     frames: int
 
 
-def turning_matches(robot: Trajectory, frames: Frames) -> tuple[Match, ...]:
-    """Finds the offsets at which camera and robot turn alike, the best first.
-
-    Angles are compared between each frame and the first one some time behind it, by their
-    correlation.
-
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: What the camera saw.
-
-    Returns:
-        The matches; none where neither turns, or the streams have too little time in common.
-    """
-    later = np.searchsorted(frames.stamps_s, frames.stamps_s + _WINDOW_S)
-    first = np.flatnonzero(later < len(frames))
-    if len(first) < 3:
-        return ()
-    second = later[first]
-    there = frames.cam_from_target
-    seen = rotation_angle(invert(there[first]) @ there[second])
-    reach_s = min(WIDEST_OFFSET_S, 0.25 * _common_s(robot, frames))
-    lags = np.arange(-int(reach_s / _STEP_S), int(reach_s / _STEP_S) + 1)
-    # With a margin, so that frames before the robot's first sample have a place on the grid.
-    begin_s = robot.stamps_s[0] - _STEP_S
-    grid_s = np.arange(begin_s + _STEP_S, robot.stamps_s[-1], _STEP_S)
-    turned = Rotation.from_matrix(robot.poses[:, :3, :3])
-    quaternions = Slerp(robot.stamps_s, turned)(grid_s).as_quat()
-    known = robot.covers(grid_s)
-    places = np.rint((frames.stamps_s - grid_s[0]) / _STEP_S).astype(np.int64)
-    scores = np.zeros(len(lags))
-    for at, lag in enumerate(lags):
-        one, other = places[first] - lag, places[second] - lag
-        inside = (one >= 0) & (other < len(grid_s))
-        inside[inside] &= known[one[inside]] & known[other[inside]]
-        # Chance alone correlates a short overlap.
-        if inside.sum() > max(0.5 * len(first), 2):
-            dots = np.abs(np.sum(quaternions[one[inside]] * quaternions[other[inside]], axis=1))
-            scores[at] = _correlation(2.0 * np.arccos(np.minimum(dots, 1.0)), seen[inside])
-    return _peaks(lags, scores)
-
-
-def _common_s(robot: Trajectory, frames: Frames) -> float:
-    """How much time the streams have in common, as stamped [s]."""
-    start = max(robot.stamps_s[0], frames.stamps_s[0])
-    return max(float(min(robot.stamps_s[-1], frames.stamps_s[-1]) - start), 0.0)
-
-
-def _correlation(a: FloatArray, b: FloatArray) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float(a @ b) / norm if norm > 0 else 0.0
-
-
-def _peaks(lags: IntArray, scores: FloatArray) -> tuple[Match, ...]:
-    """The best offset and its rivals, each a maximum of its surroundings."""
-    around = int(_APART_S / _STEP_S)
-    left, found = scores.copy(), list[Match]()
-    best = float(scores.max(initial=0.0))
-    while len(found) < _MOST_RIVALS and best > 0.0 and left.max() >= _RIVAL_SHARE * best:
-        at = int(left.argmax())
-        ends = at in (0, len(lags) - 1)
-        found.append(Match(_summit(lags, scores, at) * _STEP_S, float(scores[at]), ends))
-        low, high = at, at
-        # Down both sides of the hill, and at least as far as what is no rival.
-        while low > 0 and (at - low < around or scores[low - 1] < scores[low]):
-            low -= 1
-        while high < len(lags) - 1 and (high - at < around or scores[high + 1] < scores[high]):
-            high += 1
-        left[low : high + 1] = -1.0
-    return tuple(found)
-
-
-def _summit(lags: IntArray, scores: FloatArray, at: int) -> float:
-    """Where the parabola through a maximum and its neighbours is highest."""
-    if at in (0, len(lags) - 1):
-        return float(lags[at])
-    left, middle, right = scores[at - 1 : at + 2]
-    curvature = left - 2 * middle + right
-    return float(lags[at] + (0.5 * (left - right) / curvature if curvature < 0 else 0.0))
-
-
 def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> ClockFit | None:
     """Fits the offset and both edges together, from several starts.
 
@@ -198,11 +64,16 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> Cl
         starts: Offsets to start from [s].
 
     Returns:
-        The fit that leaves the least; None where too few frames are covered, or no edges are found.
+        The fit that leaves the least and stays near its start; None where there is none, as the
+        chain does not close or too few frames are covered.
     """
     with one_blas_thread():
         some = frames.only(_evenly(len(frames), _MOST_FRAMES))
-        fits = [fit for it in starts if (fit := _fitted(robot, some, it)) is not None]
+        fits = [
+            fit
+            for it in starts
+            if (fit := _fitted(robot, some, it)) is not None and abs(fit.offset_s - it) <= NEAR_S
+        ]
     # Few frames agree with anything.
     most = max((it.frames for it in fits), default=0)
     whole = [it for it in fits if 2 * it.frames > most]
@@ -236,7 +107,7 @@ def _settled(
         at = _start(data) if start is None else start
         fit = fit_closure(data, replace(at, shared=data.unchanged))
         # A step farther than angles are compared over is a slope that misleads.
-        step_s = float(np.clip(fit.edges.shared[0], -_WINDOW_S, _WINDOW_S))
+        step_s = float(np.clip(fit.edges.shared[0], -WINDOW_S, WINDOW_S))
         start, offset_s = fit.edges, offset_s + step_s
         if abs(step_s) < _SETTLED_S:
             break

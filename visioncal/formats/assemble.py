@@ -133,6 +133,8 @@ def _swept(foreign: Foreign, sweep: Sweep) -> Foreign:
         robot=PoseNumbers.nowhere(sweep.camera.places),
         camera=sweep.camera,
         stamps_s=sweep.camera_s,
+        views=(),
+        columns={},
     )
 
 

@@ -79,7 +79,7 @@ def _by_time(
     sampled = seen.rows(paired.rows)
     return Foreign(
         name=name,
-        robot=PoseNumbers.of_poses(paired.base_from_flange, sampled.places),
+        robot=PoseNumbers.written(paired.base_from_flange, robot[1].reading, sampled.places),
         camera=sampled,
         stamps_s=camera_s[paired.rows],
         sweep=Sweep(robot_s, robot[1].rows(robot_rows), camera_s, seen),

@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.conventions import PoseNumbers
+from visioncal.conventions import PoseNumbers, Reading
 from visioncal.errors import DataError
 from visioncal.files import parse_toml, read_text
 from visioncal.formats.assemble import assemble, pose_cells, spoken
 from visioncal.formats.foreign import Foreign
 from visioncal.guess import Candidate, Guess, guess_reading
+from visioncal.guess.hypothesis import Hypothesis
 from visioncal.pipeline.guessing import chain_poses, numbers_in, seen_poses, told_or_chained
-from visioncal.session import Session
+from visioncal.session import Session, Stream
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
 from visioncal.targets import LARGEST_M
 from visioncal.types import MOUNTS, FloatArray, IntArray, Progress
@@ -130,9 +131,24 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
         session.images,
         target_document=target,
         robot_document=session.robot_document,
-    ).with_streams(session.streams)
+    ).with_streams({name: _reread_stream(it, taken) for name, it in session.streams.items()})
     said = dict.fromkeys((*_note(candidate), *session.warnings, *reread.warnings))
     return replace(reread, warnings=tuple(said))
+
+
+def _reread_stream(stream: Stream, taken: Hypothesis) -> Stream:
+    """Reads the poses of a stream as they are read in views."""
+    if any(name not in stream for name in POSE):
+        return stream
+    numbers = np.stack([stream[name] for name in POSE], axis=1)
+    places = tuple(f"sample {row + 1}" for row in range(len(stream)))
+    poses = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
+    values = stream.values.copy()
+    columns = [stream.columns.index(name) for name in POSE]
+    rows = pose_cells(taken.robot.corrected(poses), POSE)
+    values[:, columns] = [[float(row.get(name, "nan")) for name in POSE] for row in rows]
+    values.setflags(write=False)
+    return replace(stream, values=values)
 
 
 def _note(candidate: Candidate) -> tuple[str, ...]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.clock import WIDEST_OFFSET_S, Frames, Match, turning_matches
 from visioncal.estimator.trajectory import LONGEST_GAP_S, Trajectory
+from visioncal.estimator.turned import WIDEST_OFFSET_S, Frames, Match, turning_matches
 from visioncal.stages.motion import slow_and_new
 from visioncal.stages.offset import LEAST_CORRELATION
 from visioncal.types import FloatArray, IntArray
@@ -111,7 +111,7 @@ def _check_common(robot_s: FloatArray, camera_s: FloatArray) -> None:
 
 
 def _match(flange: Trajectory, frames: Frames) -> Match:
-    best = next(iter(turning_matches(flange, frames)), Match(0.0, 0.0))
+    best = next(iter(turning_matches(flange, frames)), Match(0.0, np.inf, 0.0))
     if flange.step_s >= LONGEST_GAP_S:
         # Nothing can be compared; whoever looks for covered samples says so.
         return best

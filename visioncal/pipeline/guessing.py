@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from visioncal.conventions import PoseNumbers, Reading
 from visioncal.errors import VisioncalError
@@ -17,6 +18,7 @@ from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.stages.choose import choose_poses
 from visioncal.stages.handeye import robot_part
 from visioncal.stages.judge import is_scattered
+from visioncal.stages.motion import waits_for_clock
 from visioncal.types import FloatArray, Progress
 
 # What the camera's poses need; the robot has no part in it, so that it can be wrong.
@@ -64,7 +66,8 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
         else chain_poses(seen.session, seen.zeroed_robot)
     )
     if robot is None:
-        robot = told_or_chained(numbers_in(seen.session, POSE), chain)
+        told = numbers_in(seen.session, POSE)
+        robot = told_or_chained(told if seen.clock is None else _told_in_time(seen), chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
     for camera in _seen_ways(seen, robot):
         guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
@@ -148,9 +151,21 @@ def is_suspect(known: Known) -> bool:
     return out or is_scattered(findings) or known.robot is not None
 
 
+def _told_in_time(seen: Known) -> PoseNumbers:
+    """The robot's numbers out of its stream, at the views' times; NaN where it has none."""
+    numbers = np.full((len(seen.session.views), 7), np.nan)
+    for at, view in enumerate(seen.session.views):
+        if view.number in seen.base_from_flange:
+            pose = RigidTransform.from_matrix(seen.base_from_flange[view.number])
+            numbers[at] = [*pose.translation, *pose.rotation.as_quat()]
+    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places(seen.session))
+
+
 def _seen(known: Known) -> Known:
+    # Which moment of a stream a view belongs to is told by how both turned, however they are read.
+    names = (*_SEEING, "robot", "clock") if waits_for_clock(known.session) else _SEEING
     for stage in STAGES:
-        if stage.name in _SEEING:
+        if stage.name in names:
             known = stage.run(known)
     return known
 

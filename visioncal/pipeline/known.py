@@ -14,6 +14,7 @@ from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
+from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.robot import Convention, Robot, with_zeros
 from visioncal.session import Session
@@ -32,6 +33,8 @@ from visioncal.stages.validate import HeldOut
 from visioncal.transforms import invert
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
 
+# So many views of one reason are named.
+_LISTED = 40
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
 
@@ -400,7 +403,7 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
         views[reason].append(view)
     grouped = sorted(views.items(), key=lambda item: -len(item[1]))
     return tuple(
-        f"view{'s' if len(it) > 1 else ''} {', '.join(map(str, it))}: {reason}"
+        f"view{'s' if len(it) > 1 else ''} {some_of([*map(str, it)], _LISTED)}: {reason}"
         for reason, it in grouped
     )
 

@@ -5,6 +5,7 @@ camera takes frames at its rate, wherever the robot is; the controller tells its
 a higher one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import forward
 from visioncal.simulation.cell import Cell, Stream, simulate, stream
 from visioncal.simulation.options import CellOptions
+from visioncal.simulation.second import Shown
 from visioncal.types import FloatArray
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -96,9 +98,28 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
     ahead_s = how.camera_minus_robot_s + how.jitter_s * rng.standard_normal(len(taken_s))
     return Sweep(
         how,
-        simulate(replace(options, views=len(seen)), way(taken_s)),
+        _only(frames, seen),
         taken_s + ahead_s,
         _recorded(robot_s, told, forward(frames.arm, told)),
+    )
+
+
+def _only(cell: Cell, seen: Sequence[int]) -> Cell:
+    """The cell with some of its views, numbered anew."""
+    exact, found = (
+        tuple(replace(corners[at], view=view) for view, at in enumerate(seen))
+        for corners in (cell.exact_corners, cell.corners)
+    )
+    return replace(
+        cell,
+        options=replace(cell.options, views=len(seen)),
+        joints=cell.joints[seen],
+        base_from_flange=cell.base_from_flange[seen],
+        true_base_from_flange=cell.true_base_from_flange[seen],
+        cam_from_target=cell.cam_from_target[seen],
+        exact_corners=exact,
+        corners=found,
+        shown=Shown(np.arange(len(seen)), cell.shown.boards[seen]),
     )
 
 

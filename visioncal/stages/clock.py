@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.clock import ClockFit, Frames, Match, fit_offset, turning_matches
+from visioncal.estimator.clock import ClockFit, fit_offset
+from visioncal.estimator.turned import Frames, Match, turning_matches
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.stages.motion import Motion, at_rest, is_open, motion_of, slow_and_new
@@ -22,6 +23,7 @@ from visioncal.stages.offset import (
     speed_words,
     stated_doubts,
     told_words,
+    turning_words,
     why_untold,
 )
 from visioncal.stages.pnp import ViewPoses
@@ -87,6 +89,8 @@ def set_clock(session: Session, poses: Mapping[int, ViewPoses], robot: Robot | N
         fit = fit_offset(motion.flange, frames, starts)
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         return _by_motion(session, motion, views, (fit, sound[0]), stated_s)
+    if sound and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
+        return _by_turning(session, motion, views, sound[0], stated_s)
     return _untold(session, motion, views, (fit, matches), stated_s)
 
 
@@ -126,6 +130,17 @@ def _by_motion(
     )
     words, warnings = told_words(fit, match, motion.name), list(stated_doubts(clock, views))
     return _placed(session, motion, views, clock, warnings, [words])
+
+
+def _by_turning(
+    session: Session, motion: Motion, views: Sequence[View], match: Match, stated_s: float | None
+) -> Clocked:
+    """Takes the offset at which both turn alike, where the chain as it is read does not close."""
+    clock = Clock(
+        match.offset_s, match.sigma_s, "turning", stated_s, 0, match.correlation, speeds={}
+    )
+    warnings = [turning_words(match), *stated_doubts(clock, views)]
+    return _placed(session, motion, views, clock, warnings, [])
 
 
 def _untold(

@@ -16,9 +16,9 @@ from visioncal.types import FloatArray, IntArray, Mask
 ROBOT_STREAM = "robot"
 # Where the flange stays within this for so long before and after [mm, deg, s], clocks do not count.
 _REST_MM, _REST_DEG, _REST_S = 0.1, 0.01, 0.25
-# The slowest fifth of very many moments is taken, and more where that gives too few, each where the
+# The slower half of very many moments is taken, and more where that gives too few, each where the
 # flange has turned or gone this far from the others [rad, m].
-_SLOW_SHARE, _ENOUGH_VIEWS, _MOST_VIEWS = 0.2, 20, 200
+_SLOW_SHARE, _ENOUGH_VIEWS, _MOST_VIEWS = 0.5, 20, 200
 _NEW_RAD, _NEW_M = np.deg2rad(2.0), 0.01
 # What a rotation of 1 rad/s weighs against a speed of 1 m/s.
 _ARM_M = 0.3

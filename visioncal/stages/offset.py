@@ -7,8 +7,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.clock import ClockFit, Match, clock_shared
+from visioncal.estimator.clock import ClockFit, clock_shared
 from visioncal.estimator.shared import Shared
+from visioncal.estimator.turned import Match
 from visioncal.figures import figure
 from visioncal.session import View
 from visioncal.stages.motion import Motion
@@ -22,7 +23,7 @@ FEWEST_VIEWS = 3
 _STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
 
 
-ClockMethod: TypeAlias = Literal["motion", "stated", "rest"]
+ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class Clock:
     Attributes:
         camera_minus_robot_s: The offset [s].
         sigma_s: Its standard deviation [s]; 0 where views at rest make it immaterial.
-        method: Told by the motion, stated by the session, or of no consequence.
+        method: Told by the motion, or by its turning alone; stated by the session; of no
+            consequence, for views at rest.
         stated_s: What the session states [s]; None where it states nothing.
         frames: How many frames in motion told it.
         correlation: Of the angles by which camera and robot turned; None where none was found.
@@ -67,8 +69,10 @@ class Clock:
             known["sigma_s"] = self.sigma_s
         if self.stated_s is not None:
             known["stated_s"] = self.stated_s
-        if self.method == "motion":
-            known |= {"frames": self.frames, "correlation": self.correlation}
+        if self.frames:
+            known["frames"] = self.frames
+        if self.correlation is not None:
+            known["correlation"] = self.correlation
         return known
 
 
@@ -79,6 +83,16 @@ def told_words(fit: ClockFit, match: Match, stream: str) -> str:
         f"{1e3 * fit.sigma_s:.2g} ms), as {fit.frames} frames and streams/{stream}.csv tell by "
         "their motion (the turning of both goes along with a correlation of "
         f"{match.correlation:.2f})."
+    )
+
+
+def turning_words(match: Match) -> str:
+    """Says what the turning alone tells."""
+    return (
+        f"The camera's clock is {1e3 * match.offset_s:+.1f} ms ahead of the robot's (sigma "
+        f"{1e3 * match.sigma_s:.2g} ms), as the turning of both tells (correlation "
+        f"{match.correlation:.2f}). It tells no better, because the chain of frames does not close "
+        "over the motion: check how the poses are to be read."
     )
 
 
