@@ -8,6 +8,7 @@ import typer
 from visioncal.cli.console import messages, shown_progress
 from visioncal.simulation import (
     CellOptions,
+    SweepOptions,
     charuco_target,
     checkerboard_target,
     fine_camera,
@@ -16,7 +17,9 @@ from visioncal.simulation import (
     truth_path,
     wide_camera,
     write_session,
+    write_sweep,
 )
+from visioncal.simulation import sweep as swept
 from visioncal.types import CameraMount
 
 _CAMERAS = {"wide": wide_camera, "fine": fine_camera, "fisheye": fisheye_camera}
@@ -59,6 +62,13 @@ def simulate_command(
     images: Annotated[
         bool, typer.Option(help="Whether to render images; pose pairs are written otherwise.")
     ] = True,
+    sweep: Annotated[
+        bool,
+        typer.Option(help="A sweep without stops: pose pairs by one clock, the robot by another."),
+    ] = False,
+    clock_offset_ms: Annotated[
+        float, typer.Option(help="With --sweep: what the camera's clock is ahead [ms].")
+    ] = 37.0,
     seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
     """Write a simulated session, and its truth in a file beside it."""
@@ -77,11 +87,15 @@ def simulate_command(
         board_scale=board_scale,
         seed=seed,
     )
-    with shown_progress(quiet=False) as told:
-        write_session(
-            simulate(options),
-            folder,
-            lambda share: told("render", round(share * views), views),
-            images=images,
-        )
+    if sweep:
+        how = SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms)
+        write_sweep(swept(options, how), folder)
+    else:
+        with shown_progress(quiet=False) as told:
+            write_session(
+                simulate(options),
+                folder,
+                lambda share: told("render", round(share * views), views),
+                images=images,
+            )
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
