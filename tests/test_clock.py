@@ -1,5 +1,6 @@
 """The offset between the clocks of camera and robot: told by motion, stated, or of no matter."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from visioncal.pipeline import STAGES, calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.result import result_of
 from visioncal.recording import write_recording
+from visioncal.report.content import method_facts
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, Stream, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
@@ -24,6 +26,8 @@ from visioncal.simulation import (
     simulate,
     sweep,
     sweep_session,
+    truth_path,
+    write_sweep,
 )
 from visioncal.stages.clock import set_clock
 from visioncal.stages.pnp import given_poses
@@ -133,6 +137,19 @@ def test_a_folder_and_its_recording_give_the_same(session, tmp_path):
     assert one.stages["clock"] == other.stages["clock"]
     for name, edge in one.edges.items():
         np.testing.assert_array_equal(edge.matrix, other.edges[name].matrix)
+    (fact,) = [it for it in method_facts(one) if it.label == "camera's clock"]
+    assert fact.value.startswith("37.2")
+    assert fact.note.endswith("by motion")
+
+
+def test_a_sweep_is_written_with_its_truth(moved, tmp_path):
+    folder = write_sweep(moved, tmp_path / "sweep")
+    truth = json.loads(truth_path(folder).read_text())
+    assert truth["camera_minus_robot_s"] == AHEAD_S
+    again = Session.load(folder)
+    np.testing.assert_array_equal(again.streams["robot"].values, moved.robot.values)
+    assert again.views[3].stamp_s == moved.frames_s[3]
+    assert again.warnings == ()
 
 
 def test_a_stated_offset_is_compared(session):

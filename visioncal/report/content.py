@@ -283,7 +283,18 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         camera = calibration.camera.camera
         width, height = camera.resolution
         facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
-    return (*facts, *_instrument_facts(calibration))
+    clock = read_stage(calibration, "clock", _clock_fact)
+    return (*facts, *_instrument_facts(calibration), *(() if clock is None else (clock,)))
+
+
+def _clock_fact(clock: Mapping[str, Any]) -> Fact:
+    """How far the camera's clock is ahead of the robot's."""
+    ahead_ms, method = 1e3 * float(clock["camera_minus_robot_s"]), str(clock["method"])
+    if "sigma_s" not in clock:
+        return Fact("camera's clock", f"{ahead_ms:+.4g} ms", "taken so: views at rest")
+    sigma_ms = 1e3 * float(clock["sigma_s"])
+    note = f"{PLUS_MINUS} {significant(sigma_ms)}, ahead of the robot's, by {method}"
+    return Fact("camera's clock", f"{matched(ahead_ms, sigma_ms)} ms", note)
 
 
 def _instrument_facts(calibration: Calibration) -> tuple[Fact, ...]:
