@@ -232,21 +232,47 @@ def screwed(noise: float = 1e-4) -> Session:
     way = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.005])
     x, z = exp(rng.normal(size=(2, 6)))
     seen = invert(exp(np.outer(frames_s, way)) @ x) @ z @ exp(noise * rng.normal(size=(540, 6)))
-    rows = quaternions(seen).tolist()
+    return streamed("screw", (frames_s, seen), (times_s, exp(np.outer(times_s, way))))
+
+
+def streamed(name: str, camera, robot) -> Session:
+    """A session of what a camera saw, and a stream of the robot: times and poses of either."""
+    rows = quaternions(camera[1]).tolist()
     views = [
         View(at, numbers={"stamp_s": float(it)} | dict(zip(MEASURED_CAM_POSE, row, strict=True)))
-        for at, (it, row) in enumerate(zip(frames_s, rows, strict=True))
+        for at, (it, row) in enumerate(zip(camera[0], rows, strict=True))
     ]
-    document = {"schema": 1, "name": "screw", "mount": "eye-in-hand"}
+    document = {"schema": 1, "name": name, "mount": "eye-in-hand"}
     columns = ("view", "stamp_s", *MEASURED_CAM_POSE)
     session = Session(document, columns, tuple(views), None, None, MemoryImages({}))
-    stamped = np.hstack([times_s[:, None], quaternions(exp(np.outer(times_s, way)))])
+    stamped = np.hstack([robot[0][:, None], quaternions(robot[1])])
     return session.with_streams({"robot": Stream(("stamp_s", *POSE), stamped)})
 
 
 def test_motion_that_does_not_tell_the_offset_is_refused():
     with pytest.raises(DegenerateError, match=r"is not told by 540 views, of which 0 .* at rest"):
         calibrate(screwed())
+
+
+def periodic() -> Session:
+    """A flange that does the same every two seconds."""
+    rng, times_s = np.random.default_rng(7), np.arange(0, 20, 0.02)
+    frames_s = np.arange(3, 17, 1 / 15)
+    turns = np.pi * np.array([1, 2, 1, 2, 1, 2])
+    sizes = np.array([0.4, 0.5, 0.3, 0.1, 0.1, 0.1])
+    way = [exp(np.sin(np.outer(it, turns) + np.arange(6)) * sizes) for it in (times_s, frames_s)]
+    x, z = exp(rng.normal(size=(2, 6)))
+    seen = invert(way[1] @ x) @ z @ exp(1e-4 * rng.normal(size=(len(frames_s), 6)))
+    return streamed("periodic", (frames_s, seen), (times_s, way[0]))
+
+
+def test_motion_that_repeats_itself_is_told_by_what_is_stated():
+    with pytest.raises(DegenerateError, match=r"the motion repeats itself: offsets of .* ms"):
+        calibrate(periodic())
+    again = stating(periodic(), 2.05)
+    clock = set_clock(again, given_poses(again), None).clock
+    # A period off, which is for whoever stated it to know.
+    assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
 
 
 def test_a_stream_of_another_time_is_named(session):

@@ -17,10 +17,10 @@ from visioncal.estimator.closure import (
     fit_closure,
     residual_blocks,
 )
-from visioncal.estimator.linalg import covariance, one_blas_thread, spectrum
+from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.shared import Shared
 from visioncal.estimator.trajectory import Trajectory
-from visioncal.estimator.turned import NEAR_S, WINDOW_S, Frames
+from visioncal.estimator.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
 from visioncal.solvers import SOLVERS
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray, Mask
@@ -32,8 +32,8 @@ _ROUNDS, _SETTLED_S = 12, 1e-7
 _OUTLYING = 4.0
 # Errors of frames within this time of each other may be alike [s]; fewer stretches tell nothing.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# A ratio of eigenvalues below this is no information, only rounding.
-_NULL = 1e-10
+# Fits that leave so many times the least are no worse.
+_ALIKE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class ClockFit:
 
     Attributes:
         offset_s: What the camera's clock is ahead of the robot's [s].
-        sigma_s: Its standard deviation [s]; infinite where the motion does not tell it.
+        sigma_s: Its standard deviation [s]; very large where the motion does not tell it.
         edges: Both edges, as the moving frames have them.
         noise: What is left between them.
         frames: How many frames it rests on.
@@ -55,7 +55,7 @@ class ClockFit:
     frames: int
 
 
-def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> ClockFit | None:
+def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tuple[ClockFit, ...]:
     """Fits the offset and both edges together, from several starts.
 
     Args:
@@ -64,20 +64,36 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> Cl
         starts: Offsets to start from [s].
 
     Returns:
-        The fit that leaves the least and stays near its start; None where there is none, as the
-        chain does not close or too few frames are covered.
+        The fits that stay near their starts, the one that leaves the least first; none where the
+        chain does not close, or too few frames are covered.
     """
+    # Frames that are rare and taken at rest match over as long as the rests last.
+    near_s = NEAR_S if frames.are_dense else WIDEST_OFFSET_S
     with one_blas_thread():
         some = frames.only(_evenly(len(frames), _MOST_FRAMES))
         fits = [
             fit
             for it in starts
-            if (fit := _fitted(robot, some, it)) is not None and abs(fit.offset_s - it) <= NEAR_S
+            if (fit := _fitted(robot, some, it)) is not None and abs(fit.offset_s - it) <= near_s
         ]
     # Few frames agree with anything.
     most = max((it.frames for it in fits), default=0)
-    whole = [it for it in fits if 2 * it.frames > most]
-    return min(whole, key=lambda it: it.noise.sigma_rad, default=None)
+    whole = (it for it in fits if 2 * it.frames > most)
+    return tuple(sorted(whole, key=lambda it: it.noise.sigma_rad))
+
+
+def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | None:
+    """The fit that stands out: motion that repeats itself has several that leave as little.
+
+    Of these it is the one that is stated. None where none is, or there are no fits.
+    """
+    if not fits:
+        return None
+    alike = [it for it in fits if it.noise.sigma_rad <= _ALIKE * fits[0].noise.sigma_rad]
+    if all(abs(it.offset_s - fits[0].offset_s) <= NEAR_S for it in alike):
+        return fits[0]
+    near = [it for it in alike if stated_s is not None and abs(it.offset_s - stated_s) <= NEAR_S]
+    return near[0] if near else None
 
 
 def _evenly(count: int, most: int) -> IntArray:
@@ -169,10 +185,8 @@ def _sigma_s(data: Closure, edges: Edges, noise: Noise, stamps_s: FloatArray) ->
     together, as they are: where a lens or an arm errs the same for a while, it is the honest one
     (Liang and Zeger 1986, the sandwich over clusters).
     """
-    information = closure_information(data, edges, noise)
-    if spectrum(information).ratio < _NULL:
-        return np.inf
-    spread = covariance(information)
+    # A direction without information has a very large variance here.
+    spread = covariance(closure_information(data, edges, noise))
     independent = float(spread[12, 12])
     stretches = np.unique((stamps_s - stamps_s[0]) // _STRETCH_S, return_inverse=True)[1]
     count = int(stretches.max()) + 1

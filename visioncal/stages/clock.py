@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.clock import ClockFit, fit_offset
+from visioncal.estimator.clock import ClockFit, clear_fit, fit_offset
 from visioncal.estimator.turned import Frames, Match, turning_matches
 from visioncal.robot import Robot
 from visioncal.session import Session, View
@@ -83,15 +83,16 @@ def set_clock(session: Session, poses: Mapping[int, ViewPoses], robot: Robot | N
     frames = _frames(session, fitted, poses)
     matches = turning_matches(motion.flange, frames)
     sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
-    fit = None
-    if sound:
-        starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
-        fit = fit_offset(motion.flange, frames, starts)
+    starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
+    fits = fit_offset(motion.flange, frames, starts) if sound else ()
+    fit = clear_fit(fits, stated_s)
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
-        return _by_motion(session, motion, views, (fit, sound[0]), stated_s)
-    if sound and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
+        nearest_s = fit.offset_s
+        match = min(sound, key=lambda it: abs(it.offset_s - nearest_s))
+        return _by_motion(session, motion, views, (fit, match), stated_s)
+    if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
         return _by_turning(session, motion, views, sound[0], stated_s)
-    return _untold(session, motion, views, (fit, matches), stated_s)
+    return _untold(session, motion, views, (fits, matches), stated_s)
 
 
 def _stated_s(session: Session) -> float | None:
@@ -147,7 +148,7 @@ def _untold(
     session: Session,
     motion: Motion,
     views: Sequence[View],
-    tried: tuple[ClockFit | None, Sequence[Match]],
+    tried: tuple[Sequence[ClockFit], Sequence[Match]],
     stated_s: float | None,
 ) -> Clocked:
     """Does without an estimate: by what is stated, or with views at rest."""
@@ -192,8 +193,8 @@ def _placed(
     motion: Motion,
     views: Sequence[View],
     clock: Clock,
-    warnings: list[str],
-    notes: list[str],
+    warnings: Sequence[str],
+    notes: Sequence[str],
 ) -> Clocked:
     """Gives views their poses at an offset, and chooses among very many."""
     at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s

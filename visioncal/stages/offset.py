@@ -16,12 +16,11 @@ from visioncal.stages.motion import Motion
 from visioncal.types import FloatArray, Mask
 
 # Angles that go along by less are of other motions; a larger sigma [s] is no answer.
-LEAST_CORRELATION, LARGEST_SIGMA_S = 0.5, 0.01
+LEAST_CORRELATION, LARGEST_SIGMA_S, _ANY_SIGMA_S = 0.5, 0.01, 1.0
 # Fewer views at rest make no calibration.
 FEWEST_VIEWS = 3
 # A stated offset that is off by so many sigmas, and by this share of a frame, is told.
 _STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
-
 
 ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
@@ -111,7 +110,7 @@ def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[str]:
         )
 
 
-def why_untold(fit: ClockFit | None, matches: Sequence[Match]) -> str:
+def why_untold(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
     """Says why the motion does not tell the offset."""
     best = max(matches, key=lambda it: it.correlation, default=None)
     if best is None:
@@ -127,12 +126,15 @@ def why_untold(fit: ClockFit | None, matches: Sequence[Match]) -> str:
             f"the turning of robot and camera goes along best {best.offset_s:+.2f} s apart, where "
             "the search ends"
         )
-    if fit is None or not np.isfinite(fit.sigma_s):
+    if not fits or fits[0].sigma_s > _ANY_SIGMA_S:
         return "the motion is too even: any offset explains it"
-    return (
-        f"the motion tells the offset to {1e3 * fit.sigma_s:.2g} ms only "
-        f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
-    )
+    if fits[0].sigma_s > LARGEST_SIGMA_S:
+        return (
+            f"the motion tells the offset to {1e3 * fits[0].sigma_s:.2g} ms only "
+            f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
+        )
+    several = " and ".join(f"{1e3 * it.offset_s:+.0f}" for it in fits)
+    return f"the motion repeats itself: offsets of {several} ms explain it alike"
 
 
 def no_offset(
@@ -142,7 +144,11 @@ def no_offset(
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
     begin_s, end_s = motion.flange.stamps_s[[0, -1]]
     if not len(views):
-        return DataError("No view has both a time and a pose of the target.")
+        return DataError(
+            "No view has both a time and a pose of the target.",
+            culprits=["views.csv: stamp_s"],
+            next_step="Fill in stamp_s where the target is in the image.",
+        )
     if not motion.flange.covers(stamps_s).any():
         return DataError(
             f"No view lies within streams/{motion.name}.csv: it goes from {begin_s:.6f} to "
