@@ -32,7 +32,7 @@ _ROUNDS, _SETTLED_S = 12, 1e-7
 _OUTLYING = 4.0
 # Errors of frames within this time of each other may be alike [s]; fewer stretches tell nothing.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# Fits that leave so many times the least are no worse.
+# Fits that leave so many times the least, of rotations times positions, are no worse.
 _ALIKE = 1.2
 
 
@@ -79,7 +79,7 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tu
     # Few frames agree with anything.
     most = max((it.frames for it in fits), default=0)
     whole = (it for it in fits if 2 * it.frames > most)
-    return tuple(sorted(whole, key=lambda it: it.noise.sigma_rad))
+    return tuple(sorted(whole, key=_left))
 
 
 def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | None:
@@ -89,11 +89,16 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
     """
     if not fits:
         return None
-    alike = [it for it in fits if it.noise.sigma_rad <= _ALIKE * fits[0].noise.sigma_rad]
+    alike = [it for it in fits if _left(it) <= _ALIKE * _left(fits[0])]
     if all(abs(it.offset_s - fits[0].offset_s) <= NEAR_S for it in alike):
         return fits[0]
     near = [it for it in alike if stated_s is not None and abs(it.offset_s - stated_s) <= NEAR_S]
     return near[0] if near else None
+
+
+def _left(fit: ClockFit) -> float:
+    """What a fit leaves of rotations and positions, as its likelihood has it."""
+    return fit.noise.sigma_rad * fit.noise.sigma_m
 
 
 def _evenly(count: int, most: int) -> IntArray:
