@@ -280,6 +280,11 @@ def test_a_stream_of_another_time_is_named(session):
     late = replace(session.streams["robot"], values=late)
     with pytest.raises(DataError, match=r"No view lies within streams/robot.csv"):
         calibrate(session.with_streams({"robot": late}))
+    # Whoever states about how far they are apart is told the rest.
+    stated = stating(session.with_streams({"robot": late}), 1.0 - 1e6)
+    clocked = set_clock(stated, given_poses(stated), None)
+    # Stamps of a million seconds have digits of a tenth of a nanosecond.
+    assert abs(clocked.clock.camera_minus_robot_s + 1e6 - AHEAD_S) < 1e-4
 
 
 def test_a_stated_offset_stands_where_motion_does_not_tell_it():

@@ -20,7 +20,7 @@ WIDEST_OFFSET_S = 5.0
 WINDOW_S, _STEP_S, _LEAST_SIGMA_S = 0.2, 0.005, 1e-3
 # Peaks of the comparison that stay within so much of the best are rivals, so many at most; nearer
 # than this to each other [s] they are one.
-_RIVAL_SHARE, _MOST_RIVALS, NEAR_S = 0.9, 3, 0.1
+_RIVAL_SHARE, _MOST_RIVALS, NEAR_S = 0.9, 12, 0.1
 _FEWEST_PAIRS = 4
 
 
@@ -76,7 +76,7 @@ class Match:
     at_end: bool = False
 
 
-def turning_matches(robot: Trajectory, frames: Frames) -> tuple[Match, ...]:
+def turning_matches(robot: Trajectory, frames: Frames, about_s: float = 0.0) -> tuple[Match, ...]:
     """Finds the offsets at which camera and robot turn alike, the best first.
 
     Angles are compared between each frame and the first one some time behind it, by their
@@ -85,10 +85,12 @@ def turning_matches(robot: Trajectory, frames: Frames) -> tuple[Match, ...]:
     Args:
         robot: `base_from_flange` over the robot's time.
         frames: What the camera saw.
+        about_s: Around which offset to look [s].
 
     Returns:
         The matches; none where neither turns, or the streams have too little time in common.
     """
+    frames = replace(frames, stamps_s=frames.stamps_s - about_s)
     later = np.searchsorted(frames.stamps_s, frames.stamps_s + WINDOW_S)
     first = np.flatnonzero(later < len(frames))
     if len(first) < _FEWEST_PAIRS:
@@ -102,7 +104,8 @@ def turning_matches(robot: Trajectory, frames: Frames) -> tuple[Match, ...]:
         # Chance alone correlates a short overlap.
         if inside.sum() > max(0.5 * len(first), 2):
             scores[at] = _correlation(turned, turning.by_camera[inside])
-    return _peaks(turning, lags, scores)
+    found = _peaks(turning, lags, scores)
+    return tuple(replace(it, offset_s=it.offset_s + about_s) for it in found)
 
 
 @dataclass(frozen=True, eq=False)

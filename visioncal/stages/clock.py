@@ -81,7 +81,7 @@ def set_clock(session: Session, poses: Mapping[int, ViewPoses], robot: Robot | N
     fitted = [view for view in views if not view.holdout]
     stated_s = _stated_s(session)
     frames = _frames(session, fitted, poses)
-    matches = turning_matches(motion.flange, frames)
+    matches = turning_matches(motion.flange, frames, stated_s or 0.0)
     sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
     starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
     fits = fit_offset(motion.flange, frames, starts) if sound else ()

@@ -154,8 +154,8 @@ def no_offset(
             f"No view lies within streams/{motion.name}.csv: it goes from {begin_s:.6f} to "
             f"{end_s:.6f} s, the views from {stamps_s[0]:.6f} to {stamps_s[-1]:.6f} s.",
             culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
-            next_step="Stamp both with clocks that differ by seconds at most, or state [clock] "
-            "camera_minus_robot_s.",
+            next_step="Stamp both with clocks that differ by seconds at most, or state about what "
+            "they differ by: [clock] camera_minus_robot_s.",
         )
     return DegenerateError(
         f"clock: the offset between the clocks of camera and robot is not told by {len(views)} "
