@@ -1,1 +1,1 @@
-"""Recording a session: an arm and a camera, view by view onto the disk."""
+"""Recording a session from a live cell, one flushed view after the other."""

@@ -125,18 +125,43 @@ def _look(session: Session, view: View, options: DetectOptions) -> _Look:
     image = image_of(session, view)
     if isinstance(image, Rejection):
         return _Look(image, None)
-    resolution = (image.shape[1], image.shape[0])
+    found, misfit = look_for(image, target, view.number, options, name=name)
+    return _Look(found, (image.shape[1], image.shape[0]), misfit)
+
+
+def look_for(
+    image: Image,
+    target: Target,
+    view: int,
+    options: DetectOptions | None = None,
+    *,
+    name: str = "",
+) -> tuple[Corners | Rejection, bool]:
+    """Looks for a target in one image, as `detect` does in those of a session.
+
+    Args:
+        image: (h, w) grey image.
+        target: What to look for.
+        view: The view's number.
+        options: What a view needs.
+        name: What the session calls the target, where it has several.
+
+    Returns:
+        The corners, or why the view cannot be used; and whether markers were seen that lie
+        otherwise than on this target.
+    """
+    options = options or DetectOptions()
     seen = find_target(image, target)
     if isinstance(seen, NotFound):
         cause = why_hard_to_see(image, options.max_blur_px)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
         reason = f"{reason} (looked for target {name})" if name else reason
-        return _Look(Rejection(view.number, reason), resolution, seen.misfit)
+        return Rejection(view, reason), seen.misfit
     blur = blur_at_corners(image, seen.px)
     trouble = _trouble(target, seen.ids, blur, options)
     if trouble:
-        return _Look(Rejection(view.number, trouble), resolution)
-    return _Look(Corners(view.number, seen.ids, seen.px, blur), resolution)
+        return Rejection(view, trouble), False
+    return Corners(view, seen.ids, seen.px, blur), False
 
 
 def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
