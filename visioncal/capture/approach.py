@@ -58,13 +58,6 @@ class Ways:
 
     def _check_limits(self, here: FloatArray) -> None:
         robot = self.plan.cell.robot
-        if len(here) != robot.joint_count:
-            raise DataError(
-                f"the arm has {len(here)} joints, and the plan is for {robot.name} with "
-                f"{robot.joint_count}.",
-                culprits=["--arm", "--plan"],
-                next_step="Plan for the arm that is connected.",
-            )
         outside = (here < robot.lower_rad) | (here > robot.upper_rad)
         if outside.any():
             joint = robot.joint_names[int(np.argmax(outside))]

@@ -10,19 +10,22 @@ import numpy as np
 from visioncal.capture.agree import Agreement
 from visioncal.capture.approach import Ways
 from visioncal.capture.coach import Coach
-from visioncal.capture.core import Capture, Step, Watcher, missed
+from visioncal.capture.core import Capture, Step, Watcher
 from visioncal.capture.drive import drive, joints_of, travel_s
 from visioncal.capture.journal import Journal
 from visioncal.capture.live import LiveCell
 from visioncal.capture.options import CaptureOptions
 from visioncal.capture.predict import PlannedAccuracy
 from visioncal.drivers.protocols import MovingArm
-from visioncal.errors import DriverError, VisioncalError
+from visioncal.errors import DataError, DriverError, VisioncalError
 from visioncal.planning.read_back import PlanFile, Stop
+from visioncal.transforms import pose_difference
 from visioncal.types import Camera, FloatArray
 
 # A stop takes about so long besides the way to it [s].
 _STOP_S = 1.5
+# A nominal model is nearer to its own arm; beyond, the plan is for another one, or another base.
+_SAME_ARM_MM = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +61,11 @@ def departure(
 
     Raises:
         DriverError: The arm does not tell where it is, or is stopped.
-        DataError: The way to the first stop cannot be shown to be free.
+        DataError: The plan is for another arm, or the way to the first stop cannot be shown to be
+            free.
     """
     here = joints_of(cell)
+    _check_model(cell, plan, here)
     stops = tuple(it for it in plan.stops if it.view not in done)
     if not stops:
         return Departure((), here, (), 0.0, 0.0)
@@ -165,9 +170,29 @@ def kept_words(journal: Journal) -> str:
     return f"{count} view{'s are' if count > 1 else ' is'} safe in {journal.folder}."
 
 
-def lost_words(steps: Sequence[Step]) -> str:
-    """Says which stops gave no view; empty where all did."""
-    return "; ".join(f"view {view}: {reason}" for view, reason in missed(steps))
+def _check_model(cell: LiveCell, plan: PlanFile, here: FloatArray) -> None:
+    """Checks that the arm is the plan's: its ways were looked at with that arm in that base.
+
+    Raises:
+        DataError: It is another one.
+    """
+    robot = plan.cell.robot
+    if len(here) != robot.joint_count:
+        raise DataError(
+            f"{cell.arm.name} has {len(here)} joints, and the plan is for {robot.name} with "
+            f"{robot.joint_count}.",
+            culprits=["--arm", "--plan"],
+            next_step="Plan for the arm that is connected.",
+        )
+    reported = cell.state().base_from_flange
+    off_mm, off_deg = pose_difference(robot.base_from_flange(here[None])[0], reported)
+    if off_mm > _SAME_ARM_MM:
+        raise DataError(
+            f"{cell.arm.name}: its flange is {off_mm:.0f} mm and {off_deg:.0f} deg from where the "
+            f"plan's {robot.name} has it at these joints (limit {_SAME_ARM_MM:.0f} mm).",
+            culprits=["--plan"],
+            next_step="Plan for the arm that is connected, in its controller's base.",
+        )
 
 
 def _next_words(left: Sequence[Stop]) -> str:

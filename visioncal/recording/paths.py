@@ -59,6 +59,10 @@ PREDICTED_SIGMA = "/plan/sigma_after_so_many_stops_mm"
 PLAN_NOTE = "/notes/plan"
 STOP_NOTE = "/notes/stop"
 
+# A recording at work.
+LIVE_SIGMA = "/live/predicted_sigma_mm"
+LIVE_NOTE = "/notes/recording"
+
 # Plots and text.
 RESIDUALS = "/residuals"
 POSITION_MM = f"{RESIDUALS}/position_mm"
