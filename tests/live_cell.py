@@ -12,9 +12,10 @@ from planned import true_cell
 from visioncal.camera import matrix_3x3
 from visioncal.drivers.protocols import ArmState, Frame, Safety
 from visioncal.errors import DriverError
-from visioncal.planning.cell import PlanCell
+from visioncal.planning.cell import Limits, PlanCell
 from visioncal.planning.purposes import purpose_of
 from visioncal.planning.read_back import PlanFile, Stop
+from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
 from visioncal.targets import charuco_board
 from visioncal.types import Camera, FloatArray
@@ -33,12 +34,15 @@ class FakeClock:
     seconds: float = 1000.0
 
     def now(self) -> float:
+        """The time [s]."""
         return self.seconds
 
     def sleep(self, seconds: float) -> None:
+        """Lets time pass."""
         self.seconds += seconds
 
     def unix_offset_s(self) -> float:
+        """What makes the time a UNIX time [s]."""
         return 1.7e9
 
 
@@ -46,8 +50,9 @@ class FakeClock:
 class FakeArm:
     """An arm whose joints go straight to their goal by trapezoids, and what may befall it.
 
-    `trembling_s` after each motion it swings by `tremble_rad`, unseen by its own encoders if
-    `hidden`. At a moment `fails_at` after a motion began, `failure` happens.
+    For `trembling_s` after each motion it swings by `tremble_rad`, unseen by its own encoders if
+    `hidden`. `fails_at` seconds after a motion began, `failure` happens: `gone`, or a stop by its
+    name. `stale` names what it tells as it was at the beginning: `joints`.
     """
 
     cell: PlanCell
@@ -68,6 +73,7 @@ class FakeArm:
     _stuck: FloatArray | None = None
 
     def true_q(self, at: float) -> FloatArray:
+        """Where the joints really are [rad]."""
         q, since = self._smooth(at)
         if since is not None and since < self.trembling_s:
             share = 1.0 - since / self.trembling_s
@@ -75,6 +81,7 @@ class FakeArm:
         return q
 
     def true_flange(self, at: float) -> FloatArray:
+        """Where the flange really is."""
         return self.cell.robot.base_from_flange(self.true_q(at)[None])[0]
 
     def _smooth(self, at: float) -> tuple[FloatArray, float | None]:
@@ -97,6 +104,7 @@ class FakeArm:
         return self.q0 + way * (gone / far), since if since >= 0.0 else None
 
     def state(self) -> ArmState:
+        """What its encoders say."""
         self.clock.sleep(CYCLE_S)
         now = self.clock.now()
         fails = self.failure and self.goal is not None and now - self.begun > self.fails_at
@@ -136,18 +144,21 @@ class FakeArm:
             self._stuck = self._smooth(now)[0]
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
+        """Begins a trapezoid."""
         now = self.clock.now()
         self.q0 = self._smooth(now)[0]
         self.goal, self.begun, self.pace = np.array(q), now, (speed, acceleration)
         self.moves += 1
 
     def moving(self) -> bool:
+        """Whether the trapezoid has not ended."""
         self.clock.sleep(CYCLE_S)
         if self._stuck is not None:
             return False
         return self.goal is not None and self._smooth(self.clock.now())[1] is None
 
     def halt(self) -> None:
+        """Stands still from now on."""
         self.halted += 1
         self._freeze(self.clock.now())
 
@@ -181,9 +192,11 @@ class FakeCamera:
 
     @property
     def resolution(self) -> tuple[int, int]:
+        """Of the lens."""
         return self.lens.resolution
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """A picture of the true arm's view, smeared where that moves."""
         if self.frames >= self.unplugged_after:
             self.arm.clock.sleep(timeout_s)
             raise DriverError("fake camera: no picture in 1 s.", next_step="Check its cable.")
@@ -223,11 +236,18 @@ class FakeCamera:
 def fake_plan(stops: int = 5, seed: int = 2) -> PlanFile:
     """A plan whose stops all see the board; its ways are not looked at."""
     options = CellOptions(robot="ur5e", camera=LENS, views=stops, seed=seed, cut_views=0.0)
-    cell = replace(true_cell(options), sigma_m=1e-3, sigma_rad=1e-3)
+    # The simulated camera sits close to the wrist: the links are thin, so that nothing is near.
+    limits = Limits(clearance_m=0.0, floor_m=None)
+    cell = replace(true_cell(options), limits=limits, robot=_thin(load_robot("ur5e")))
     q = simulate(options).joints
     none = np.zeros((0, 6))
     planned = tuple(Stop(at + 1, it, none, f"words of stop {at + 1}") for at, it in enumerate(q))
     return PlanFile(cell, purpose_of("hand-eye"), planned, q[0] + 0.002, "0" * 64)
+
+
+def _thin(robot: Robot) -> Robot:
+    joints = [{**it, "body_radius_m": 0.01} for it in robot.document["joint"]]
+    return Robot.from_document({**robot.document, "joint": joints})
 
 
 def fake_devices(plan: PlanFile, **changes) -> tuple[FakeArm, FakeCamera]:

@@ -14,8 +14,9 @@ from visioncal.types import FloatArray
 _POLL_S = 0.02
 # A motion may take so many times its time, and so much longer [s], before something is wrong.
 _TIMES, _MORE_S = 1.5, 3.0
-# Controllers come to rest this near to a posture [rad].
-_ARRIVED_RAD = 2e-3
+# An arm may tremble about its goal so far when it has arrived; one that was stopped is farther off,
+# or stands where a view is as good [rad].
+_ARRIVED_RAD = 2e-2
 
 
 def travel_s(start: FloatArray, end: FloatArray, speed: float, acceleration: float) -> float:

@@ -14,6 +14,8 @@ from visioncal.types import FloatArray, Image
 _POINTS, _WINDOW_PX = 80, 21
 # Fewer points tell nothing: the image shows nothing, and no view comes of it.
 _FEWEST = 8
+# Under this many grey levels from dark to light there is nothing but noise to follow.
+_CONTRAST = 20
 # Points that are lost count as moved where they are more than this share.
 _LOST = 0.5
 # Differences of grey levels between windows that show the same.
@@ -83,6 +85,9 @@ def image_motion_px(first: Image, then: Image) -> float:
         The points' median shift [px]; zero where nothing stands out, infinite where most points
         are not found again.
     """
+    low, high = np.percentile(first[::4, ::4], [1, 99])
+    if high - low < _CONTRAST:
+        return 0.0
     points = cv2.goodFeaturesToTrack(first, _POINTS, 0.05, _WINDOW_PX)
     if points is None or len(points) < _FEWEST:
         return 0.0

@@ -133,7 +133,11 @@ def _tell(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
         return
     first = leaving.stops[0]
     postures = len(leaving.first)
-    via = f" by {postures - 1} posture{'s' if postures > 2 else ''} in between" if postures > 1 else ""
+    via = (
+        f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
+        if postures > 1
+        else ""
+    )
     say(
         escape(
             f"{cell.arm.name}, {cell.camera.name}: {count} stop{'s' if count > 1 else ''} to drive "
@@ -154,9 +158,7 @@ def _confirm(cell: LiveCell) -> None:
             culprits=["--yes"],
             next_step="Say --yes where the cell is clear and somebody holds the stop button.",
         )
-    sentence = (
-        f"{cell.arm.name} will move. Is the cell clear, and a hand on the stop button?"
-    )
+    sentence = f"{cell.arm.name} will move. Is the cell clear, and a hand on the stop button?"
     if not typer.confirm(sentence, err=True):
         raise DataError("record: not begun; nothing moved.", next_step="Look with --dry-run.")
 

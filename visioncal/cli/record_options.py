@@ -14,7 +14,9 @@ _MOVING = "How the arm is moved"
 _CAMERA = "What the camera is set to"
 
 
-def _option(*names: str, words: str, panel: str | None = None, metavar: str | None = None) -> object:
+def _option(
+    *names: str, words: str, panel: str | None = None, metavar: str | None = None
+) -> object:
     return typer.Option(
         *names, help=words, rich_help_panel=panel, show_default=False, metavar=metavar
     )
@@ -52,7 +54,10 @@ Follow: TypeAlias = Annotated[
 Views: TypeAlias = Annotated[
     int,
     typer.Option(
-        "--views", min=0, help="With --follow or a manual arm: end after so many.", show_default=False
+        "--views",
+        min=0,
+        help="With --follow or a manual arm: end after so many.",
+        show_default=False,
     ),
 ]
 Resume: TypeAlias = Annotated[
@@ -61,9 +66,7 @@ Resume: TypeAlias = Annotated[
 DryRun: TypeAlias = Annotated[
     bool, typer.Option("--dry-run", help="Only say what would be driven; nothing moves.")
 ]
-Yes: TypeAlias = Annotated[
-    bool, typer.Option("--yes", help="Begin to move without asking.")
-]
+Yes: TypeAlias = Annotated[bool, typer.Option("--yes", help="Begin to move without asking.")]
 View: TypeAlias = Annotated[
     bool, typer.Option("--view", help="Show it in the rerun viewer as it goes.")
 ]
@@ -89,9 +92,7 @@ MountOption: TypeAlias = Annotated[
 ]
 PoseForm: TypeAlias = Annotated[
     str | None,
-    _option(
-        "--pose-form", panel=_CELL, words="With a manual arm: ur, kuka, abb, fanuc or ours."
-    ),
+    _option("--pose-form", panel=_CELL, words="With a manual arm: ur, kuka, abb, fanuc or ours."),
 ]
 
 Frames: TypeAlias = Annotated[
@@ -100,9 +101,7 @@ Frames: TypeAlias = Annotated[
 ]
 KeepOption: TypeAlias = Annotated[
     Keep,
-    typer.Option(
-        "--keep", help="The sharpest of these, or their mean.", rich_help_panel=_TAKING
-    ),
+    typer.Option("--keep", help="The sharpest of these, or their mean.", rich_help_panel=_TAKING),
 ]
 StillPx: TypeAlias = Annotated[
     float,

@@ -117,9 +117,7 @@ class LiveDrawing:
         picture = rr.Image(view.image, color_model=model).compress(jpeg_quality=_JPEG)
         self.stream.log(paths.IMAGE, in_image, picture)
         # Rerun counts from the image's corner, not from the first pixel's centre.
-        points = rr.Points2D(
-            view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5)
-        )
+        points = rr.Points2D(view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5))
         self.stream.log(paths.DETECTED, in_image, points)
 
     def _draw_cell(self, view: LiveView) -> None:
