@@ -102,7 +102,7 @@ def _manual(wish: ArmWish) -> Arm:
 def _oak(address: str, wishes: DeviceWishes) -> CameraDevice:
     from visioncal.drivers.oak import OakCamera
 
-    return OakCamera(address or None, wishes)
+    return OakCamera(wishes, device=address or None)
 
 
 def _uvc(address: str, wishes: DeviceWishes) -> CameraDevice:

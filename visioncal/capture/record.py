@@ -158,7 +158,9 @@ def closed_cleanly(cell: LiveCell, journal: Journal) -> Iterator[None]:
         ) from None
     except VisioncalError as error:
         message = f"{error.message} {kept_words(journal)}"
-        step = error.next_step or "Go on with --resume."
+        step = error.next_step
+        if "--resume" not in step:
+            step = f"{step} Go on with --resume.".strip()
         raise type(error)(message, culprits=error.culprits, next_step=step) from error
 
 

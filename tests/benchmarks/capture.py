@@ -1,0 +1,119 @@
+"""What recording costs beyond motion and settling, and whether kills lose views.
+
+python tests/benchmarks/capture.py            30 planned views, through the UR's client library
+python tests/benchmarks/capture.py --kills 20 recordings killed at random moments
+"""
+
+import argparse
+import shutil
+import tempfile
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from killed import kill_and_resume
+from planned import true_cell
+
+from visioncal.capture.core import Step
+from visioncal.capture.facts import Facts
+from visioncal.capture.journal import Journal
+from visioncal.capture.live import LiveCell
+from visioncal.capture.options import CaptureOptions
+from visioncal.capture.record import record
+from visioncal.drivers.ur import UrArm
+from visioncal.planning.cell import PlanCell
+from visioncal.planning.plan import Request, make_plan
+from visioncal.planning.purposes import purpose_of
+from visioncal.planning.read_back import PlanFile, Stop
+from visioncal.rehearsal.camera import RehearsalCamera
+from visioncal.rehearsal.controller import spawn
+from visioncal.rehearsal.options import ControllerOptions
+from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation.arms import ArmErrors
+
+# More than this beside motion and settling is too much [s].
+ALLOWED_S = 0.5
+EXACT = ArmErrors(0.0, 0.0, 0.0)
+
+
+class _Printed:
+    """Prints the times of each view."""
+
+    def stepped(self, step: Step) -> None:
+        """Prints them."""
+        times = step.times
+        print(
+            f"  view {step.view}: moved {times.moved_s:.2f} s, settled {times.settled_s:.2f} s, "
+            f"worked {times.worked_s:.3f} s",
+            flush=True,
+        )
+
+
+def planned(cell: PlanCell, stops: int, start_q: tuple[float, ...]) -> PlanFile:
+    """A plan of a cell, as it would be read back."""
+    request = Request(purpose_of("hand-eye"), stops, start_q=np.array(start_q), candidates=200)
+    plan = make_plan(cell, request)
+    found = tuple(Stop(it.view, it.q, it.via, it.words) for it in plan.stops)
+    return PlanFile(cell, request.purpose, found, request.start_q, "0" * 64)
+
+
+def measure(stops: int) -> None:
+    """Records planned views of a simulated cell, and says what each took."""
+    options = CellOptions(robot="ur10e", views=1)
+    controller_options = ControllerOptions(errors=EXACT)
+    cell = replace(true_cell(options), sigma_rad=0.01, sigma_m=0.005)
+    begun = time.perf_counter()
+    plan = planned(cell, stops, controller_options.q)
+    print(f"planned {len(plan.stops)} stops in {time.perf_counter() - begun:.1f} s", flush=True)
+    folder = Path(tempfile.mkdtemp()) / "live"
+    with spawn(controller_options) as controller, closing(UrArm(controller.host)) as arm:
+        truth = controller.truth
+        camera = RehearsalCamera(simulate(options), lambda at: truth.state([at]).q[0])
+        live = LiveCell(arm, camera)
+        facts = Facts(
+            "live",
+            cell.mount,
+            cell.target,
+            cell.robot,
+            arm.name,
+            camera.name,
+            camera.resolution,
+            camera.factory,
+            camera.settings,
+            plan.digest,
+        )
+        journal = Journal.begin(folder, facts, live.clock.unix_offset_s(), stops)
+        taking = CaptureOptions(speed=1.0, acceleration=1.5)
+        steps = record(live, plan, journal, taking, [_Printed()], lens=camera.factory)
+    worked = np.array([it.times.worked_s for it in steps])
+    print(
+        f"{len(steps)} views: worked {np.median(worked):.3f} s a view (median), "
+        f"{worked.max():.3f} s at most (allowed {ALLOWED_S} s); on the way "
+        f"{sum(it.times.moved_s for it in steps):.0f} s, settling "
+        f"{sum(it.times.settled_s for it in steps):.0f} s in all"
+    )
+    shutil.rmtree(folder.parent)
+
+
+def main() -> None:
+    """Runs one of both."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kills", type=int, default=0)
+    parser.add_argument("--stops", type=int, default=30)
+    given = parser.parse_args()
+    if not given.kills:
+        measure(given.stops)
+        return
+    folder = Path(tempfile.mkdtemp()) / "live"
+    ends = kill_and_resume(folder, stops=3 * given.kills, kills=given.kills, seed=1, most_s=0.9)
+    for end in ends:
+        print(f"  killed after {end.after_s:.2f} s: {end.acknowledged} views acknowledged by then")
+    killed = sum(not it.done for it in ends)
+    print(f"{killed} kills, none of {3 * given.kills} acknowledged views lost")
+    shutil.rmtree(folder.parent)
+
+
+if __name__ == "__main__":
+    main()
