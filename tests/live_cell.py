@@ -174,7 +174,7 @@ class FakeCamera:
     lens: Camera = LENS
     name: str = "fake camera"
     hidden_at: tuple[int, ...] = ()
-    unplugged_after: int = 10**9
+    unplugged_at: int = 10**9
     factory: Camera | None = None
     settings: dict[str, str | float] = field(default_factory=lambda: {"exposure_us": 10000.0})
     frames: int = 0
@@ -188,7 +188,10 @@ class FakeCamera:
         self._print = cv2.copyMakeBorder(
             board.generateImage(size), *(_PX_A_SQUARE // 2,) * 4, cv2.BORDER_CONSTANT, value=255
         )
+        width, height = self.lens.resolution
+        # Fresh noise is a part of a larger picture of it, which is quicker than drawing it anew.
         self._rng = np.random.default_rng(3)
+        self._noise = self._rng.standard_normal((height + 50, width + 50)).astype(np.float32)
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -197,9 +200,11 @@ class FakeCamera:
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """A picture of the true arm's view, smeared where that moves."""
-        if self.frames >= self.unplugged_after:
+        if self.arm.moves >= self.unplugged_at:
             self.arm.clock.sleep(timeout_s)
-            raise DriverError("fake camera: no picture in 1 s.", next_step="Check its cable.")
+            raise DriverError(
+                f"fake camera: no picture in {timeout_s:g} s.", next_step="Check its cable."
+            )
         self.frames += 1
         begun = self.arm.clock.now()
         middle = begun + 0.5 * EXPOSURE_S
@@ -212,7 +217,9 @@ class FakeCamera:
         image = np.mean([self._seen(it) for it in poses], axis=0)
         if self.arm.moves in self.hidden_at:
             image = np.full_like(image, 110.0)
-        noisy = image + self.noise * self._rng.standard_normal(image.shape)
+        top, left = self._rng.integers(0, 50, 2)
+        height, width = image.shape
+        noisy = image + self.noise * self._noise[top : top + height, left : left + width]
         return Frame(np.clip(np.rint(noisy), 0, 255).astype(np.uint8), middle, EXPOSURE_S)
 
     def _seen(self, base_from_flange: FloatArray) -> FloatArray:
@@ -227,7 +234,7 @@ class FakeCamera:
         seen = cv2.warpPerspective(
             self._print, warp, self.lens.resolution, flags=flags, borderValue=120
         )
-        return cv2.GaussianBlur(seen, (0, 0), 0.7).astype(float)
+        return cv2.GaussianBlur(seen, (0, 0), 0.7).astype(np.float32)
 
     def close(self) -> None:
         """Nothing is open."""

@@ -107,7 +107,7 @@ def main() -> None:
         measure(given.stops)
         return
     folder = Path(tempfile.mkdtemp()) / "live"
-    ends = kill_and_resume(folder, stops=3 * given.kills, kills=given.kills, seed=1, most_s=0.9)
+    ends = kill_and_resume(folder, stops=3 * given.kills, kills=given.kills, seed=1, most_s=2.5)
     for end in ends:
         print(f"  killed after {end.after_s:.2f} s: {end.acknowledged} views acknowledged by then")
     killed = sum(not it.done for it in ends)

@@ -12,6 +12,9 @@ from visioncal.types import FloatArray
 
 # How often the arm is asked while it moves [s].
 _POLL_S = 0.02
+# How often the camera is, and for how long its picture is waited for [s]; both devices' failures
+# are noticed within a second.
+_GLANCE_S, _FRAME_S = 0.3, 0.5
 # A motion may take so many times its time, and so much longer [s], before something is wrong.
 _TIMES, _MORE_S = 1.5, 3.0
 # An arm may tremble about its goal so far when it has arrived; one that was stopped is farther off,
@@ -59,8 +62,13 @@ def _move(cell: LiveCell, arm: MovingArm, goal: FloatArray, options: CaptureOpti
     allowed_s = _TIMES * expected_s + _MORE_S
     begun = cell.clock.now()
     arm.start_move(goal, speed=speed, acceleration=acceleration)
+    glanced = begun
     while arm.moving():
         cell.state()
+        if cell.clock.now() - glanced > _GLANCE_S:
+            # A camera that is gone is told now, not at the end of a long way.
+            cell.camera.frame(timeout_s=_FRAME_S)
+            glanced = cell.clock.now()
         took = cell.clock.now() - begun
         if took > allowed_s:
             raise DriverError(

@@ -34,6 +34,11 @@ class LiveCell:
             DriverError: It is stopped, its link is lost, or what it says is old.
         """
         state = self.arm.state()
+        old_s = self.clock.now() - state.stamp_s
+        if old_s > _STALE_S:
+            # This computer may have slept in between.
+            state = self.arm.state()
+            old_s = self.clock.now() - state.stamp_s
         if state.safety in _STOPPED:
             words = state.safety.replace("-", " ")
             raise DriverError(
@@ -41,7 +46,6 @@ class LiveCell:
                 culprits=[self.arm.name],
                 next_step=f"{_STOPPED[state.safety]} and go on with --resume.",
             )
-        old_s = self.clock.now() - state.stamp_s
         if old_s > _STALE_S:
             raise DriverError(
                 f"{self.arm.name}: its newest state is {old_s:.1f} s old; one of the last "

@@ -14,7 +14,7 @@ from visioncal.viewer.process import viewer_process
 
 _HOST = "127.0.0.1"
 # A viewer that does not listen by then is not coming [s].
-_PATIENCE_S, _POLL_S = 10.0, 0.1
+_PATIENCE_S, _POLL_S, _WINDOW_S = 10.0, 0.1, 1.0
 # What was drawn last is on its way for so long at most [s].
 _FLUSH_S = 2.0
 
@@ -37,13 +37,15 @@ def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
         port = free.getsockname()[1]
     with viewer_process("--bind", _HOST, "--port", str(port)) as process:
         until = time.monotonic() + _PATIENCE_S
-        while not _listens(port):
-            if process.poll() is not None or time.monotonic() > until:
-                raise DriverError(
-                    "rerun's viewer cannot be shown here; is there a display?",
-                    next_step="Record without --view.",
-                )
+        while process.poll() is None and time.monotonic() < until and not _listens(port):
             time.sleep(_POLL_S)
+        # It listens before it opens its window, and ends where it cannot.
+        time.sleep(_WINDOW_S)
+        if process.poll() is not None or not _listens(port):
+            raise DriverError(
+                "rerun's viewer cannot be shown here; is there a display?",
+                next_step="Record without --view.",
+            )
         stream = rr.RecordingStream(paths.APPLICATION)
         stream.connect_grpc(f"rerun+http://{_HOST}:{port}/proxy")
         stream.send_recording_name(name)
