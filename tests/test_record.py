@@ -6,12 +6,14 @@ import sys
 from dataclasses import replace
 from unittest.mock import patch
 
+import cv2
 import numpy as np
 import pytest
 import rerun as rr
 from commands import Done, visioncal
 from drawn import column
 from live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from scipy.spatial.transform import Rotation
 
 from visioncal.capture import devices
 from visioncal.cli import record as command
@@ -227,6 +229,37 @@ def test_a_guided_arm_is_followed(planned, cell, tmp_path):
     session = Session.load(tmp_path / "live")
     assert len(session.views) == 4
     assert session.robot_name == "ur5e"
+
+
+def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
+    plan = read_plan(planned[0])
+    arm, camera = fake_devices(plan)
+    (tmp_path / "pictures").mkdir()
+    lines = []
+    for at, stop in enumerate(plan.stops):
+        arm.q0 = stop.q
+        cv2.imwrite(str(tmp_path / "pictures" / f"shot{at}.png"), camera.frame().image)
+        pose = arm.true_flange(0.0)
+        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        numbers = ", ".join(f"{it:.6f}" for it in [*pose[:3, 3], *turn])
+        # Take it, its pose, and yes, that is what it means.
+        lines += ["", f"p[{numbers}]", ""]
+    answers = io.StringIO("\n".join([*lines, "q", ""]))
+    words = ["--arm", "manual", "--camera", f"folder:{tmp_path / 'pictures'}"]
+    words += ["--target", "charuco_9x6_30mm", "-o", tmp_path / "live"]
+    with patch.object(sys, "stdin", answers):
+        done = visioncal("record", *words)
+    assert done.status == 0, done.err
+    session = Session.load(tmp_path / "live")
+    assert len(session.views) == len(plan.stops)
+    for view, stop in zip(session.views, plan.stops, strict=True):
+        flange = plan.cell.robot.base_from_flange(stop.q[None])[0]
+        # Six digits of metres and radians.
+        assert np.allclose(view.base_from_flange().as_matrix(), flange, atol=5e-6)
+    with patch.object(sys, "stdin", io.StringIO("")):
+        done = visioncal("record", *words, "--resume")
+    assert done.status == 2
+    assert "begins with its first picture again" in done.err
 
 
 def test_a_recording_is_drawn(tmp_path):

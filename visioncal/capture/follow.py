@@ -101,12 +101,20 @@ def ask_and_take(capture: Capture, arm: Arm, count: int, ask: Callable[[str], st
             number = _next(capture)
             wish = capture.coach.advice()
             hint = f" ({wish})" if wish else ""
-            if ask(f"View {number}{hint}: Enter takes it, q ends: ").strip().lower() == "q":
+            if _ends(ask, f"View {number}{hint}: Enter takes it, q ends: "):
                 break
             held = HeldArm(arm.name, arm.state(), clock)
             capture.cell = LiveCell(held, camera, clock)
             capture.view(number, len(capture.journal.views) + 1, count, 0.0)
     return capture.steps
+
+
+def _ends(ask: Callable[[str], str], question: str) -> bool:
+    try:
+        return ask(question).strip().lower() == "q"
+    except EOFError:
+        # A file of answers ends so.
+        return True
 
 
 def _rest(cell: LiveCell, been: Sequence[FloatArray], still: Stillness) -> tuple[ArmState, float]:

@@ -90,6 +90,8 @@ def record_command(
         start = Journal.resume if resume else Journal.begin
         count = len(scene.planned.stops) if drives else views
         journal = start(out, facts, cell.clock.unix_offset_s(), count)
+        if resume and taking.single:
+            _check_not_begun(journal, camera)
         watchers = [_Console(), *open_devices.enter_context(shown_in(scene, cell, wanted=view))]
         if drives:
             steps = _driven(cell, scene, journal, taking, watchers, asks=not yes)
@@ -213,6 +215,17 @@ def _check_driven(scene: Scene, *, drives: bool) -> None:
     )
 
 
+def _check_not_begun(journal: Journal, camera: str) -> None:
+    """A folder begins with its first picture again, which would go to the wrong pose."""
+    if journal.views:
+        raise DataError(
+            f"--resume: {camera} begins with its first picture again, and {len(journal.views)} "
+            "views are there.",
+            culprits=["--resume"],
+            next_step="Record all of it into a new folder.",
+        )
+
+
 def _undriven(name: str) -> DriverError:
     return DriverError(
         f"{name} cannot be driven.", culprits=[name], next_step="Guide it by hand: --follow."
@@ -220,10 +233,16 @@ def _undriven(name: str) -> DriverError:
 
 
 def _asked(question: str) -> str:
-    """Asks on stderr, which leaves stdout to results."""
+    """Asks on stderr, which leaves stdout to results.
+
+    Raises:
+        EOFError: Nothing more is typed.
+    """
     messages().print(escape(question), end="")
     line = sys.stdin.readline()
-    return line if line else "q"
+    if not line:
+        raise EOFError
+    return line.rstrip("\r\n")
 
 
 def _size(words: str | None) -> tuple[int, int] | None:
