@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 from dataclasses import replace
 from unittest.mock import patch
@@ -106,7 +107,7 @@ def test_a_plan_is_driven_and_told_line_by_line(planned, cell, tmp_path):
     lines = [it for it in done.err.splitlines() if it.startswith("[")]
     assert [it[:5] for it in lines] == ["[1/4]", "[2/4]", "[3/4]", "[4/4]"]
     assert "predicted sigma" in lines[-1]
-    assert lines[-1].endswith("-> next: done")
+    assert re.search(r"-> next: view \d, for [0-9.]+ mm$", lines[-2])
     assert "visioncal calibrate" in done.err
     assert len(Session.load(tmp_path / "live").views) == 4
     assert cell[0].halted == 0

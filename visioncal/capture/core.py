@@ -13,6 +13,7 @@ from visioncal.capture.options import CaptureOptions
 from visioncal.capture.predict import Prediction
 from visioncal.capture.take import Missed, Taken, settle, take
 from visioncal.errors import DataError
+from visioncal.figures import figure
 from visioncal.finders.imaging import decode_image
 from visioncal.planning.accuracy import Accuracy
 from visioncal.stages.detect import look_for
@@ -97,7 +98,15 @@ class Capture:
             if state is not None:
                 self.agreement.why_not(state)
 
-    def view(self, number: int, place: int, count: int, moved_s: float, advice: str = "") -> Step:
+    def view(
+        self,
+        number: int,
+        place: int,
+        count: int,
+        moved_s: float,
+        *,
+        onward: int | None = None,
+    ) -> Step:
         """Takes a view where the arm stands.
 
         Args:
@@ -105,7 +114,7 @@ class Capture:
             place: Which of the stops it is, from 1 on.
             count: How many there are; 0 where that is open.
             moved_s: How long the arm was on its way here [s].
-            advice: What comes next; empty to have it thought about.
+            onward: The view that comes next; None where a person chooses it.
 
         Raises:
             DriverError: A device fails, or the arm is stopped.
@@ -123,7 +132,7 @@ class Capture:
         found = self._kept(number, found)
         accuracy = self._accuracy()
         times = Times(moved_s, rested - begun, clock.now() - rested)
-        advice = advice or self.coach.advice()
+        advice = self.coach.advice() if onward is None else self._onward(onward)
         step = Step(number, place, count, found, self.coach.words(), accuracy, advice, times)
         self.steps.append(step)
         for watcher in self.watchers:
@@ -146,6 +155,15 @@ class Capture:
         if self.prediction is None:
             return None
         return self.prediction.after([it.number for it in self.journal.views])
+
+    def _onward(self, view: int) -> str:
+        """Names the next view, and what is predicted with it."""
+        if self.prediction is None:
+            return f"view {view}"
+        then = self.prediction.after([*(it.number for it in self.journal.views), view])
+        if then is None or then.is_open:
+            return f"view {view}"
+        return f"view {view}, for {figure(then.mm)} mm"
 
     def _check_lost(self) -> None:
         last = self.steps[-self.options.lost :]

@@ -134,8 +134,8 @@ def record(
             drive(cell, arm, ways.to(stop, joints_of(cell)), options)
             moved_s = cell.clock.now() - begun
             place = len(plan.stops) - len(left) + at + 1
-            advice = _next_words(left[at + 1 :])
-            capture.view(stop.view, place, len(plan.stops), moved_s, advice)
+            onward = left[at + 1].view if at + 1 < len(left) else None
+            capture.view(stop.view, place, len(plan.stops), moved_s, onward=onward)
     return capture.steps
 
 
@@ -195,9 +195,3 @@ def _check_model(cell: LiveCell, plan: PlanFile, here: FloatArray) -> None:
             culprits=["--plan"],
             next_step="Plan for the arm that is connected, in its controller's base.",
         )
-
-
-def _next_words(left: Sequence[Stop]) -> str:
-    if not left:
-        return "done"
-    return f"view {left[0].view}: {left[0].words}" if left[0].words else f"view {left[0].view}"
