@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import signal
 import sys
 from dataclasses import replace
 from unittest.mock import patch
@@ -168,6 +169,23 @@ def test_a_recording_that_failed_is_resumed(planned, cell, tmp_path, monkeypatch
     done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--resume")
     assert done.status == 0
     assert "nothing is left to drive" in done.err
+
+
+def test_a_signal_ends_it_like_ctrl_c(planned, cell, tmp_path):
+    arm, camera = cell
+    frame = camera.frame
+
+    def signalled(**words):
+        if arm.moves == 3:
+            signal.raise_signal(signal.SIGTERM)
+        return frame(**words)
+
+    camera.frame = signalled
+    done = record(tmp_path / "live", "--plan", planned[0], "--yes")
+    assert done.status == 2
+    assert "stopped by Ctrl-C or a signal; the arm was halted" in done.err
+    assert arm.halted == 1
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):

@@ -1,6 +1,6 @@
 """One view after the other: settled, taken, checked, put on the disk, and told."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -104,8 +104,7 @@ class Capture:
         place: int,
         count: int,
         moved_s: float,
-        *,
-        onward: int | None = None,
+        advise: Callable[[], str],
     ) -> Step:
         """Takes a view where the arm stands.
 
@@ -114,7 +113,7 @@ class Capture:
             place: Which of the stops it is, from 1 on.
             count: How many there are; 0 where that is open.
             moved_s: How long the arm was on its way here [s].
-            onward: The view that comes next; None where a person chooses it.
+            advise: Says what comes next, once the view is there.
 
         Raises:
             DriverError: A device fails, or the arm is stopped.
@@ -132,13 +131,24 @@ class Capture:
         found = self._kept(number, found)
         accuracy = self._accuracy()
         times = Times(moved_s, rested - begun, clock.now() - rested)
-        advice = self.coach.advice() if onward is None else self._onward(onward)
+        advice = advise()
         step = Step(number, place, count, found, self.coach.words(), accuracy, advice, times)
         self.steps.append(step)
         for watcher in self.watchers:
             watcher.stepped(step)
         self._check_lost()
         return step
+
+    def onward(self, view: int | None) -> str:
+        """Names the view that is next, and what is predicted with it; empty where none is."""
+        if view is None:
+            return ""
+        if self.prediction is None:
+            return f"view {view}"
+        then = self.prediction.after([*(it.number for it in self.journal.views), view])
+        if then is None or then.is_open:
+            return f"view {view}"
+        return f"view {view}, for {figure(then.mm)} mm"
 
     def _kept(self, number: int, found: Taken | Missed) -> Taken | Missed:
         """Puts a view on the disk, if it can be believed."""
@@ -155,15 +165,6 @@ class Capture:
         if self.prediction is None:
             return None
         return self.prediction.after([it.number for it in self.journal.views])
-
-    def _onward(self, view: int) -> str:
-        """Names the next view, and what is predicted with it."""
-        if self.prediction is None:
-            return f"view {view}"
-        then = self.prediction.after([*(it.number for it in self.journal.views), view])
-        if then is None or then.is_open:
-            return f"view {view}"
-        return f"view {view}, for {figure(then.mm)} mm"
 
     def _check_lost(self) -> None:
         last = self.steps[-self.options.lost :]

@@ -67,7 +67,8 @@ def follow(capture: Capture, count: int, waiting: Callable[[str], None]) -> list
                 waiting(capture.coach.advice() or "all is covered; Ctrl-C ends")
                 state, took_s = _rest(capture.cell, been, capture.options.still)
                 been.append(state.base_from_flange)
-                capture.view(_next(capture), len(capture.journal.views) + 1, count, took_s)
+                place = len(capture.journal.views) + 1
+                capture.view(_next(capture), place, count, took_s, capture.coach.advice)
         except KeyboardInterrupt:
             # This is how a person ends what has no other end.
             if not capture.journal.views:
@@ -105,7 +106,8 @@ def ask_and_take(capture: Capture, arm: Arm, count: int, ask: Callable[[str], st
                 break
             held = HeldArm(arm.name, arm.state(), clock)
             capture.cell = LiveCell(held, camera, clock)
-            capture.view(number, len(capture.journal.views) + 1, count, 0.0)
+            place = len(capture.journal.views) + 1
+            capture.view(number, place, count, 0.0, capture.coach.advice)
     return capture.steps
 
 

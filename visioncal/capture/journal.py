@@ -81,9 +81,11 @@ class Journal:
             )
         journal = cls(folder, facts, unix_offset_s)
         with named_errors(folder):
-            (folder / _IMAGES).mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
         width, height = facts.resolution
         journal._check_room(views * width * height, f"{views} views")
+        with named_errors(folder):
+            (folder / _IMAGES).mkdir(exist_ok=True)
         document = {"visioncal": __version__, **facts.provenance(), "settings": facts.settings}
         journal._write(PROVENANCE, tomli_w.dumps(document))
         return journal
@@ -165,8 +167,8 @@ class Journal:
     def _full(self, needed: int, what: str) -> DataError:
         free = shutil.disk_usage(self.folder).free
         return DataError(
-            f"{self.folder}: the disk is full: {free / 1e6:.1f} MB are free, and {what} needs "
-            f"{(needed + _SPARE_BYTES) / 1e6:.1f} MB.",
+            f"{self.folder}: too little room: {free / 1e6:.1f} MB are free, and "
+            f"{(needed + _SPARE_BYTES) / 1e6:.1f} MB are needed for {what}.",
             culprits=[str(self.folder)],
             next_step="Make room on that disk and go on with --resume.",
         )

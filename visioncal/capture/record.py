@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -135,7 +136,8 @@ def record(
             moved_s = cell.clock.now() - begun
             place = len(plan.stops) - len(left) + at + 1
             onward = left[at + 1].view if at + 1 < len(left) else None
-            capture.view(stop.view, place, len(plan.stops), moved_s, onward=onward)
+            advise = partial(capture.onward, onward)
+            capture.view(stop.view, place, len(plan.stops), moved_s, advise)
     return capture.steps
 
 
@@ -152,7 +154,7 @@ def closed_cleanly(cell: LiveCell, journal: Journal) -> Iterator[None]:
             yield
     except KeyboardInterrupt:
         raise DriverError(
-            f"stopped by Ctrl-C; the arm was halted. {kept_words(journal)}",
+            f"stopped by Ctrl-C or a signal; the arm was halted. {kept_words(journal)}",
             culprits=["Ctrl-C"],
             next_step="Go on with --resume.",
         ) from None

@@ -3,8 +3,8 @@
 import json
 import math
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from typing import Any
 
 import typer
@@ -73,31 +73,39 @@ def record_command(
     )
     wishes = DeviceWishes(_size(resolution), exposure_us, gain, focus)
     wish = ArmWish("", not drives or dry_run, _asked, pose_form)
-    with ExitStack() as open_devices, ended_like_ctrl_c():
-        opened = open_arm(arm, wish)
-        open_devices.enter_context(closing(opened))
-        device = open_camera(camera, wishes)
-        open_devices.enter_context(closing(device))
-        cell = LiveCell(opened, device, HostClock())
-        scene.check(device.resolution, drives=drives)
-        facts = facts_of(scene, cell, out.name)
-        if drives and not isinstance(opened, MovingArm):
-            raise _undriven(opened.name)
+    with ended_like_ctrl_c(), _opened(arm, wish, camera, wishes) as cell:
+        scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
             _tell(departure(cell, scene.planned, (), taking), cell, taking)
             messages().print("Nothing was moved (--dry-run).")
             return
         start = Journal.resume if resume else Journal.begin
         count = len(scene.planned.stops) if drives else views
+        facts = facts_of(scene, cell, out.name)
         journal = start(out, facts, cell.clock.unix_offset_s(), count)
-        if resume and taking.single:
+        if taking.single:
             _check_not_begun(journal, camera)
-        watchers = [_Console(), *open_devices.enter_context(shown_in(scene, cell, wanted=view))]
-        if drives:
-            steps = _driven(cell, scene, journal, taking, watchers, asks=not yes)
-        else:
-            steps = guided(cell, scene, journal, taking, watchers, views, _asked)
+        with shown_in(scene, cell, wanted=view) as viewers:
+            watchers = [_Console(), *viewers]
+            if drives:
+                steps = _driven(cell, scene, journal, taking, watchers, asks=not yes)
+            else:
+                steps = guided(cell, scene, journal, taking, watchers, views, _asked)
     _finish(journal, steps, as_json=as_json)
+
+
+@contextmanager
+def _opened(arm: str, wish: ArmWish, camera: str, wishes: DeviceWishes) -> Iterator[LiveCell]:
+    """Opens both devices; the block's end lets go of them."""
+    with closing(open_arm(arm, wish)) as opened:
+        if not wish.watch_only and not isinstance(opened, MovingArm):
+            raise DriverError(
+                f"{opened.name} cannot be driven.",
+                culprits=[opened.name],
+                next_step="Guide it by hand: --follow.",
+            )
+        with closing(open_camera(camera, wishes)) as device:
+            yield LiveCell(opened, device, HostClock())
 
 
 class _Console:
@@ -224,12 +232,6 @@ def _check_not_begun(journal: Journal, camera: str) -> None:
             culprits=["--resume"],
             next_step="Record all of it into a new folder.",
         )
-
-
-def _undriven(name: str) -> DriverError:
-    return DriverError(
-        f"{name} cannot be driven.", culprits=[name], next_step="Guide it by hand: --follow."
-    )
 
 
 def _asked(question: str) -> str:
