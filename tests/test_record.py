@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import signal
 import sys
@@ -315,3 +316,15 @@ def test_without_a_display_the_recording_goes_on(planned, cell, tmp_path, monkey
     assert done.status == 0, done.err
     assert "goes on without it" in done.err
     assert cell[0].moves >= 4
+
+
+@pytest.mark.skipif(
+    any(os.environ.get(it) for it in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")),
+    reason="there is a display, on which a window would open",
+)
+def test_a_viewer_without_a_display_is_told():
+    with (
+        pytest.raises(DriverError, match="cannot be shown here"),
+        viewer.live_viewer("recording"),
+    ):
+        pass
