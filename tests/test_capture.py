@@ -15,7 +15,7 @@ from visioncal.capture import journal as journal_module
 from visioncal.capture.agree import Agreement
 from visioncal.capture.approach import Ways
 from visioncal.capture.coach import Coach
-from visioncal.capture.core import Capture, missed
+from visioncal.capture.core import Capture, Step, missed
 from visioncal.capture.drive import travel_s
 from visioncal.capture.follow import ask_and_take, follow
 from visioncal.capture.journal import Journal
@@ -438,34 +438,65 @@ def test_the_coach_asks_for_what_is_missing(plan):
     assert "right" in coach.advice() or "bottom" in coach.advice()
 
 
+class Hand:
+    """Leads an arm to the next place as soon as a view is there; in the end it presses Ctrl-C."""
+
+    def __init__(self, arm: FakeArm, places: list[np.ndarray]) -> None:
+        self.arm, self.places = arm, iter(places)
+
+    def stepped(self, _: Step) -> None:
+        """Leads it on."""
+        place = next(self.places, None)
+        if place is None:
+            raise KeyboardInterrupt
+        self.arm.start_move(place, speed=2.0, acceleration=4.0)
+
+
 def test_a_guided_arm_gives_a_view_wherever_it_rests(plan, tmp_path):
     arm, camera = fake_devices(plan)
     capture = _capture(tmp_path / "live", plan, arm, camera)
-    hand = iter([it.q for it in plan.stops])
-
-    def waiting(_: str) -> None:
-        # The hand moves on as soon as the view is taken.
-        arm.start_move(next(hand), speed=2.0, acceleration=4.0)
-
-    steps = follow(capture, len(plan.stops), waiting)
+    # It begins at the first of them.
+    places = [it.q for it in plan.stops[1:]]
+    capture.watchers = (Hand(arm, places),)
+    steps = follow(capture, len(plan.stops))
     assert len(steps) == len(plan.stops)
     session = Session.load(tmp_path / "live")
     assert [it.number for it in session.views] == list(range(1, len(plan.stops) + 1))
     assert max(errors_m(session, camera)) < REPEATABILITY_M
 
 
+def test_an_arm_that_is_led_on_before_it_settles_gives_no_view_twice(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    capture = _capture(tmp_path / "live", plan, arm, camera)
+    frame = camera.frame
+
+    def led(**words):
+        # The first frame of all: the hand goes on to another place, and from there to a third.
+        if camera.frames == 0:
+            arm.start_move(plan.stops[1].q, speed=2.0, acceleration=4.0)
+        return frame(**words)
+
+    camera.frame = led
+    capture.watchers = (Hand(arm, [plan.stops[1].q + 0.001, plan.stops[2].q]),)
+    state, last = arm.state, plan.stops[2].q
+
+    def led_on():
+        # After some seconds at the place that has its view it goes to a third.
+        if arm.moves == 2 and arm.clock.now() - arm.begun > 5.0:
+            arm.start_move(last, speed=2.0, acceleration=4.0)
+        return state()
+
+    arm.state = led_on
+    follow(capture, 2)
+    poses = [it.base_from_flange().translation for it in Session.load(tmp_path / "live").views]
+    assert np.linalg.norm(poses[1] - poses[0]) > 0.02
+
+
 def test_ctrl_c_ends_a_guided_recording(plan, tmp_path):
     arm, camera = fake_devices(plan)
     capture = _capture(tmp_path / "live", plan, arm, camera)
-    turns = []
-
-    def waiting(_: str) -> None:
-        turns.append(1)
-        if len(turns) == 3:
-            raise KeyboardInterrupt
-        arm.start_move(plan.stops[len(turns)].q, speed=2.0, acceleration=4.0)
-
-    assert len(follow(capture, 0, waiting)) == 2
+    capture.watchers = (Hand(arm, [plan.stops[1].q]),)
+    assert len(follow(capture, 0)) == 2
     assert len(Session.load(tmp_path / "live").views) == 2
 
 

@@ -11,6 +11,7 @@ from visioncal.capture.live import LiveCell
 from visioncal.capture.options import Stillness
 from visioncal.capture.record import closed_cleanly
 from visioncal.capture.still import why_arm_moves
+from visioncal.capture.take import Taken
 from visioncal.drivers.protocols import Arm, ArmState
 from visioncal.errors import DriverError
 from visioncal.transforms import pose_difference
@@ -44,13 +45,12 @@ class HeldArm:
         """Nothing is held."""
 
 
-def follow(capture: Capture, count: int, waiting: Callable[[str], None]) -> list[Step]:
+def follow(capture: Capture, count: int) -> list[Step]:
     """Takes a view whenever a guided arm rests at a new place.
 
     Args:
         capture: The recording.
         count: How many views; 0 until Ctrl-C.
-        waiting: Told, once a place, what is waited for.
 
     Returns:
         What became of each rest.
@@ -64,11 +64,13 @@ def follow(capture: Capture, count: int, waiting: Callable[[str], None]) -> list
     with closed_cleanly(capture.cell, capture.journal):
         try:
             while not count or len(capture.journal.views) < count:
-                waiting(capture.coach.advice() or "all is covered; Ctrl-C ends")
                 state, took_s = _rest(capture.cell, been, capture.options.still)
                 been.append(state.base_from_flange)
                 place = len(capture.journal.views) + 1
-                capture.view(_next(capture), place, count, took_s, capture.coach.advice)
+                step = capture.view(_next(capture), place, count, took_s, capture.coach.advice)
+                if isinstance(step.found, Taken):
+                    # The hand may have gone on while the rest was waited for.
+                    been.append(step.found.state.base_from_flange)
         except KeyboardInterrupt:
             # This is how a person ends what has no other end.
             if not capture.journal.views:

@@ -159,7 +159,10 @@ def guided(
     try:
         if not isinstance(cell.arm, MovingArm):
             return ask_and_take(capture, cell.arm, views, ask)
-        return follow(capture, views, _waiting)
+        messages().print(
+            "Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends."
+        )
+        return follow(capture, views)
     finally:
         prediction.close()
 
@@ -195,7 +198,3 @@ def shown_in(scene: Scene, cell: LiveCell, *, wanted: bool) -> Iterator[list[Wat
         except DriverError as error:
             messages().print(escape(f"{error} The recording goes on without it."))
         yield watchers
-
-
-def _waiting(wish: str) -> None:
-    messages().print(escape(f"  bring the arm to rest; {wish}"))
