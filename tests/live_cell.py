@@ -18,7 +18,7 @@ from visioncal.planning.read_back import PlanFile, Stop
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
 from visioncal.targets import charuco_board
-from visioncal.types import Camera, FloatArray
+from visioncal.types import Camera, CameraMount, FloatArray
 
 # Of the fakes: a controller's cycle, a camera's frame period and exposure [s].
 CYCLE_S, PERIOD_S, EXPOSURE_S = 0.002, 1.0 / 30.0, 0.01
@@ -240,9 +240,11 @@ class FakeCamera:
         """Nothing is open."""
 
 
-def fake_plan(stops: int = 5, seed: int = 2) -> PlanFile:
+def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand") -> PlanFile:
     """A plan whose stops all see the board; its ways are not looked at."""
-    options = CellOptions(robot="ur5e", camera=LENS, views=stops, seed=seed, cut_views=0.0)
+    options = CellOptions(
+        robot="ur5e", mount=mount, camera=LENS, views=stops, seed=seed, cut_views=0.0
+    )
     # The simulated camera sits close to the wrist: the links are thin, so that nothing is near.
     limits = Limits(clearance_m=0.0, floor_m=None)
     cell = replace(true_cell(options), limits=limits, robot=_thin(load_robot("ur5e")))

@@ -81,6 +81,15 @@ def test_a_recording_is_a_session_that_calibrates(tmp_path):
     assert np.linalg.norm(off) < 1e-3
 
 
+def test_a_camera_that_stands_still_is_recorded_likewise(tmp_path):
+    plan = fake_plan(3, mount="eye-to-hand")
+    arm, camera = fake_devices(plan)
+    recorded(tmp_path / "live", plan, arm, camera)
+    session = Session.load(tmp_path / "live")
+    assert session.mount == "eye-to-hand"
+    assert len(session.views) == 3
+
+
 @pytest.mark.parametrize("hidden", [False, True], ids=["told by the arm", "seen in the image"])
 def test_a_moving_arm_gives_no_view(plan, tmp_path, hidden):
     arm, camera = fake_devices(plan, trembling_s=0.8, tremble_rad=4e-3, hidden=hidden)

@@ -241,13 +241,16 @@ def test_a_guided_arm_is_followed(planned, cell, tmp_path):
         return state()
 
     arm.state = led
-    more = ("--follow", "--target", "charuco_9x6_30mm", "--robot", "ur5e", "--views", 4)
+    # One place at which nothing is seen is told, and the person goes elsewhere.
+    cell[1].hidden_at = (2,)
+    more = ("--follow", "--target", "charuco_9x6_30mm", "--robot", "ur5e", "--views", 3)
     done = record(tmp_path / "live", *more)
     assert done.status == 0, done.err
-    assert "[1/4] view 1:" in done.err
+    assert "[1/3] view 1:" in done.err
+    assert "not taken:" in done.err
     assert "-> next:" in done.err
     session = Session.load(tmp_path / "live")
-    assert len(session.views) == 4
+    assert len(session.views) == 3
     assert session.robot_name == "ur5e"
 
 

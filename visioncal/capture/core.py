@@ -167,6 +167,8 @@ class Capture:
         return self.prediction.after([it.number for it in self.journal.views])
 
     def _check_lost(self) -> None:
+        if not self.options.lost:
+            return
         last = self.steps[-self.options.lost :]
         reasons = [it.found.reason for it in last if isinstance(it.found, Missed)]
         if len(reasons) < self.options.lost:

@@ -57,7 +57,7 @@ def follow(capture: Capture, count: int) -> list[Step]:
 
     Raises:
         DriverError: A device failed, or the arm is stopped.
-        DataError: A view cannot be written, or three rests in a row gave no view.
+        DataError: A view cannot be written, or too many rests in a row gave none.
     """
     capture.catch_up()
     been = _places(capture)
@@ -95,7 +95,7 @@ def ask_and_take(capture: Capture, arm: Arm, count: int, ask: Callable[[str], st
 
     Raises:
         DriverError: The camera failed, or Ctrl-C came.
-        DataError: A view cannot be written, or three in a row gave none.
+        DataError: A view cannot be written, or too many in a row gave none.
     """
     capture.catch_up()
     camera, clock = capture.cell.camera, capture.cell.clock

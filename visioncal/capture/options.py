@@ -46,7 +46,8 @@ class CaptureOptions:
         still: When arm and image count as still.
         single: Whether every frame is of another place, as in a folder of pictures: then one is
             taken as it comes.
-        lost: After so many stops in a row without a view, the recording ends.
+        lost: After so many stops in a row without a view, the recording ends; 0 for never, where a
+            person sees it and goes elsewhere.
     """
 
     speed: float = SPEED
@@ -63,5 +64,5 @@ class CaptureOptions:
                 f"--speed is {self.speed}; above 0 and up to {FASTEST} rad/s is possible.",
                 culprits=["--speed"],
             )
-        if self.acceleration <= 0.0 or self.frames < 1 or self.lost < 1:
-            raise DataError("acceleration, frames and lost stops must be above zero.")
+        if self.acceleration <= 0.0 or self.frames < 1:
+            raise DataError("recording: acceleration and frames must be above zero.")

@@ -70,6 +70,7 @@ def record_command(
         keep=keep,
         still=Stillness(image_px=still_px, quiet_s=settle_s),
         single=is_folder(camera),
+        lost=CaptureOptions.lost if drives else 0,
     )
     wishes = DeviceWishes(_size(resolution), exposure_us, gain, focus)
     wish = ArmWish("", not drives or dry_run, _asked, pose_form)
@@ -91,6 +92,8 @@ def record_command(
                 steps = _driven(cell, scene, journal, taking, watchers, asks=not yes)
             else:
                 steps = guided(cell, scene, journal, taking, watchers, views, _asked)
+    if drives:
+        _check_all(journal, steps)
     _finish(journal, steps, as_json=as_json)
 
 
@@ -173,21 +176,25 @@ def _confirm(cell: LiveCell) -> None:
         raise DataError("record: not begun; nothing moved.", next_step="Look with --dry-run.")
 
 
-def _finish(journal: Journal, steps: Sequence[Step], *, as_json: bool) -> None:
-    """Says how it ended; status 2 where stops gave no view."""
+def _check_all(journal: Journal, steps: Sequence[Step]) -> None:
+    """Ends with status 2 where stops of the plan gave no view."""
     without = dict(missed(steps))
-    count = len(journal.views)
     if without:
         words = "; ".join(f"view {it}: {reason}" for it, reason in without.items())
         raise DataError(
-            f"{len(without)} of {len(steps)} stops gave no view ({words}). {count} views are in "
-            f"{journal.folder}.",
+            f"{len(without)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
+            f"views are in {journal.folder}.",
             culprits=[f"view {it}" for it in without],
             next_step="--resume tries them again.",
         )
+
+
+def _finish(journal: Journal, steps: Sequence[Step], *, as_json: bool) -> None:
+    """Says what there is now."""
     if as_json:
         typer.echo(json.dumps(_summary(journal, steps), indent=2, allow_nan=False))
         return
+    count = len(journal.views)
     messages().print(
         escape(
             f"{count} view{'s' if count != 1 else ''} in {journal.folder}; next: visioncal "
