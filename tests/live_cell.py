@@ -25,6 +25,8 @@ CYCLE_S, PERIOD_S, EXPOSURE_S = 0.002, 1.0 / 30.0, 0.01
 # A small image is enough for corners to a tenth of a pixel, and quick to make.
 LENS = Camera("brown", (640, 400), np.array([500.0, 500.0, 320.0, 200.0]), np.zeros(5))
 _PX_A_SQUARE = 40
+# A camera beside the robot stands farther off.
+FAR_LENS = replace(LENS, matrix=np.array([1000.0, 1000.0, 320.0, 200.0]))
 
 
 @dataclass
@@ -242,8 +244,9 @@ class FakeCamera:
 
 def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand") -> PlanFile:
     """A plan whose stops all see the board; its ways are not looked at."""
+    lens = LENS if mount == "eye-in-hand" else FAR_LENS
     options = CellOptions(
-        robot="ur5e", mount=mount, camera=LENS, views=stops, seed=seed, cut_views=0.0
+        robot="ur5e", mount=mount, camera=lens, views=stops, seed=seed, cut_views=0.0
     )
     # The simulated camera sits close to the wrist: the links are thin, so that nothing is near.
     limits = Limits(clearance_m=0.0, floor_m=None)
@@ -263,4 +266,4 @@ def fake_devices(plan: PlanFile, **changes) -> tuple[FakeArm, FakeCamera]:
     """An arm that stands at the plan's start, and a camera."""
     start = plan.stops[0].q if plan.start_q is None else plan.start_q
     arm = FakeArm(plan.cell, FakeClock(), start, **changes)
-    return arm, FakeCamera(arm)
+    return arm, FakeCamera(arm, plan.cell.camera)
