@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 from live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
 from visioncal.capture.core import Step, Watcher
@@ -13,7 +14,10 @@ from visioncal.capture.options import CaptureOptions, Stillness
 from visioncal.capture.record import record
 from visioncal.capture.take import Taken
 from visioncal.planning.read_back import PlanFile
+from visioncal.session import Session
 
+# A UR repeats to 0.03 to 0.05 mm; what stands within is where it was told to be.
+REPEATABILITY_M = 5e-5
 # The shortest rest that counts: fewer pictures have to be made.
 QUICK = CaptureOptions(frames=1, still=Stillness(quiet_s=0.03))
 
@@ -50,6 +54,19 @@ def recorded(
     journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
     cell = LiveCell(arm, camera, arm.clock)
     return record(cell, plan, journal, options, watchers)
+
+
+def errors_m(session: Session, camera: FakeCamera) -> list[float]:
+    """How far each view's pose is from where the flange was at its exposure [m]."""
+    found = []
+    for view in session.views:
+        stamp = view.stamp_s - camera.arm.clock.unix_offset_s()
+        at = min(camera.exposures, key=lambda it: abs(it - stamp))
+        # Stamps are written to the microsecond.
+        assert abs(at - stamp) < 2e-6
+        away = camera.exposures[at][:3, 3] - view.base_from_flange().as_matrix()[:3, 3]
+        found.append(float(np.linalg.norm(away)))
+    return found
 
 
 class _Acknowledged:
