@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from visioncal.planning.losses import (
 from visioncal.planning.obstacles import collisions_of
 from visioncal.planning.sight import sight_of
 from visioncal.robot import Robot
+from visioncal.robot.atlas import Atlas
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
 from visioncal.types import FloatArray, Mask, Progress
@@ -32,8 +34,6 @@ _SURE = (0.97, 0.9, 0.7, 0.5)
 # How many views or postures are drawn at a time; how many times before the next share is taken,
 # and how many where next to none are found: less than this share of the wish.
 _BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 8, 0.03
-# Views of a batch for which postures are looked for, at most.
-_MOST_TRIED = 800
 # Less sure stops help only where doubt about the guesses keeps out this share.
 _UNSURE = 0.5
 # Fewer than this share of the wish, or than a plan needs, are too few.
@@ -114,6 +114,10 @@ class _Search:
         self._inverse = Inverse(cell.robot)
         self._unreached: list[FloatArray] = []
 
+    @cached_property
+    def _atlas(self) -> Atlas:
+        return Atlas(self._cell.robot, self._inverse, self._rng)
+
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough, or until it is plain that there are not."""
         draw = self._reaching if self._cell.robot.joint_count >= _FREE else self._postures
@@ -152,16 +156,16 @@ class _Search:
         flange = self._cell.flange_at(views)
         flange = flange[passed(HIDDEN, sight.free(flange))]
         flange = flange[passed(AWAY, _within(robot, flange))]
+        within, starts = self._atlas.starts(flange, self._rng)
+        self._unreached += list(flange[~within][: _ASKED_AGAIN - len(self._unreached)])
+        flange = flange[passed(REACH, within)]
         share = sight.share(flange, self._bar)
         sure = passed(GUESS, share >= self._bar)
         # More than are still needed would be thrown away.
-        few = np.flatnonzero(sure)[: min(3 * (self._count - len(self.kept)) + 50, _MOST_TRIED)]
-        flange, share = flange[few], share[few]
-        starts = self._inverse.starts(len(flange), self._rng)
-        found = [self._inverse.from_start(*it) for it in zip(flange, starts, strict=True)]
-        positions = np.array([it.positions for it in found]).reshape(starts.shape)
-        reached = passed(REACH, np.array([it.reached for it in found], dtype=bool))
-        self._unreached += list(flange[~reached][: _ASKED_AGAIN - len(self._unreached)])
+        few = np.flatnonzero(sure)[: 3 * (self._count - len(self.kept)) + 50]
+        flange, starts, share = flange[few], starts[few], share[few]
+        positions, reached = self._inverse.from_starts(flange, starts)
+        self.losses.lost[REACH] += int(np.sum(~reached))
         return robot.chain.encoded(positions[reached]), share[reached]
 
     def _postures(self) -> tuple[FloatArray, FloatArray]:

@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.camera import normalise, project_with_jacobian
+from visioncal.camera import normalise
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.obstacles import board_size_m
+from visioncal.planning.window import Window, border_tangents
 from visioncal.targets import extent_m
 from visioncal.transforms import compose, invert
-from visioncal.types import Camera, FloatArray, Mask, Target
+from visioncal.types import FloatArray, Mask, Target
 
 # How large the board is drawn: the image's half short side over half the print's diagonal.
 _NEAREST, _FARTHEST = 0.75, 1.6
@@ -24,9 +25,11 @@ _WIDER = 1.05
 # The guesses are off by less than so many standard deviations, and a plan goes no farther than so
 # many times the distance at which the board would fill the image.
 _SURELY, _NEVER_BEYOND = 2.2, 6.0
-# How many cells stand for what may really be, how many of them are looked at first, and how many
-# points stand for a side of the print.
-_GUESSES, _FIRST, _SIDE_POINTS = 40, 6, 2
+# How many cells stand for what may really be, how many of them are looked at before those that are
+# out of the question are left out, and how many points stand for a side of the print.
+_GUESSES, _LOOKED_AT, _SIDE_POINTS = 40, (5, 15, 40), 2
+# By so many rays through each side of the image the distance is found at which the board fills it.
+_BORDER_RAYS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +41,7 @@ class Sight:
         distance_m: Least and greatest distance between camera and board's centre [m].
         outline: (p, 3) points around the print, in the target's frame [m].
         centre: (3,) the print's centre [m].
-        rays_within: Tangents of rays are shorter; beyond, a lens model may fold back into the
-            image.
+        window: The part of space that is in the image.
         x: (g, 4, 4) draws of the guessed edge x.
         z: (g, 4, 4) draws of the guessed edge z.
     """
@@ -48,7 +50,7 @@ class Sight:
     distance_m: tuple[float, float]
     outline: FloatArray
     centre: FloatArray
-    rays_within: float
+    window: Window
     x: FloatArray
     z: FloatArray
 
@@ -104,17 +106,8 @@ class Sight:
         return replace(self, distance_m=(max(low, least), min(high, most)))
 
     def shows(self, cam_from_target: FloatArray) -> Mask:
-        """Whether the whole print is in the image (...) of views (..., 4, 4)."""
-        camera, edge = self.cell.camera, self.cell.limits.edge_px
-        rotation = np.swapaxes(cam_from_target[..., :3, :3], -1, -2)
-        points = self.outline @ rotation + cam_from_target[..., None, :3, 3]
-        flat = points.reshape(-1, 3)
-        radius = np.linalg.norm(flat[:, :2], axis=1)
-        straight = radius < self.rays_within * flat[:, 2]
-        px = np.full((len(flat), 2), -np.inf)
-        px[straight] = project_with_jacobian(camera, flat[straight], lens=False).px
-        inside = (px >= edge) & (px <= np.array(camera.resolution) - 1.0 - edge)
-        return np.asarray(inside.reshape(*points.shape[:-1], 2).all(axis=(-1, -2)))
+        """Whether the whole print is in the image (k,) of views (k, 4, 4)."""
+        return self.window.holds(_moved(cam_from_target, self.outline))
 
     def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
         """In what share of the guesses' draws poses show the whole print.
@@ -124,21 +117,28 @@ class Sight:
             wanted: Where the first draws leave no hope of this share, the others are not looked at.
 
         Returns:
-            (k,) shares, those of the first draws where the wanted one is not reached.
+            (k,) shares; where the wanted one is not reached, not all may have been counted.
         """
-        first = self._drawn_shows(base_from_flange, slice(0, _FIRST))
-        share = np.asarray(first.mean(axis=1))
-        hope = np.sum(~first, axis=1) <= (1.0 - wanted) * _GUESSES
-        rest = self._drawn_shows(base_from_flange[hope], slice(_FIRST, None))
-        share[hope] = np.concatenate([first[hope], rest], axis=1).mean(axis=1)
-        share[~hope] = np.minimum(share[~hope], np.nextafter(wanted, 0.0))
+        seen = np.zeros(len(base_from_flange))
+        looked, hope = 0, np.arange(len(base_from_flange))
+        for upto in _LOOKED_AT:
+            shows = self._drawn_shows(base_from_flange[hope], slice(looked, upto))
+            seen[hope] += shows.sum(axis=1)
+            looked = upto
+            hope = hope[(_GUESSES - upto + seen[hope]) / _GUESSES >= wanted]
+        share = np.minimum(seen / _GUESSES, np.nextafter(wanted, 0.0))
+        share[hope] = seen[hope] / _GUESSES
         return share
 
     def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
-        flange = base_from_flange[:, None]
-        if self.cell.mount == "eye-in-hand":
-            return self.shows(invert(flange @ self.x[which]) @ self.z[which])
-        return self.shows(invert(self.x[which]) @ flange @ self.z[which])
+        in_hand = self.cell.mount == "eye-in-hand"
+        flange = invert(base_from_flange) if in_hand else base_from_flange
+        outlines = _moved(self.z[which], self.outline)
+        points = _moved(flange, outlines.reshape(-1, 3))
+        cam_from_here = invert(self.x[which])
+        return self.window.holds(
+            _moved(cam_from_here, points.reshape(len(flange), *outlines.shape))
+        )
 
     def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
         """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
@@ -189,13 +189,12 @@ def sight_of(cell: PlanCell, seed: int) -> Sight:
     """Prepares the views of a cell, with draws of what its guesses may really be."""
     drawn = cell.guesses(_GUESSES, seed)
     low, high = extent_m(cell.target)
-    tangents = _tangents(cell.camera, 0.0)
     return Sight(
         cell,
         cell.limits.distance_m or _distance_m(cell),
         _outline(cell.target),
         np.append(0.5 * (low + high), 0.0),
-        float(np.nanmax(np.linalg.norm(tangents, axis=1))) * (1.0 + 1e-6),
+        Window(cell.camera, cell.limits.edge_px),
         np.array([it.x for it in drawn]),
         np.array([it.z for it in drawn]),
     )
@@ -207,7 +206,8 @@ def _distance_m(cell: PlanCell) -> tuple[float, float]:
     At a distance d the board is off by the errors of both places, by d times the error of the
     camera's direction, and by half its own size times the error of its own.
     """
-    half = float(np.nanmin(np.abs(_tangents(cell.camera, cell.limits.edge_px)).max(axis=1)))
+    border = border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+    half = float(np.nanmin(np.abs(border).max(axis=-1)))
     radius = 0.5 * board_size_m(cell.target)
     full = radius / half
     farthest = _FARTHEST * full
@@ -218,14 +218,10 @@ def _distance_m(cell: PlanCell) -> tuple[float, float]:
     return _NEAREST * full, _NEVER_BEYOND * full
 
 
-def _tangents(camera: Camera, edge_px: float) -> FloatArray:
-    """(n, 2) x / z and y / z of rays along the image's border, `edge_px` inside."""
-    along = np.linspace(-1.0, 1.0, 9)
-    ones = np.ones_like(along)
-    sides = [(along, -ones), (along, ones), (-ones, along), (ones, along)]
-    unit = np.concatenate([np.column_stack(side) for side in sides])
-    half = 0.5 * (np.array(camera.resolution) - 1.0)
-    return normalise(camera, half + unit * (half - edge_px))
+def _moved(a_from_b: FloatArray, points: FloatArray) -> FloatArray:
+    """Moves (..., p, 3) points by (..., 4, 4) transforms."""
+    turned = points @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return np.asarray(turned + a_from_b[..., None, :3, 3])
 
 
 def _outline(target: Target) -> FloatArray:

@@ -1,7 +1,8 @@
 """Inverse kinematics: joint positions that bring an arm's flange where it is wanted.
 
 One posture at a time: Pinocchio evaluates one in a microsecond, less than numpy needs to look at a
-batch of one, and each target is best started from the posture of the one before.
+batch of one, and each target is best started from the posture of the one before. Only where many
+poses come together, each with a posture near to it, numpy goes to all at once.
 
 Joints stand at their effective positions here (`Chain.effective`, `Chain.encoded`): in these a turn
 is exactly two pi, whatever the gear's ratio.
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from visioncal.robot.batch import reached_from
 from visioncal.robot.model import Robot
 from visioncal.types import FloatArray, Mask
 
@@ -125,7 +127,7 @@ class Inverse:
     def __init__(self, robot: Robot) -> None:
         """Prepares the search for an arm."""
         chain = robot.chain
-        self._names = chain.joint_names
+        self._chain, self._names = chain, chain.joint_names
         self._model = robot.pinocchio_model
         self._data: pin.Data = self._model.createData()
         self._frame: int = self._model.getFrameId(robot.tip)
@@ -159,20 +161,24 @@ class Inverse:
         nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
         return replace(nearest, beyond=self._in_the_way(goal, wanted))
 
-    def from_start(self, base_from_flange: FloatArray, start: FloatArray) -> Posture:
-        """Goes to a pose from one posture alone: quick, for one that may be left out if it fails.
+    def from_starts(
+        self, base_from_flange: FloatArray, starts: FloatArray
+    ) -> tuple[FloatArray, Mask]:
+        """Goes to poses from postures near to them: quick, for poses that may be left out.
 
         Args:
-            base_from_flange: (4, 4) the pose [m].
-            start: (n,) effective positions to start from [rad or m].
+            base_from_flange: (m, 4, 4) the poses [m].
+            starts: (m, n) effective positions to start from [rad or m]; six joints or more.
 
         Returns:
-            Where the search ended, with joints turned as little as can be from zero.
+            (m, n) positions with joints turned as little as can be from zero, and whether the pose
+            was reached there (m,).
         """
-        import pinocchio as pin
-
-        goal = pin.SE3(base_from_flange)
-        return self._descend(goal, start, self._bounds, np.zeros(len(start)))
+        bounds = self._bounds
+        found, reached = reached_from(
+            self._chain, base_from_flange, starts, (bounds.lower, bounds.upper), _REACHED
+        )
+        return bounds.nearest(found, np.zeros(len(self._names))), reached
 
     def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draws (count, n) effective positions all over the joints' range [rad or m]."""
