@@ -30,12 +30,13 @@ from visioncal.types import FloatArray, Mask, Progress
 
 # Stops are taken that show the board in this share of what the cell may really be; where there are
 # too few, those that show it less surely.
-_SURE = (0.97, 0.9, 0.7, 0.5)
+_SURE = (0.99, 0.97, 0.9, 0.7, 0.5)
 # How many views or postures are drawn at a time; how many times before the next share is taken,
 # and how many where next to none are found: less than this share of the wish.
 _BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 8, 0.03
-# Less sure stops help only where doubt about the guesses keeps out this share.
-_UNSURE = 0.5
+# Less sure stops help only where doubt about the guesses keeps out this share, and are taken only
+# where there are fewer sure ones than this share of the wish: few good ones are a better choice.
+_UNSURE, _ENOUGH = 0.5, 0.2
 # Fewer than this share of the wish, or than a plan needs, are too few.
 _LEAST_SHARE, _LEAST = 0.1, 12
 # So many stops tell at what distances others may be found.
@@ -130,7 +131,8 @@ class _Search:
                 self._narrow()
                 if progress is not None:
                     progress("candidates", min(len(self.kept), self._count), self._count)
-            if self.losses.lost[GUESS] < _UNSURE * self.losses.tried[GUESS]:
+            doubted = self.losses.lost[GUESS] >= _UNSURE * self.losses.tried[GUESS]
+            if not doubted or len(self.kept) >= _ENOUGH * self._count:
                 break
         del self.kept[self._count :]
 
