@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from apart import clearances, corners
+from apart import UR5E_RADIUS_M, clearances, corners, lines, lines_apart, tubes
 
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
@@ -222,13 +222,36 @@ def test_boxes_do_not_hide_the_board():
     )
     shelved = replace(cell, boxes=(shelf, table), limits=replace(cell.limits, floor_m=None))
     stops = candidates(shelved, 30, seed=2)
-    assert stops.lost["a free line of sight"] > 0
+    assert stops.lost["a free line of sight (shelf)"] > 0
+    assert "a free line of sight (table)" not in stops.lost
     outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0) @ cell.z[:3, :3].T + cell.z[:3, 3]
     shares = np.linspace(0.0, 1.0, 300)[:, None, None]
     for eye in (forward(ur_arm("ur5e"), stops.q) @ cell.x)[:, :3, 3]:
         on_the_way = eye + shares * (outline - eye)
         inside = np.abs(on_the_way - shelf.base_from_box[:3, 3]) < 0.5 * shelf.size_m
         assert not inside.all(axis=-1).any()
+
+
+def test_the_arm_itself_does_not_hide_the_board():
+    """A camera behind the arm, that looks over it."""
+    down, along = np.sin(0.36), np.cos(0.36)
+    rotation = np.array([[0.0, -down, along], [-1.0, 0.0, 0.0], [0.0, -along, -down]])
+    behind = compose(rotation, np.array([-0.7, 0.0, 0.75]))
+    cell = replace(cell_of(CellOptions(robot="ur5e", mount="eye-to-hand")), x=behind)
+    stops = candidates(cell, 100, seed=2)
+    assert any(it.startswith("a line of sight past the arm (link ") for it in stops.lost)
+    outline = outline_m(Sheet(cell.target, 1.0, 0.0), 0.0)
+    arm = ur_arm("ur5e")
+    found = tubes(arm, stops.q)
+    board = forward(arm, stops.q) @ cell.z
+    eye = np.broadcast_to(behind[:3, 3], (len(stops), 3))
+    for point in outline[::6]:
+        corner = board[:, :3, :3] @ point + board[:, :3, 3]
+        # The board's own mount lies behind the print.
+        sight = eye + 0.98 * (corner - eye)
+        for link in range(5):
+            for p, q in lines(found[link]):
+                assert lines_apart(eye, sight, p, q).min() > UR5E_RADIUS_M[link] - 1e-9
 
 
 def test_a_joint_that_stops_the_arm_is_named():

@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.losses import (
     AWAY,
+    BEHIND_ARM,
     CLEARANCE,
     DISTANCE,
     FOCUS,
@@ -21,12 +22,13 @@ from visioncal.planning.losses import (
     Losses,
 )
 from visioncal.planning.obstacles import collisions_of
+from visioncal.planning.shade import Shade
 from visioncal.planning.sight import sight_of
 from visioncal.robot import Robot
 from visioncal.robot.atlas import Atlas
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
-from visioncal.types import FloatArray, Mask, Progress
+from visioncal.types import FloatArray, IntArray, Mask, Progress
 
 # Stops are taken that show the board in this share of what the cell may really be; where there are
 # too few, those that show it less surely.
@@ -111,6 +113,7 @@ class _Search:
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
         self._sight = sight_of(cell, seed)
+        self._shade = Shade.of(cell, np.vstack([self._sight.outline, self._sight.centre]))
         self.collisions = collisions_of(cell)
         self._inverse = Inverse(cell.robot)
         self._unreached: list[FloatArray] = []
@@ -156,7 +159,7 @@ class _Search:
         views = views[passed(IMAGE, sight.shows(views))]
         views = views[passed(FOCUS, sight.sharp(views))]
         flange = self._cell.flange_at(views)
-        flange = flange[passed(HIDDEN, sight.free(flange))]
+        flange = flange[self._unhidden(self._shade.behind_boxes(flange))]
         flange = flange[passed(AWAY, _within(robot, flange))]
         within, starts = self._atlas.starts(flange, self._rng)
         self._unreached += list(flange[~within][: _ASKED_AGAIN - len(self._unreached)])
@@ -184,21 +187,32 @@ class _Search:
             (TILT, sight.tilt_rad(views) <= cell.limits.tilt_rad),
             (DISTANCE, (distance >= near) & (distance <= far)),
             (FOCUS, sight.sharp(views)),
-            (HIDDEN, sight.free(flange)),
         ):
             self.losses.passed(limit, good[kept])
             kept &= good
+        q, flange = q[kept], flange[kept]
+        kept = self._unhidden(self._shade.behind_boxes(flange))
         q, share = q[kept], sight.share(flange[kept], self._bar)
         sure = self.losses.passed(GUESS, share >= self._bar)
         return q[sure], share[sure]
 
+    def _unhidden(self, behind: IntArray) -> Mask:
+        """Counts and names the boxes (k,) that hide the board, and tells where none does."""
+        free = self.losses.passed(HIDDEN, behind < 0)
+        self.losses.blame(HIDDEN, [self._cell.boxes[place].name for place in behind[~free]])
+        return free
+
     def _keep(self, q: FloatArray, share: FloatArray) -> None:
-        """Keeps the postures (k, n) within the joints' limits that touch nothing."""
+        """Keeps the postures (k, n) that are within limits, hide nothing and touch nothing."""
         robot, margin = self._cell.robot, self._cell.limits.joint_margin_rad
         over = np.maximum(robot.lower_rad + margin - q, q - robot.upper_rad + margin)
         within = self.losses.passed(LIMITS, np.asarray(np.all(over <= 0.0, axis=1)))
         self.losses.blame(LIMITS, [robot.joint_names[it] for it in over[~within].argmax(axis=1)])
         q, share = q[within], share[within]
+        behind = self._shade.behind_arm(q)
+        free = self.losses.passed(BEHIND_ARM, behind < 0)
+        self.losses.blame(BEHIND_ARM, [self._shade.parts[it].name for it in behind[~free]])
+        q, share = q[free], share[free]
         contact = self.collisions.first_contact(q)
         clear = self.losses.passed(CLEARANCE, contact < 0)
         pairs = [self.collisions.names[place] for place in contact[~clear]]

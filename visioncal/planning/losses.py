@@ -13,7 +13,7 @@ from visioncal.types import Mask
 IMAGE = "the whole board in the image"
 GUESS = "the whole board in the image although the guesses are off"
 FOCUS, TILT, DISTANCE = "the range of focus", "the tilt", "the distance"
-HIDDEN = "a free line of sight"
+HIDDEN, BEHIND_ARM = "a free line of sight", "a line of sight past the arm"
 AWAY, REACH = "the arm's length", "the arm's reach"
 LIMITS, CLEARANCE = "the joints' limits", "the clearance"
 _ADVICE = {
@@ -21,6 +21,8 @@ _ADVICE = {
     GUESS: "Measure more closely where camera and board are, or allow a greater distance.",
     FOCUS: "Widen focus_m, or set distance_m to where the image is sharp.",
     HIDDEN: "Look whether the boxes are where they stand, or put the board elsewhere.",
+    BEHIND_ARM: "Put the camera where the arm comes less between it and the board, or hold the "
+    "board farther away from the arm.",
     TILT: "Widen tilt_rad, or turn the board towards the camera.",
     DISTANCE: "Widen distance_m, or put the board elsewhere.",
     AWAY: "Put the board nearer to the arm, allow smaller distances, or look whether the guesses "

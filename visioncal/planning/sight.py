@@ -18,8 +18,6 @@ _NEAREST, _FARTHEST = 0.75, 1.6
 # What tilt leaves of a board's short side, and how many standard deviations of where it is in the
 # image are left free around it.
 _FORESHORTENED, _DOUBTED = 0.8, 2.0
-# A line of sight may end on a box, as on the table that a board lies on: it is free up to here.
-_LIES_ON, _TINY = 0.99, 1e-12
 # How far draws reach beyond the distances that turned out well.
 _WIDER = 1.05
 # The guesses are off by less than so many standard deviations, and a plan goes no farther than so
@@ -159,31 +157,6 @@ class Sight:
             return np.ones(len(cam_from_target), dtype=bool)
         depth = cam_from_target[:, 2, :3] @ self.outline.T + cam_from_target[:, 2, 3, None]
         return np.asarray(((depth >= span[0]) & (depth <= span[1])).all(axis=1))
-
-    def free(self, base_from_flange: FloatArray) -> Mask:
-        """Whether no declared box hides a part of the print (k,) at poses (k, 4, 4).
-
-        A line of sight meets a box where the spans in which it is between opposite faces overlap
-        (Kay and Kajiya 1986, slabs).
-        """
-        cell = self.cell
-        in_hand = cell.mount == "eye-in-hand"
-        base_from_cam = base_from_flange @ cell.x if in_hand else cell.x[None]
-        base_from_target = cell.z[None] if in_hand else base_from_flange @ cell.z
-        points = np.vstack([self.outline, self.centre])
-        ends = points @ np.swapaxes(base_from_target[:, :3, :3], 1, 2)
-        ends = ends + base_from_target[:, None, :3, 3]
-        starts = base_from_cam[:, None, :3, 3]
-        hidden = np.zeros(len(base_from_flange), dtype=bool)
-        for box in cell.boxes:
-            rotation, middle = box.base_from_box[:3, :3], box.base_from_box[:3, 3]
-            start, along = (starts - middle) @ rotation, (ends - starts) @ rotation
-            along = np.where(along == 0.0, _TINY, along)
-            faces = np.stack([(side * box.size_m - start) / along for side in (-0.5, 0.5)])
-            enters, leaves = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
-            meets = (enters <= leaves) & (enters < _LIES_ON) & (leaves > 0.0)
-            hidden |= meets.any(axis=1)
-        return np.asarray(~hidden)
 
 
 def sight_of(cell: PlanCell, seed: int) -> Sight:
