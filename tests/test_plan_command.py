@@ -153,7 +153,7 @@ def test_the_same_seed_gives_the_same_plan(document, tmp_path):
 def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):
     refused = visioncal("calibrate", one_axis, "-o", tmp_path / "out")
     assert refused.status == 2
-    assert "Let visioncal plan SESSION --add 5 propose them." in refused.err
+    assert f"Let visioncal plan '{one_axis}' --add 5 propose them." in refused.err
     out = tmp_path / "plan"
     done = visioncal("plan", one_axis, "--add", 2, "-o", out, "--candidates", 60)
     assert done.status == 0, done.err
@@ -181,6 +181,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
         ("ur5e", {}, ("--box", "cage:500,0,400:900,900,700"), "Look whether the boxes are"),
         ("ur5e", {}, ("--box", "cage:500,0,400"), "NAME:X,Y,Z:SX,SY,SZ"),
         ("ur5e", {}, ("--for", "handeye"), "Did you mean hand-eye"),
+        ("ur5e", {}, ("--for", "tcp"), "--for is 'tcp'; stops can be planned for hand-eye"),
         ("ur5e", {}, ("--add", "3"), "holds no recorded session"),
         ("ur5e", {}, ("--start-joints", "1,2"), "--start-joints"),
         ("ur5e", {}, ("--floor", "high"), "--floor"),
@@ -201,6 +202,15 @@ def test_a_cell_without_a_camera_says_all_that_is_missing(tmp_path):
     assert done.status == 2
     for option in ("--target", "--camera", "--cam", "--board"):
         assert option in done.err
+
+
+@pytest.mark.parametrize(
+    ("option", "said"), [("--camera", "914,913"), ("--cam", "1 2 3"), ("--board", "low")]
+)
+def test_what_is_written_wrongly_is_told_before_what_is_missing(option, said, tmp_path):
+    done = visioncal("plan", "ur5e", option, said, "-o", tmp_path / "out")
+    assert done.status == 2
+    assert f"error: {option} is " in done.err
 
 
 def test_a_wish_beyond_the_candidates_is_told_and_the_plan_written(tmp_path):

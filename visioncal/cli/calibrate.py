@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from visioncal.calibration import to_document
 from visioncal.cli.console import messages, print_summary, shown_progress
+from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import run
@@ -53,7 +54,7 @@ def calibrate_command(
     """
     loaded = Session.load(session)
     left = leftover(out)
-    with shown_progress(quiet=as_json) as told:
+    with naming(session), shown_progress(quiet=as_json) as told:
         result = run(loaded, solver=solver, level=level, convention=convention, progress=told)
         told("write", 0, 1)
         if left is not None:
@@ -62,7 +63,7 @@ def calibrate_command(
     if as_json:
         typer.echo(json.dumps(to_document(result.calibration), indent=2))
     else:
-        print_summary(result.calibration, verbose=verbose)
+        print_summary(told_of(result.calibration, session), verbose=verbose)
         for file in files:
             messages().print(f"wrote {file}")
     if left is not None:

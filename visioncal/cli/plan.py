@@ -30,9 +30,6 @@ from visioncal.planning.telling import accuracy_words, looks_note, summary_of
 from visioncal.planning.written import plan_document
 from visioncal.types import FloatArray, Progress
 
-# Stops of a plan of its own: with more, each is worth little.
-_STOPS = {"hand-eye": 12, "offsets": 20}
-_MANY_STOPS = 30
 _SHOWN = 12
 # The cosine of a board's z to the base's, from which on only a camera below would see it.
 _FACE_DOWN = 0.7
@@ -103,7 +100,7 @@ def plan_command(
         limits,
         tuple(box_of(it) for it in boxes or ()),
     )
-    wanted = purpose_of(purpose)
+    wanted = purpose_of(purpose, "--for")
     start = find_source(source)
     wish = None if wish_mm is None and wish_deg is None else Wish(wish_mm, wish_deg)
     with shown_progress(quiet=as_json) as told:
@@ -115,7 +112,7 @@ def plan_command(
             )
         request = Request(
             wanted,
-            add or stops or _STOPS.get(wanted.name, _MANY_STOPS),
+            add or stops or wanted.stops,
             criterion,
             wish,
             candidates,

@@ -5,6 +5,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from visioncal.planning.purposes import PURPOSES
 from visioncal.planning.selection import Criterion
 from visioncal.types import Mount
 
@@ -12,6 +13,7 @@ _WHAT = "What is planned"
 _CELL = "The cell, where the source does not say it"
 _LIMITS = "What the arm must keep"
 _DOUBT = "How well it is known"
+_USUAL_STOPS = ", ".join(f"{it.stops} for {it.name}" for it in PURPOSES.values())
 
 
 def _option(*names: str, panel: str, words: str, metavar: str | None = None) -> object:
@@ -33,7 +35,7 @@ Out: TypeAlias = Annotated[
 AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print plan.json to stdout.")]
 
 For: TypeAlias = Annotated[
-    str, typer.Option("--for", help="hand-eye, offsets or kinematics.", rich_help_panel=_WHAT)
+    str, typer.Option("--for", help=f"{', '.join(PURPOSES)}.", rich_help_panel=_WHAT)
 ]
 Stops: TypeAlias = Annotated[
     int | None,
@@ -41,7 +43,7 @@ Stops: TypeAlias = Annotated[
         "--stops",
         min=1,
         max=500,
-        help="How many stops: 12 for hand-eye, 20 for offsets, 30 for kinematics.",
+        help=f"How many stops: {_USUAL_STOPS}.",
         rich_help_panel=_WHAT,
         show_default=False,
     ),

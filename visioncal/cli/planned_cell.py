@@ -128,9 +128,13 @@ def cell_of(source: Source, words: CellWords) -> PlanCell:
     if source.calibration is not None:
         _refuse(words.given("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words), words)
-    missing = [
-        f"--{it}" for it in ("target", "camera", "cam", "board") if getattr(words, it) is None
-    ]
+    # What is written wrongly is told before what is missing.
+    numbers = _camera_numbers(words.camera)
+    for option, said in (("--cam", words.cam), ("--board", words.board)):
+        if said is not None:
+            pose_of(said, option)
+    needed = ("target", "camera", "cam", "board", *(() if numbers is None else ("resolution",)))
+    missing = [f"--{it}" for it in needed if getattr(words, it) is None]
     if missing or source.robot is None:
         raise DataError(
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
@@ -281,8 +285,8 @@ def _target(words: str) -> Target:
 
 
 def _camera(words: str, resolution: str | None) -> Camera:
-    if "," in words and not Path(words).exists():
-        matrix = numbers_in(words, "--camera", "fx,fy,cx,cy")
+    matrix = _camera_numbers(words)
+    if matrix is not None:
         return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
     path = Path(words)
     if path.is_dir() or path.suffix.lower() == ".rrd" or _holds_a_result(path):
@@ -297,6 +301,13 @@ def _camera(words: str, resolution: str | None) -> Camera:
     width, height = lens["resolution"] if "resolution" in lens else _size(resolution)
     distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)
     return Camera(lens["model"], (int(width), int(height)), np.array(lens["matrix"]), distortion)
+
+
+def _camera_numbers(words: str | None) -> tuple[float, ...] | None:
+    """The camera matrix, where that was given in numbers."""
+    if words is None or "," not in words or Path(words).exists():
+        return None
+    return numbers_in(words, "--camera", "fx,fy,cx,cy")
 
 
 def _size(words: str | None) -> tuple[int, int]:

@@ -27,20 +27,23 @@ class Purpose:
             that is known of them beforehand [rad]; lengths are off by 0.5 m times as much.
         judged: Which errors count.
         errors: What they are, in words.
+        stops: How many a plan of its own has; with more, each is worth little.
     """
 
     name: str
     judged: Judged
     errors: str
+    stops: int
     blocks: Mapping[str, float] = field(default_factory=dict)
 
 
 # Where the robot finds what the camera sees is the camera's edge alone; the target's is scaffold.
-_HAND_EYE = Purpose("hand-eye", "sight", "the camera's place on the robot")
+_HAND_EYE = Purpose("hand-eye", "sight", "the camera's place on the robot", 12)
 _OFFSETS = Purpose(
     "offsets",
     "workspace",
     "the arm's place all over its workspace",
+    20,
     # A lost encoder is set again by eye, to about this.
     {"offsets": 2e-3},
 )
@@ -48,6 +51,7 @@ _KINEMATICS = Purpose(
     "kinematics",
     "workspace",
     "the arm's place all over its workspace",
+    30,
     # Arms come off by 1 mrad and 0.5 mm a link.
     {"links": 1e-3},
 )
@@ -56,16 +60,20 @@ PURPOSES: Mapping[str, Purpose] = MappingProxyType(
 )
 
 
-def purpose_of(name: str) -> Purpose:
+def purpose_of(name: str, culprit: str = "purpose") -> Purpose:
     """Finds a purpose.
+
+    Args:
+        name: Its name.
+        culprit: Where it was named, for the error.
 
     Raises:
         DataError: There is none of that name.
     """
     if name not in PURPOSES:
         raise DataError(
-            f"stops can be planned for {', '.join(PURPOSES)}, not for {name!r}.",
-            culprits=["purpose"],
+            f"{culprit} is {name!r}; stops can be planned for {', '.join(PURPOSES)}.",
+            culprits=[culprit],
             next_step=did_you_mean(name, PURPOSES),
         )
     return PURPOSES[name]

@@ -1,0 +1,36 @@
+"""Advice that names a command, with the session that the user named."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from visioncal.calibration import Calibration
+from visioncal.errors import VisioncalError
+
+# How advice names the session in a command, where it does not know what the user calls it.
+_COMMAND = re.compile(r"\b(visioncal \w+) SESSION\b")
+
+
+@contextmanager
+def naming(session: Path) -> Iterator[None]:
+    """Puts a session's path into the commands that errors of the block point to."""
+    try:
+        yield
+    except VisioncalError as error:
+        raise type(error)(
+            error.message, culprits=error.culprits, next_step=_named(error.next_step, session)
+        ) from error
+
+
+def told_of(calibration: Calibration, session: Path) -> Calibration:
+    """A calibration whose reasons, to be printed, name the session by its path."""
+    verdict = calibration.verdict
+    reasons = tuple(_named(it, session) for it in verdict.reasons)
+    return replace(calibration, verdict=replace(verdict, reasons=reasons))
+
+
+def _named(advice: str, session: Path) -> str:
+    return _COMMAND.sub(lambda found: f"{found[1]} {shlex.quote(str(session))}", advice)
