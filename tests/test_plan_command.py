@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import rerun as rr
 from commands import Done, visioncal
 from drawn import column
 
+from visioncal.calibration import Calibration
 from visioncal.cli.review import find_recording
 from visioncal.errors import DataError
 from visioncal.recording import paths
@@ -29,6 +31,8 @@ CELL = {
     "--guess-deg": "2",
     "--candidates": "60",
 }
+
+ONE_AXIS = CellOptions(robot="ur5e", views=5, motion="one_axis", seed=1)
 
 
 @pytest.fixture(autouse=True)
@@ -62,8 +66,7 @@ def document(planned) -> dict:
 @pytest.fixture(scope="module")
 def one_axis(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sessions") / "one axis"
-    options = CellOptions(robot="ur5e", views=5, motion="one_axis", seed=1)
-    return write_session(simulate(options), folder)
+    return write_session(simulate(ONE_AXIS), folder)
 
 
 def test_a_plan_has_a_table_a_program_a_preview_and_all_of_it_as_json(planned, document):
@@ -148,6 +151,31 @@ def test_the_same_seed_gives_the_same_plan(document, tmp_path):
     )
     assert done.status == 0, done.err
     assert json.loads(done.out) | {"created": ""} == document | {"created": ""}
+
+
+def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_path):
+    """Plan, record, calibrate anew: all through the command line, the recording simulated."""
+    done = visioncal("plan", one_axis, "--add", 5, "-o", tmp_path, "--candidates", 100)
+    assert done.status == 0, done.err
+    document = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
+    added = np.array([stop["q"] for stop in document["stops"]])
+    cell = simulate(ONE_AXIS)
+    both = np.concatenate([cell.joints, added])
+    whole = simulate(replace(ONE_AXIS, motion="free"), both)
+    session = write_session(whole, tmp_path / "whole")
+    planned = sorted(stop["view"] for stop in document["stops"])
+    assert planned == [it.number for it in Session.load(session).views][-5:]
+    solved = visioncal("calibrate", session, "-o", tmp_path / "out", "--level", "hand-eye")
+    assert solved.status == 0, solved.err
+    result = Calibration.load(tmp_path / "out")
+    assert result.verdict.status != "bad"
+    edge = result.edges["flange_from_cam"]
+    # The same noise makes the same sigma; with ten views it is itself known to a fifth or so, and
+    # what the plan took for noise is what five views showed.
+    assert 0.5 < edge.sigma_mm / document["predicted"]["after"]["sigma_mm"] < 2.0
+    away = whole.transforms["flange_from_cam"][:3, 3] - edge.transform.translation
+    # Three sigma of three numbers together.
+    assert 1e3 * np.linalg.norm(away) < 3.0 * edge.sigma_mm
 
 
 def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):
