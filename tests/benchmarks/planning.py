@@ -16,8 +16,10 @@ import numpy as np
 from cells import calibrated, error_of
 from planned import plan_cell, so_far_of, true_cell
 from results import write_section
+from test_candidates import cell_of, whole
 from test_kinematics import WRONG_LINKS, error_m
 
+from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
 from visioncal.pipeline.known import Known
 from visioncal.planning.candidates import candidates
@@ -29,6 +31,7 @@ from visioncal.planning.purposes import PURPOSES
 from visioncal.planning.recorded import Begun, begin
 from visioncal.planning.selection import CRITERIA
 from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.transforms import exp
 from visioncal.types import FloatArray
 
 WORLDS = 20
@@ -36,8 +39,10 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 CANDIDATES = 1500
 # Real arms and noises that each world's stops are tried with: one alone says little.
 DRAWS = 3
-# How well the guesses are known from which is planned.
+# How well the guesses are known from which is planned, and how far off bad ones are.
 GUESS_RAD, GUESS_M = 0.03, 0.01
+BAD_RAD, BAD_M = np.deg2rad(10.0), 0.05
+ARMS = ("ur3e", "ur5e", "ur10e")
 SURE = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
 ARM = replace(WRONG_LINKS, target=SURE)
 HAND_EYE = CellOptions(robot="ur5e", target=SURE)
@@ -132,6 +137,57 @@ def speed(options: CellOptions) -> str:
     )
 
 
+def search_row(robot: str) -> str:
+    """CPU seconds to find the candidates of one arm, from fair and from bad guesses."""
+    cells = []
+    for mount in MOUNTS:
+        for sigmas in ((GUESS_RAD, GUESS_M), (BAD_RAD / np.sqrt(3.0), BAD_M / np.sqrt(3.0))):
+            cell = plan_cell(replace(HAND_EYE, robot=robot, mount=mount), *sigmas)
+            if mount == "eye-in-hand":
+                cell = replace(cell, limits=replace(cell.limits, floor_m=-0.3))
+            begun = time.process_time()
+            found = len(candidates(cell, CANDIDATES))
+            cells.append(f"{time.process_time() - begun:.1f} ({found})")
+    return f"| {robot} | {' | '.join(cells)} |"
+
+
+def bad_guess(mount: str, robot: str, seed: int) -> float:
+    """Share of planned stops that see the whole board where both guesses are badly off.
+
+    NaN where planning is refused.
+    """
+    true = cell_of(CellOptions(robot=robot, mount=mount, seed=seed))
+    turn, shift = np.random.default_rng([seed, 5]).standard_normal((2, 2, 3))
+    turn *= BAD_RAD / np.linalg.norm(turn, axis=1, keepdims=True)
+    shift *= BAD_M / np.linalg.norm(shift, axis=1, keepdims=True)
+    off = exp(np.concatenate([turn, shift], axis=1))
+    guess = replace(
+        true,
+        x=true.x @ off[0],
+        z=true.z @ off[1],
+        sigma_rad=BAD_RAD / np.sqrt(3.0),
+        sigma_m=BAD_M / np.sqrt(3.0),
+        # The board may be lower than it seems.
+        limits=replace(true.limits, floor_m=true.limits.floor_m and true.limits.floor_m - 0.2),
+    )
+    try:
+        q = candidates(guess, CANDIDATES // 5, seed=seed).q
+    except DataError:
+        return np.nan
+    worlds = worlds_of((guess, *guess.guesses(SAMPLE - 1, seed)), PURPOSES["hand-eye"], q)
+    return float(whole(true, q[chosen(worlds, 20).rows], 0.0).mean())
+
+
+def bad_guess_row(robot: str, found: dict[str, list[float]]) -> str:
+    """One line of the table of bad guesses."""
+    cells = []
+    for shares in found.values():
+        refused = int(np.isnan(shares).sum())
+        worst = f"{100 * np.nanmin(shares):.0f}" + (f" ({refused} refused)" if refused else "")
+        cells.append(f"{100 * np.nanmean(shares):.1f} | {worst}")
+    return f"| {robot} | {' | '.join(cells)} |"
+
+
 def peer(world: World, count: int) -> list[int]:
     """Greedy I-optimal stops the plain way: each candidate's covariance by an inversion."""
     information, rows = world.prior + world.recorded, []
@@ -210,6 +266,10 @@ def main(worlds: int) -> None:
 
         duels = [duels_row(name, it, run(partial(duel, name), it)) for name, it in rows]
         axes = [one_axis_row(it, np.array(run(partial(one_axis, it)))) for it in MOUNTS]
+        seen = [
+            bad_guess_row(arm, {it: run(partial(bad_guess, it, arm)) for it in MOUNTS})
+            for arm in ARMS
+        ]
     text = "\n".join(
         (
             f"Stops of a UR5e chosen from {CANDIDATES} feasible ones, and as many drawn from them;",
@@ -232,6 +292,15 @@ def main(worlds: int) -> None:
             criteria(ARM, "kinematics"),
             criteria(HAND_EYE, "hand-eye"),
             f"\n{speed(ARM)}",
+            f"\nCPU seconds to find {CANDIDATES} possible stops (how many there were):\n",
+            "| arm | eye-in-hand, fair guess | bad guess | eye-to-hand, fair guess | bad guess |",
+            "| --- | --- | --- | --- | --- |",
+            *(search_row(it) for it in ARMS),
+            "\nOf 20 planned stops, those that see the whole board [%] where both guesses are off",
+            f"by {1e2 * BAD_M:.0f} cm and {np.rad2deg(BAD_RAD):.0f} deg, and are said to be:\n",
+            "| arm | eye-in-hand, mean | worst world | eye-to-hand, mean | worst world |",
+            "| --- | --- | --- | --- | --- |",
+            *seen,
             "\nEight views that turn about one axis give no result. With five planned stops more,",
             "sigmas of the camera's edge [mm, deg]:\n",
             "| camera | predicted | obtained | obtained / predicted | at equal noise "

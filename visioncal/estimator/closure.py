@@ -26,6 +26,7 @@ import numpy as np
 
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance, damped_step, gram
+from visioncal.estimator.measured import Measured
 from visioncal.estimator.shared import Shared
 from visioncal.estimator.variance import (
     Components,
@@ -68,6 +69,7 @@ class Closure:
         shared: What moves all camera poses together; None where they are held.
         guess: The edges near which rotations were supplied, where places are all that was measured;
             None where the poses themselves were.
+        measured: What is known of the edges besides.
     """
 
     mount: Mount
@@ -76,6 +78,7 @@ class Closure:
     camera_covariance: FloatArray | None = None
     shared: Shared | None = None
     guess: "Edges | None" = None
+    measured: tuple[Measured, ...] = ()
 
     def __len__(self) -> int:
         return len(self.robot)
@@ -264,6 +267,7 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
         information = gram(jacobian, weighted) + known.information
         gradient = gram(weighted, residuals) + known.pull
         cost = np.einsum("mi,mij,mj->", residuals, weights, residuals)
+        cost += sum(it.cost(at.x, at.z) for it in data.measured)
         if data.shared is not None:
             cost += at.shared @ (data.shared.pull + known.pull[12:])
         return Linearised(
@@ -309,7 +313,7 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     """
     slopes, camera, robot = weighted_slopes(data, edges, noise)
     information = gram(slopes, (camera + robot) @ slopes)
-    information += _chosen(data, len(information))
+    information += _of_edges(data, edges, len(information))
     if data.shared is not None:
         information[12:, 12:] += data.shared.information
     return np.asarray(information)
@@ -415,20 +419,27 @@ def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
 
 
 def knowledge_of(data: Closure, edges: Edges) -> Knowledge:
-    """What is known of the unknowns without the robot: of what is shared, and what is chosen."""
+    """What is known of the unknowns without the robot: of edges and of what is shared."""
     size = 12 + len(edges.shared)
-    information, pull = _chosen(data, size), np.zeros(size)
+    information, pull = _of_edges(data, edges, size), np.zeros(size)
+    for it in data.measured:
+        pull += it.pull(edges.x, edges.z, size)
     if data.shared is not None:
         information[12:, 12:] = data.shared.information + np.diag(data.shared.anchor)
         pull[12:] = data.shared.pull + information[12:, 12:] @ edges.shared
     return Knowledge(information, pull)
 
 
-def _chosen(data: Closure, size: int) -> FloatArray:
-    """Information (size, size) on what is a matter of choice: nothing, or the target's rotation."""
+def _of_edges(data: Closure, edges: Edges, size: int) -> FloatArray:
+    """Information (size, size) on the edges without any view: what was measured or is chosen.
+
+    A matter of choice is the target's rotation, where places alone were read.
+    """
     information = np.zeros((size, size))
+    for it in data.measured:
+        information += it.information(edges.x, edges.z, size)
     if data.guess is not None:
-        information[6:9, 6:9] = _CHOSEN * np.eye(3)
+        information[6:9, 6:9] += _CHOSEN * np.eye(3)
     return information
 
 

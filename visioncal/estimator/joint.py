@@ -26,6 +26,7 @@ from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance
+from visioncal.estimator.measured import Measured
 from visioncal.targets import corner_positions, first_corners, numbered_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
 
@@ -79,6 +80,7 @@ class Arm:
         of_links: Whether these are errors of its own links.
         boards: What the views show, where there are several boards.
         errors: Their size, where they are free.
+        measured: What is known of the edges besides.
     """
 
     robot: FloatArray
@@ -87,6 +89,7 @@ class Arm:
     of_links: bool
     boards: Boards
     errors: ArmErrors | None = None
+    measured: tuple[Measured, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,6 +299,7 @@ def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
         seen.compressed.cam_from_target,
         floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
         free.shared(seen.compressed.by_shared[:, :, free.columns]),
+        measured=arm.measured,
     )
     data = arm.boards.brought(data)
     if arm.errors is not None:

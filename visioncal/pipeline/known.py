@@ -15,6 +15,7 @@ from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
 from visioncal.files import some_of
+from visioncal.estimator.measured import Measured
 from visioncal.guess.joints import JointReading
 from visioncal.robot import Convention, Robot, with_zeros
 from visioncal.session import Session
@@ -25,6 +26,7 @@ from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.offset import Clock
+from visioncal.stages.measured import measured_of
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
@@ -237,6 +239,11 @@ class Known:
             if self.poses[view].board in self.boards
         )
 
+    @property
+    def measured(self) -> tuple[Measured, ...]:
+        """What is known of the edges besides; a closed form has no use for it."""
+        return measured_of(self.session) if self.solver == "joint" else ()
+
     def closure(self, views: Sequence[int]) -> Closure:
         """The chain's known parts for some views, each with its first or chosen pose."""
         mount, poses = self.session.mount, [self.poses[view] for view in views]
@@ -245,6 +252,7 @@ class Known:
             mount,
             robot_part(robot, mount),
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
+            measured=self.measured,
         )
         if self.readings is not None and poses:
             data = self.readings.told_to(data, poses)

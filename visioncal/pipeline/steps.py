@@ -32,6 +32,8 @@ from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
 from visioncal.stages.motion import waits_for_clock
+from visioncal.stages.measured import doubts as doubts_of_measured
+from visioncal.stages.measured import remarks as remarks_on_measured
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
 from visioncal.stages.readings import mounted, read_instrument
@@ -65,7 +67,8 @@ class Stage:
 def _read_robot(known: Known) -> Known:
     session, document = known.session, known.session.robot_document
     robot = None if document is None else Robot.from_document(document)
-    known = replace(known, robot=robot).noting((), (*session.warnings, *not_used(session)))
+    known = replace(known, robot=robot)
+    known = known.noting((), (*session.warnings, *not_used(known)))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.
@@ -290,6 +293,7 @@ def _arm(known: Known) -> Arm:
         known.arm_basis(known.used),
         known.joints_rad is not None,
         known.shown(known.used),
+        measured=known.measured,
     )
 
 
@@ -339,7 +343,11 @@ def _hand_eye(known: Known) -> Known:
             known = replace(known, arm_model=model.moved(step[: known.arm_size]))
         if readings is not None:
             known = known.with_readings(readings.moved(result.edges))
-    return known
+    if not known.measured:
+        return known
+    notes = remarks_on_measured(known.session, known.solved)
+    known = replace(known, notes=(*known.notes, *notes))
+    return known.noting((), doubts_of_measured(known.session, known.solved))
 
 
 def _is_aimed(known: Known) -> bool:

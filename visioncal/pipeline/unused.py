@@ -3,15 +3,24 @@
 from collections.abc import Iterator
 
 from visioncal.errors import DataError
+from visioncal.estimator.observability import edge_names
 from visioncal.pipeline.known import Known
-from visioncal.session import Session
 
 
-def not_used(session: Session) -> Iterator[str]:
+def not_used(known: Known) -> Iterator[str]:
     """Says what the session declares and this version leaves aside."""
-    declared = session.declaration
-    if declared.prior:
-        yield f"[prior.{next(iter(declared.prior))}] was not used: this version knows no priors."
+    session = known.session
+    names = edge_names(session.mount)
+    used = [names[it.edge] for it in known.measured]
+    for edge in session.declaration.prior:
+        if edge in used:
+            continue
+        reason = f"what is unknown of this session is {' and '.join(names)}"
+        if known.solver != "joint":
+            reason = f"the closed form {known.solver} cannot"
+        elif edge in names:
+            reason = "the session has several targets"
+        yield f"[prior.{edge}] was not used: {reason}."
     readings = sum(view.reading_m is not None for view in session.views)
     if readings and session.mount != "instrument":
         yield (

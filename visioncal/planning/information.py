@@ -241,6 +241,8 @@ def _world(
     if recorded is not None:
         rows = _recorded_factors(cell, purpose, recorded).reshape(-1, len(prior))
         known = rows.T @ rows
+        for it in recorded.data.measured:
+            known += it.information(cell.x, cell.z, len(known))
     of_looks = np.sqrt(np.diag(covariance(shared))) if looks else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
