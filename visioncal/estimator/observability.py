@@ -107,7 +107,7 @@ def check_observability(
             f"{title(data.mount)}: {culprit} {verb} not determined at all (information ratio "
             f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data)}.",
             culprits=[culprit],
-            next_step=_advice(data.mount),
+            next_step=f"{_or_measured(data.mount, culprit)}{_advice(data.mount)}",
         )
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
     worst = worst_directions(held, still, plausible, replace(boards, begin=0))
@@ -311,6 +311,13 @@ def _motion(data: Closure) -> str:
         f"the {count} used views turn by at most {largest:.2g} deg, and by {aside:.2g} deg "
         "about a second axis"
     )
+
+
+def _or_measured(mount: Mount, culprit: str) -> str:
+    """What else there is where the arm cannot tilt, as with four axes, and one offset is open."""
+    if mount == "instrument" or "offset along" not in culprit:
+        return ""
+    return f"Where the arm cannot tilt, measure that offset for [prior.{edge_names(mount)[0]}]. "
 
 
 def _advice(mount: Mount) -> str:
