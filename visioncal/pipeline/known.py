@@ -14,8 +14,8 @@ from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Noise
 from visioncal.estimator.joint import Scene
-from visioncal.files import some_of
 from visioncal.estimator.measured import Measured
+from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.robot import Convention, Robot, with_zeros
 from visioncal.session import Session
@@ -25,8 +25,8 @@ from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
-from visioncal.stages.offset import Clock
 from visioncal.stages.measured import measured_of
+from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade

@@ -31,9 +31,9 @@ from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
-from visioncal.stages.motion import waits_for_clock
 from visioncal.stages.measured import doubts as doubts_of_measured
 from visioncal.stages.measured import remarks as remarks_on_measured
+from visioncal.stages.motion import waits_for_clock
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
 from visioncal.stages.readings import mounted, read_instrument
