@@ -16,6 +16,7 @@ from visioncal.cli.fixture import fixture_command
 from visioncal.cli.locate import locate_command
 from visioncal.cli.plan import plan_command
 from visioncal.cli.record import record_command
+from visioncal.cli.rehearse import rehearse_command
 from visioncal.cli.report import report_command
 from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
@@ -38,6 +39,7 @@ app = typer.Typer(
 app.command("demo")(demo_command)
 app.command("plan")(plan_command)
 app.command("record")(record_command)
+app.command("rehearse")(rehearse_command)
 app.command("calibrate")(calibrate_command)
 app.command("report")(report_command)
 app.command("diff")(diff_command)

@@ -87,9 +87,9 @@ def record_command(
         if taking.single:
             _check_not_begun(journal, camera)
         with shown_in(scene, cell, wanted=view) as viewers:
-            watchers = [_Console(), *viewers]
+            watchers = [ViewLines(), *viewers]
             if drives:
-                steps = _driven(cell, scene, journal, taking, watchers, asks=not yes)
+                steps = driven(cell, scene, journal, taking, watchers, asks=not yes)
             else:
                 steps = guided(cell, scene, journal, taking, watchers, views, _asked)
     if drives:
@@ -111,7 +111,7 @@ def _opened(arm: str, wish: ArmWish, camera: str, wishes: DeviceWishes) -> Itera
             yield LiveCell(opened, device, HostClock())
 
 
-class _Console:
+class ViewLines:
     """Tells each view in a line."""
 
     def stepped(self, step: Step) -> None:
@@ -119,7 +119,7 @@ class _Console:
         messages().print(escape(line_of(step)))
 
 
-def _driven(
+def driven(
     cell: LiveCell,
     scene: Scene,
     journal: Journal,

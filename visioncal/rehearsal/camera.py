@@ -20,7 +20,10 @@ from visioncal.types import Camera, FloatArray, Image
 # Moments of an exposure at which the arm is asked for its joints, the beginning and end included.
 _MOMENTS = 5
 
-Fault = Literal["none", "unplugged", "frozen"]
+# Dark, as the inside of a lens cap [grey level].
+_DARK = 12
+
+Fault = Literal["none", "unplugged", "frozen", "covered"]
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,8 @@ class RehearsalCamera:
     def _taken(self, begins: float) -> Image:
         if self.fault == "frozen" and self._last is not None:
             return self._last[1].copy()
+        if self.fault == "covered":
+            return np.full(self.resolution[::-1], _DARK, dtype=np.uint8)
         moments = np.linspace(begins, begins + self._pace.exposure_s, _MOMENTS)
         try:
             joints = self._true_joints(moments)

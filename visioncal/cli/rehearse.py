@@ -1,0 +1,214 @@
+"""`visioncal rehearse`."""
+
+import json
+import platform
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.markup import escape
+
+from visioncal.calibration import Calibration
+from visioncal.cli.against_truth import truth_table
+from visioncal.cli.console import messages, print_summary
+from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded
+from visioncal.drivers.extras import client_library
+from visioncal.errors import DataError
+from visioncal.files import write_atomically
+from visioncal.rehearsal.bench import Bench
+from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
+from visioncal.rehearsal.compared import Explained, edge_errors, explained
+from visioncal.rehearsal.trouble import Trouble
+from visioncal.rehearsal.witness import Pace, Witness, pace_of
+from visioncal.types import CameraMount
+from visioncal.version import __version__
+
+# A check said no: the result is there, and it is farther from the truth than it says.
+EXIT_WRONG = 3
+_NEAR_RAD = 2e-3
+_SUMMARY = "rehearsal.json"
+_PACKAGES = ("ur-rtde", "depthai", "numpy", "opencv-contrib-python-headless")
+
+
+def rehearse_command(
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for the plan, the session and its result.")
+    ] = Path("rehearsal"),
+    robot: Annotated[
+        Literal["ur3e", "ur5e", "ur10e"], typer.Option(help="The simulated arm.")
+    ] = "ur5e",
+    mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
+    views: Annotated[int, typer.Option(min=5, max=200, help="Number of planned stops.")] = 16,
+    seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
+    fault: Annotated[
+        Trouble | None,
+        typer.Option(
+            help="Let this happen half way: what is said, and how to go on.", show_default=False
+        ),
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print rehearsal.json to stdout.")
+    ] = False,
+) -> None:
+    """Plan, record and calibrate a simulated cell through the real client libraries.
+
+    The controller is a process on this machine that speaks a UR's protocols, with an arm that is
+    not quite as it should be; the camera draws what that arm sees. Nothing real moves. Exit status
+    0: the result is as near to the truth as it says; 3: it is not.
+    """
+    client_library("rtde_control", "ur")
+    options = RehearsalOptions(robot, mount, views, seed)
+    _make_place(out)
+    begun = time.monotonic()
+    cell = rehearsed_cell(options)
+    scene = planned(cell, options, out / "plan")
+    plan_ready = time.monotonic()
+    # Led there by hand, as an operator would, and not quite exactly.
+    start_q = scene.planned.stops[0].q + _NEAR_RAD
+    bench = Bench(cell, start_q)
+    witness = Witness(bench)
+    try:
+        _tell_devices(bench)
+        taken = recorded(bench, scene, out / "session", [witness], fault, view=view)
+    finally:
+        bench.close()
+    captured = time.monotonic()
+    found = calibrated(out / "session", out / "result").calibration
+    ended = time.monotonic()
+    whole = _Rehearsal(
+        options,
+        cell,
+        found,
+        explained(found, cell.truth.transforms),
+        taken,
+        None if fault else pace_of(taken.steps, scene.planned, start_q, TAKING),
+        tuple(witness.away_mm),
+        {
+            "plan": plan_ready - begun,
+            "capture": captured - plan_ready,
+            "calibrate": ended - captured,
+            "all": ended - begun,
+        },
+    )
+    document = whole.document(through_depthai=bench.through_depthai)
+    write_atomically(out / _SUMMARY, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    whole.tell(out)
+    if as_json:
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+    if not whole.error.passed:
+        raise typer.Exit(EXIT_WRONG)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rehearsal:
+    """A rehearsal that came to its end."""
+
+    options: RehearsalOptions
+    cell: RehearsedCell
+    calibration: Calibration
+    error: Explained
+    taken: Recorded
+    pace: Pace | None
+    away_mm: tuple[float, ...]
+    times_s: dict[str, float]
+
+    def document(self, *, through_depthai: bool) -> dict[str, Any]:
+        """The content of rehearsal.json; what does not apply is absent."""
+        truth = self.cell.truth.transforms
+        document: dict[str, Any] = {
+            "schema": 1,
+            "visioncal": __version__,
+            "versions": _versions(),
+            "through_depthai": through_depthai,
+            **asdict(self.options),
+            "passed": self.error.passed,
+            "chi_square": asdict(self.error),
+            "errors": {
+                name: asdict(it) for name, it in edge_errors(self.calibration, truth).items()
+            },
+            "arm_level": self.calibration.stages.get("kinematics", {}).get("level", "nominal"),
+            "noise": dict(self.calibration.noise),
+            "verdict": self.calibration.verdict.status,
+            "views": len(self.away_mm),
+            "most_away_at_exposure_mm": max(self.away_mm),
+            "times_s": self.times_s,
+            "truth": {name: it.tolist() for name, it in truth.items()},
+        }
+        if self.pace is not None:
+            document["capture"] = asdict(self.pace)
+        if self.taken.fault is not None:
+            suffered = asdict(self.taken.fault)
+            document["fault"] = {key: it for key, it in suffered.items() if it is not None}
+        return document
+
+    def tell(self, out: Path) -> None:
+        """Says it in words."""
+        say, times = messages().print, self.times_s
+        print_summary(self.calibration, verbose=False)
+        truth = self.cell.truth
+        say(truth_table(self.calibration, truth.transforms, truth.options.camera))
+        error = self.error
+        verb = "is explained by" if error.passed else "is more than"
+        say(
+            f"the error {verb} the sigmas: chi-square {error.chi_square:.1f} of {error.freedom} "
+            f"numbers, and chance exceeds {error.limit:.1f} once in a thousand"
+        )
+        if self.pace is not None:
+            pace = self.pace
+            say(
+                f"each view: {pace.motion_s:.1f} s of motion, {pace.settling_s:.2f} s until all "
+                f"stood still, {pace.added_s:.2f} s for the rest; where it was taken the flange "
+                f"was within {1e3 * max(self.away_mm):.0f} um of what was recorded"
+            )
+        say(
+            f"plan {times['plan']:.0f} s, capture {times['capture']:.0f} s, calibrate "
+            f"{times['calibrate']:.0f} s; in all {times['all']:.0f} s"
+        )
+        say(escape(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}"))
+
+
+def _tell_devices(bench: Bench) -> None:
+    host = bench.controller.host
+    messages().print(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
+    if bench.through_depthai:
+        messages().print(f"pictures through the pipeline of depthai {version('depthai')}")
+        return
+    messages().print(
+        "depthai is not installed, so pictures are taken without its pipeline: "
+        "pip install 'depthai>=3.12,<4'"
+    )
+
+
+def _make_place(out: Path) -> None:
+    """Makes room in the place of an earlier rehearsal; nothing else is ever removed.
+
+    Raises:
+        DataError: There is a session that is not a rehearsal's.
+    """
+    mark, session = out / _SUMMARY, out / "session"
+    if session.exists():
+        if not mark.is_file():
+            raise DataError(
+                f"{session} is not of a rehearsal.",
+                culprits=[str(session)],
+                next_step="Choose another folder with -o.",
+            )
+        shutil.rmtree(session)
+    out.mkdir(parents=True, exist_ok=True)
+    # Until it is over there is no more to say; an interrupted one is replaced by the next.
+    write_atomically(mark, json.dumps({"schema": 1, "visioncal": __version__}) + "\n")
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,162 @@
+"""The parts of a rehearsal, each as the command of its name does it."""
+
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from visioncal.capture.core import Step, Watcher
+from visioncal.capture.journal import Journal
+from visioncal.capture.options import CaptureOptions
+from visioncal.cli.console import messages, report_error, shown_progress
+from visioncal.cli.interrupts import ended_like_ctrl_c
+from visioncal.cli.record import ViewLines, driven
+from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
+from visioncal.errors import VisioncalError
+from visioncal.outputs import write_outputs, write_plan
+from visioncal.pipeline import Run, run
+from visioncal.planning.plan import Request, make_plan
+from visioncal.planning.purposes import purpose_of
+from visioncal.planning.telling import summary_of
+from visioncal.planning.written import plan_document
+from visioncal.rehearsal.bench import Bench
+from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell
+from visioncal.rehearsal.trouble import Befalling, Trouble
+from visioncal.session import Session
+
+# The pace at which a UR moves where its program says nothing else; nobody stands beside this one.
+TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
+
+
+# Fewer than a real plan is chosen from: it matters more that a rehearsal is short.
+_CANDIDATES = 600
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What was recorded.
+
+    Attributes:
+        steps: What became of each stop, up to a fault and after it.
+        fault: What the fault did; None without one.
+    """
+
+    steps: tuple[Step, ...]
+    fault: "Suffered | None"
+
+
+@dataclass(frozen=True)
+class Suffered:
+    """How a recording took a fault.
+
+    Attributes:
+        name: The fault.
+        message: What was said.
+        next_step: And what to do.
+        told_after_s: How long after the fault [s].
+        stood_after_s: How long after it the arm stood [s]; None where nobody can tell any more.
+        views_kept: How many views the session had then, every acknowledged one among them.
+    """
+
+    name: str
+    message: str
+    next_step: str
+    told_after_s: float
+    stood_after_s: float | None
+    views_kept: int
+
+
+def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Scene:
+    """Plans stops from the rough guesses, and reads them back as a recording does."""
+    request = Request(
+        purpose_of("hand-eye"), options.stops, candidates=_CANDIDATES, seed=options.seed
+    )
+    with shown_progress(quiet=False) as told:
+        plan = make_plan(cell.known, request, progress=told)
+        write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
+    messages().print(f"plan: {summary_of(plan)}")
+    return scene_of(folder, target=None, robot=None, mount=None)
+
+
+def recorded(
+    bench: Bench,
+    scene: Scene,
+    folder: Path,
+    watchers: Sequence[Watcher],
+    fault: Trouble | None,
+    *,
+    view: bool,
+) -> Recorded:
+    """Records the plan's stops; where a fault is wanted, through it and on.
+
+    Raises:
+        DriverError: A device failed without being asked to.
+    """
+    if fault is None:
+        steps = _drive(bench, scene, folder, watchers, resume=False, view=view)
+        return Recorded(tuple(steps), None)
+    befalling = Befalling(bench, fault, after=max(1, len(scene.planned.stops) // 2))
+    kept = _Kept()
+    every = (*watchers, kept, befalling)
+    try:
+        _drive(bench, scene, folder, every, resume=False, view=view)
+    except VisioncalError as error:
+        told_s = time.monotonic()
+        if befalling.befell_s is None:
+            raise
+        report_error(error, as_json=False)
+        suffered = Suffered(
+            fault,
+            error.message,
+            error.next_step,
+            told_s - befalling.befell_s,
+            befalling.stood_after_s(),
+            len(Session.load(folder).views),
+        )
+    messages().print(f"  ({fault} is mended; on with --resume)")
+    befalling.mend()
+    rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
+    return Recorded((*kept.steps, *rest), suffered)
+
+
+def calibrated(folder: Path, out: Path) -> Run:
+    """Calibrates what was recorded."""
+    session = Session.load(folder)
+    with shown_progress(quiet=not sys.stderr.isatty()) as told:
+        found = run(session, progress=told)
+        told("write", 0, 1)
+        write_outputs(out, session, found)
+    return found
+
+
+def _drive(
+    bench: Bench,
+    scene: Scene,
+    folder: Path,
+    watchers: Sequence[Watcher],
+    *,
+    resume: bool,
+    view: bool,
+) -> list[Step]:
+    with ExitStack() as opened, ended_like_ctrl_c():
+        cell = opened.enter_context(bench.connected())
+        begin = Journal.resume if resume else Journal.begin
+        facts = facts_of(scene, cell, folder.name)
+        offset_s = cell.clock.unix_offset_s()
+        journal = begin(folder, facts, offset_s, len(scene.planned.stops))
+        shown = opened.enter_context(shown_in(scene, cell, wanted=view))
+        every = [ViewLines(), *shown, *watchers]
+        return driven(cell, scene, journal, TAKING, every, asks=False)
+
+
+class _Kept:
+    """Keeps the steps of a recording that does not come to its end."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+
+    def stepped(self, step: Step) -> None:
+        """Keeps it."""
+        self.steps.append(step)

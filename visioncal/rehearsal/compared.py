@@ -1,0 +1,76 @@
+"""A calibration against the truth of a simulated cell."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.calibration import Calibration
+from visioncal.chance import chi2_limit
+from visioncal.transforms import invert, log, pose_difference
+from visioncal.types import FloatArray
+
+# One rehearsal in a thousand errs by more than this although nothing is wrong.
+_CHANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class EdgeError:
+    """How far an edge is from the truth, beside what the calibration says of it.
+
+    Attributes:
+        mm: Its place [mm].
+        deg: Its rotation [deg].
+        sigma_mm: The calibration's sigma [mm].
+        sigma_deg: Likewise [deg].
+    """
+
+    mm: float
+    deg: float
+    sigma_mm: float
+    sigma_deg: float
+
+
+@dataclass(frozen=True)
+class Explained:
+    """Whether the errors of all edges together are what their covariance lets expect.
+
+    Attributes:
+        chi_square: Their squared length in sigmas.
+        freedom: Of how many numbers.
+        limit: What chance alone exceeds once in a thousand.
+    """
+
+    chi_square: float
+    freedom: int
+    limit: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether chance explains them."""
+        return self.chi_square <= self.limit
+
+
+def edge_errors(
+    calibration: Calibration, transforms: Mapping[str, FloatArray]
+) -> dict[str, EdgeError]:
+    """How far each edge is from its truth.
+
+    Args:
+        calibration: The result.
+        transforms: (4, 4) true edges by name.
+    """
+    found = {}
+    for name, edge in calibration.edges.items():
+        mm, deg = pose_difference(transforms[name], edge.matrix)
+        found[name] = EdgeError(mm, deg, edge.sigma_mm, edge.sigma_deg)
+    return found
+
+
+def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> Explained:
+    """Weighs the errors of all edges by their joint covariance."""
+    away = np.concatenate(
+        [log(invert(transforms[it]) @ edge.matrix) for it, edge in calibration.edges.items()]
+    )
+    squared = float(away @ np.linalg.solve(calibration.joint_covariance, away))
+    return Explained(squared, away.size, float(chi2_limit(_CHANCE, away.size)))
