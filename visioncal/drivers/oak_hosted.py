@@ -90,8 +90,11 @@ class HostedOak:
                 # It was under way already when this one was asked for.
                 self._feed.ask()
             self._feed.raise_what_went_wrong()
-            waited = time.monotonic() - asked
-            if waited > (_PATIENCE_S if self._feed.is_at_work else timeout_s):
+            now = time.monotonic()
+            waited = now - asked
+            # What the source has just made is still on its way through the pipeline.
+            quiet_s = now - max(asked, self._feed.rested_s)
+            if waited > _PATIENCE_S if self._feed.is_at_work else quiet_s > timeout_s:
                 raise DriverError(
                     f"The {self.name} gave no picture within {waited:.1f} s.", culprits=[self.name]
                 )
@@ -119,6 +122,7 @@ class _Feed:
         self._wanted = threading.Event()
         self._error: DriverError | None = None
         self.is_at_work = False
+        self.rested_s = 0.0
 
     def ask(self) -> None:
         """Wants a picture."""
@@ -138,6 +142,7 @@ class _Feed:
             self._error = error
             return None
         finally:
+            self.rested_s = time.monotonic()
             self.is_at_work = False
         return frame
 
