@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +25,14 @@ class Killed:
     done: bool
 
 
-def kill_and_resume(folder: Path, stops: int, kills: int, seed: int, most_s: float) -> list[Killed]:
+def kill_and_resume(
+    folder: Path,
+    stops: int,
+    kills: int,
+    seed: int,
+    most_s: float,
+    program: Sequence[str] = (sys.executable, str(_PROGRAM)),
+) -> list[Killed]:
     """Records into a folder, killed so often, each time resumed, and in the end left to finish.
 
     Each time the folder is loaded, and all that was acknowledged must be in it.
@@ -35,18 +43,19 @@ def kill_and_resume(folder: Path, stops: int, kills: int, seed: int, most_s: flo
         kills: How often it is killed.
         seed: Of the moments.
         most_s: The latest moment after the recording began [s].
+        program: What records; it is given the folder and the number of stops.
     """
     rng = random.Random(seed)
     acknowledged: set[int] = set()
     ends = []
     for _ in range(kills):
         after_s = rng.uniform(0.0, most_s)
-        done = _run(folder, stops, acknowledged, after_s)
+        done = _run([*program, str(folder), str(stops)], acknowledged, after_s)
         _check(folder, acknowledged)
         ends.append(Killed(after_s, len(acknowledged), done))
         if done:
             break
-    if not _run(folder, stops, acknowledged, None):
+    if not _run([*program, str(folder), str(stops)], acknowledged, None):
         raise AssertionError("the last recording did not end by itself")
     _check(folder, acknowledged)
     # A view may have been on the disk already when its acknowledgement was cut off.
@@ -56,9 +65,8 @@ def kill_and_resume(folder: Path, stops: int, kills: int, seed: int, most_s: flo
     return ends
 
 
-def _run(folder: Path, stops: int, acknowledged: set[int], after_s: float | None) -> bool:
+def _run(command: Sequence[str], acknowledged: set[int], after_s: float | None) -> bool:
     """Runs a recording, killed after a while; whether it came to its own end before."""
-    command = [sys.executable, str(_PROGRAM), str(folder), str(stops)]
     done = False
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as process:
         timer: threading.Timer | None = None

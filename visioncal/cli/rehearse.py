@@ -156,7 +156,7 @@ class _Rehearsal:
         verb = "is explained by" if error.passed else "is more than"
         say(
             f"the error {verb} the sigmas: chi-square {error.chi_square:.1f} of {error.freedom} "
-            f"numbers, and chance exceeds {error.limit:.1f} once in a thousand"
+            f"numbers, and up to {error.limit:.0f} is believed"
         )
         if self.pace is not None:
             pace = self.pace

@@ -7,14 +7,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.capture.core import Step, Watcher
+from visioncal.capture.core import Step, Watcher, missed
 from visioncal.capture.journal import Journal
 from visioncal.capture.options import CaptureOptions
+from visioncal.capture.take import Taken
 from visioncal.cli.console import messages, report_error, shown_progress
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.record import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
-from visioncal.errors import VisioncalError
+from visioncal.errors import DataError, DriverError, VisioncalError
 from visioncal.outputs import write_outputs, write_plan
 from visioncal.pipeline import Run, run
 from visioncal.planning.plan import Request, make_plan
@@ -39,7 +40,7 @@ class Recorded:
     """What was recorded.
 
     Attributes:
-        steps: What became of each stop, up to a fault and after it.
+        steps: What became of each stop; of a recording with a fault, the views before and after it.
         fault: What the fault did; None without one.
     """
 
@@ -101,9 +102,9 @@ def recorded(
     kept = _Kept()
     every = (*watchers, kept, befalling)
     try:
-        _drive(bench, scene, folder, every, resume=False, view=view)
+        _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
     except VisioncalError as error:
-        told_s = time.monotonic()
+        told_s = kept.missed_s or time.monotonic()
         if befalling.befell_s is None:
             raise
         report_error(error, as_json=False)
@@ -115,6 +116,8 @@ def recorded(
             befalling.stood_after_s(),
             len(Session.load(folder).views),
         )
+    else:
+        raise DriverError(f"rehearse: {fault} did not happen before all views were taken.")
     messages().print(f"  ({fault} is mended; on with --resume)")
     befalling.mend()
     rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
@@ -152,11 +155,35 @@ def _drive(
 
 
 class _Kept:
-    """Keeps the steps of a recording that does not come to its end."""
+    """Keeps the views of a recording that does not come to its end.
+
+    Attributes:
+        steps: Those that there are.
+        missed_s: When the first stop without one was told, on the monotonic clock [s].
+    """
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
+        self.missed_s: float | None = None
 
     def stepped(self, step: Step) -> None:
         """Keeps it."""
-        self.steps.append(step)
+        if isinstance(step.found, Taken):
+            self.steps.append(step)
+        elif self.missed_s is None:
+            self.missed_s = time.monotonic()
+
+
+def _check_all_seen(steps: Sequence[Step]) -> None:
+    """Raises what a recording ends with where stops gave no view.
+
+    Raises:
+        DataError: Some gave none.
+    """
+    without = list(missed(steps))
+    if without:
+        view, reason = without[0]
+        raise DataError(
+            f"{len(without)} of {len(steps)} stops gave no view; view {view}: {reason}.",
+            next_step="--resume tries them again.",
+        )
