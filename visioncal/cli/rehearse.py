@@ -4,6 +4,7 @@ import json
 import platform
 import shutil
 import time
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -62,25 +63,35 @@ def rehearse_command(
     0: the result is as near to the truth as it says; 3: it is not.
     """
     client_library("rtde_control", "ur")
-    options = RehearsalOptions(robot, mount, views, seed)
     _make_place(out)
+    whole = _rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
+    document = whole.document()
+    write_atomically(out / _SUMMARY, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    whole.tell(out)
+    if as_json:
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+    if not whole.error.passed:
+        raise typer.Exit(EXIT_WRONG)
+
+
+def _rehearse(
+    options: RehearsalOptions, out: Path, fault: Trouble | None, *, view: bool
+) -> "_Rehearsal":
+    """Plans, records and calibrates."""
     begun = time.monotonic()
     cell = rehearsed_cell(options)
     scene = planned(cell, options, out / "plan")
     plan_ready = time.monotonic()
     # Led there by hand, as an operator would, and not quite exactly.
     start_q = scene.planned.stops[0].q + _NEAR_RAD
-    bench = Bench(cell, start_q)
-    witness = Witness(bench)
-    try:
+    with closing(Bench(cell, start_q)) as bench:
+        witness = Witness(bench)
         _tell_devices(bench)
         taken = recorded(bench, scene, out / "session", [witness], fault, view=view)
-    finally:
-        bench.close()
     captured = time.monotonic()
     found = calibrated(out / "session", out / "result").calibration
     ended = time.monotonic()
-    whole = _Rehearsal(
+    return _Rehearsal(
         options,
         cell,
         found,
@@ -94,19 +105,25 @@ def rehearse_command(
             "calibrate": ended - captured,
             "all": ended - begun,
         },
+        bench.through_depthai,
     )
-    document = whole.document(through_depthai=bench.through_depthai)
-    write_atomically(out / _SUMMARY, json.dumps(document, indent=2, allow_nan=False) + "\n")
-    whole.tell(out)
-    if as_json:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
-    if not whole.error.passed:
-        raise typer.Exit(EXIT_WRONG)
 
 
 @dataclass(frozen=True, eq=False)
 class _Rehearsal:
-    """A rehearsal that came to its end."""
+    """A rehearsal that came to its end.
+
+    Attributes:
+        options: What was asked for.
+        cell: The cell.
+        calibration: The result.
+        error: Its error, weighed.
+        taken: What was recorded.
+        pace: How long the views took; None where a fault came between.
+        away_mm: For each view, how far the flange was from what was recorded [mm].
+        times_s: How long each part took [s].
+        through_depthai: Whether the pictures went through depthai's pipeline.
+    """
 
     options: RehearsalOptions
     cell: RehearsedCell
@@ -116,15 +133,16 @@ class _Rehearsal:
     pace: Pace | None
     away_mm: tuple[float, ...]
     times_s: dict[str, float]
+    through_depthai: bool
 
-    def document(self, *, through_depthai: bool) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """The content of rehearsal.json; what does not apply is absent."""
         truth = self.cell.truth.transforms
         document: dict[str, Any] = {
             "schema": 1,
             "visioncal": __version__,
             "versions": _versions(),
-            "through_depthai": through_depthai,
+            "through_depthai": self.through_depthai,
             **asdict(self.options),
             "passed": self.error.passed,
             "chi_square": asdict(self.error),
