@@ -57,7 +57,8 @@ class Suffered:
         message: What was said.
         next_step: And what to do.
         told_after_s: How long after the fault [s].
-        stood_after_s: How long after it the arm stood [s]; None where nobody can tell any more.
+        stood_after_s: How long after it the arm stood [s]; None where nobody can tell, or
+            where it goes on.
         views_kept: How many views the session had then, every acknowledged one among them.
     """
 

@@ -70,8 +70,11 @@ class Befalling:
             threading.Thread(target=self._befall, daemon=True).start()
 
     def stood_after_s(self) -> float | None:
-        """How long the arm still moved after the fault [s]; None where nobody can tell any more."""
-        if self.befell_s is None or self._fault in ("link-lost", "silent"):
+        """How long the arm still moved after the fault [s].
+
+        None where the simulated arm is gone with its controller, or goes on to the next stop.
+        """
+        if self.befell_s is None or self._fault in ("link-lost", "covered"):
             return None
         times = self.befell_s + np.arange(0.0, _LOOKED_S, _FINE_S)
         time.sleep(max(0.0, float(times[-1]) - time.monotonic()))
