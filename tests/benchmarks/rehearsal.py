@@ -6,12 +6,13 @@ depthai's pipeline, the recorder and the files.
     PYTHONPATH=tests python tests/benchmarks/rehearsal.py pace faults knocks kills
 """
 
+import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import get_args
 
@@ -28,16 +29,22 @@ from visioncal.cli.recorded_cell import Scene, facts_of, scene_of
 from visioncal.cli.rehearsed import TAKING, planned, recorded
 from visioncal.drivers.oak_hosted import HostedOak
 from visioncal.drivers.ur import UrArm
+from visioncal.errors import DataError, DriverError
 from visioncal.rehearsal.bench import Bench
 from visioncal.rehearsal.camera import RehearsalCamera
 from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
+from visioncal.rehearsal.controller import spawn
+from visioncal.rehearsal.options import ControllerOptions
 from visioncal.rehearsal.trouble import Trouble
 from visioncal.rehearsal.truth import TruthClient
 from visioncal.rehearsal.witness import Witness, pace_of
+from visioncal.session import Session
 
 COMMAND = "PYTHONPATH=tests python tests/benchmarks/rehearsal.py"
 SEED = 1
 PACE_STOPS, FAULT_STOPS, KNOCK_STOPS, KILL_STOPS = 30, 4, 12, 20
+# Room for the four views and little more.
+DISK_BYTES = 6_000_000
 KILLS, LATEST_KILL_S = 20, 6.0
 # A knock turns every joint by so much, so fast [rad, rad/s]: a tenth of a second long.
 KNOCK_RAD, KNOCK_SPEED = 1e-3, 0.01
@@ -117,11 +124,67 @@ def faults(folder: Path) -> str:
             f"| {fault} | {suffered.told_after_s:.2f} | {stood} | {suffered.views_kept} | {views} "
             f"| {message} {suffered.next_step} |"
         )
+    lines += [wrong_banner(), disk_full(folder)]
     return (
         f"{FAULT_STOPS} planned views; the fault comes after the second, while the arm moves, or, "
-        "of the camera, at the stop. A board that is covered is told at each stop, and ends the "
-        "recording at the third; all others at once.\n\n" + "\n".join(lines) + "\n"
+        "of the camera, at the stop. A covered lens is told at each stop, and ends the recording "
+        "at the third; a full disk is told when the next view is written, which has the way to "
+        "the next stop in its time; all others are told at once.\n\n" + "\n".join(lines) + "\n"
     )
+
+
+def wrong_banner() -> str:
+    """A controller whose dashboard tells no version."""
+    with spawn(ControllerOptions(polyscope="no version")) as controller:
+        begun = time.monotonic()
+        try:
+            UrArm(controller.host).close()
+        except DriverError as error:
+            told_s = time.monotonic() - begun
+            return f"| wrong version banner | {told_s:.2f} | | | | {error} |"
+    raise RuntimeError("it was taken for a controller")
+
+
+def disk_full(folder: Path) -> str:
+    """A disk that somebody else fills after the second view; needs the right to mount."""
+    place = folder / "full"
+    _, scene, bench = stage(place, FAULT_STOPS)
+    disk = place / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(disk)]
+    if subprocess.run(mount, check=False).returncode:
+        bench.close()
+        return "| disk full | | | | | (not measured: no right to mount a small disk) |"
+    filling = _Filling(disk / "ballast")
+    try:
+        recorded(bench, scene, disk / "session", [filling], None, view=False)
+    except DataError as error:
+        told_s = time.monotonic() - filling.filled_s
+        kept = len(Session.load(disk / "session").views)
+        filling.ballast.unlink()
+        rest = recorded(bench, scene, disk / "session", [], None, view=False, resume=True)
+        message = str(error).replace(str(disk), "...")
+        views = kept + len(rest.steps)
+        return f"| disk full | {told_s:.2f} | | {kept} | {views} | {message} |"
+    finally:
+        bench.close()
+        subprocess.run(["umount", str(disk)], check=True)
+    raise RuntimeError("the disk was not full")
+
+
+class _Filling:
+    """Fills a disk after the second view."""
+
+    def __init__(self, ballast: Path) -> None:
+        self.ballast, self.filled_s = ballast, 0.0
+
+    def stepped(self, step: Step) -> None:
+        """Fills it."""
+        if step.place == FAULT_STOPS // 2:
+            with suppress(OSError), self.ballast.open("wb", buffering=0) as file:
+                while file.write(bytes(65536)):
+                    pass
+            self.filled_s = time.monotonic()
 
 
 def knocks(folder: Path) -> str:

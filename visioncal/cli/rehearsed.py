@@ -90,14 +90,16 @@ def recorded(
     fault: Trouble | None,
     *,
     view: bool,
+    resume: bool = False,
 ) -> Recorded:
     """Records the plan's stops; where a fault is wanted, through it and on.
 
     Raises:
         DriverError: A device failed without being asked to.
+        DataError: The views cannot be written.
     """
     if fault is None:
-        steps = _drive(bench, scene, folder, watchers, resume=False, view=view)
+        steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
         return Recorded(tuple(steps), None)
     befalling = Befalling(bench, fault, after=max(1, len(scene.planned.stops) // 2))
     kept = _Kept()
