@@ -114,7 +114,7 @@ def test_errors_are_weighed_by_what_the_calibration_says():
     assert edge_errors(found, away)["flange_from_cam"].mm > 2.0 - before
 
 
-def test_what_a_recording_adds_is_told_from_motion_and_settling():
+def test_what_a_recording_adds_is_told_from_motion_driving_and_settling():
     known = rehearsed_cell(RehearsalOptions()).known
     q = [np.zeros(6), np.full(6, 0.5), np.full(6, 1.5)]
     # The second stop is reached by way of another posture.
@@ -128,5 +128,6 @@ def test_what_a_recording_adds_is_told_from_motion_and_settling():
     assert pace.views == 2
     assert pace.motion_s == pytest.approx(sum(ways) / 2)
     assert pace.settling_s == pytest.approx(0.6)
-    assert pace.added_s == pytest.approx(0.5)
-    assert pace.most_added_s == pytest.approx(0.7)
+    assert pace.driving_s == pytest.approx(0.2)
+    assert pace.added_s == pytest.approx(0.3)
+    assert pace.most_added_s == pytest.approx(0.4)

@@ -179,9 +179,10 @@ class _Rehearsal:
         if self.pace is not None:
             pace = self.pace
             say(
-                f"each view: {pace.motion_s:.1f} s of motion, {pace.settling_s:.2f} s until all "
-                f"stood still, {pace.added_s:.2f} s for the rest; where it was taken the flange "
-                f"was within {1e3 * max(self.away_mm):.0f} um of what was recorded"
+                f"each view: {pace.motion_s:.1f} s of motion and {pace.driving_s:.2f} s to begin "
+                f"and end it, {pace.settling_s:.2f} s until all stood still, {pace.added_s:.2f} s "
+                f"for the rest; where it was taken the flange was within "
+                f"{1e3 * max(self.away_mm):.0f} um of what was recorded"
             )
         say(
             f"plan {times['plan']:.0f} s, capture {times['capture']:.0f} s, calibrate "

@@ -50,13 +50,15 @@ class Pace:
     Attributes:
         views: How many there are.
         motion_s: The motion alone, by speed and acceleration.
+        driving_s: What it took beyond that, to begin and to end each part of the way.
         settling_s: Until all stood still.
-        added_s: Everything else: pictures, detection, writing, and what driving adds.
+        added_s: Everything else: pictures, detection, checks, writing.
         most_added_s: The same of the slowest view.
     """
 
     views: int
     motion_s: float
+    driving_s: float
     settling_s: float
     added_s: float
     most_added_s: float
@@ -80,10 +82,11 @@ def pace_of(
         motions.append(sum(travel_s(a, b, *pace) for a, b in pairwise(way)))
         here = stop.q
     times = [it.times for it in steps]
-    added = [it.moved_s - motion + it.worked_s for it, motion in zip(times, motions, strict=True)]
+    motion_s, added = float(np.mean(motions)), [it.worked_s for it in times]
     return Pace(
         len(steps),
-        float(np.mean(motions)),
+        motion_s,
+        float(np.mean([it.moved_s for it in times])) - motion_s,
         float(np.mean([it.settled_s for it in times])),
         float(np.mean(added)),
         max(added),
