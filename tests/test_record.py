@@ -232,11 +232,15 @@ def test_devices_and_pictures_that_do_not_fit_are_named(planned, cell, tmp_path)
 
 def test_a_guided_arm_is_followed(planned, cell, tmp_path):
     arm, stops = cell[0], iter(read_plan(planned[0]).stops)
-    state = arm.state
+    state, rested = arm.state, [arm.clock.now()]
 
     def led():
-        # Who leads the arm goes on half a second after each rest.
-        if arm.clock.now() - arm.begun > 3.0:
+        # Who leads the arm goes on some time after each rest, however long the way there was.
+        now = arm.clock.now()
+        if arm.moving():
+            rested[0] = now
+        if now - rested[0] > 2.0:
+            rested[0] = now
             arm.start_move(next(stops).q, speed=2.0, acceleration=4.0)
         return state()
 
