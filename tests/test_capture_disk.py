@@ -57,7 +57,9 @@ def test_a_full_disk_is_told_and_leaves_the_session(plan, tmp_path, monkeypatch)
 
     monkeypatch.setattr(journal_module, "write_atomically", counted)
     monkeypatch.setattr(journal_module.shutil, "disk_usage", room)
-    with pytest.raises(DataError, match=r"live: too little room: 0\.0 MB are free.* for view ."):
+    # It is told on the way, not when the next view is there.
+    words = r"live: too little room: 0\.0 MB are free.* for the next view"
+    with pytest.raises(DataError, match=words):
         recorded(tmp_path / "live", plan, arm, camera)
     assert arm.halted == 1
     assert len(Session.load(tmp_path / "live").views) >= 3

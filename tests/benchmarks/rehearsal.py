@@ -127,8 +127,7 @@ def faults(folder: Path) -> str:
     return (
         f"{FAULT_STOPS} planned views; the fault comes after the second, while the arm moves, or, "
         "of the camera, at the stop. A covered lens is told at each stop, and ends the recording "
-        "at the third; a full disk is told when the next view is written, which has the way to "
-        "the next stop in its time; all others are told at once.\n\n" + "\n".join(lines) + "\n"
+        "at the third; all others are told at once.\n\n" + "\n".join(lines) + "\n"
     )
 
 

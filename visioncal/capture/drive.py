@@ -1,6 +1,6 @@
 """Driving an arm from posture to posture, under a watchdog."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from visioncal.types import FloatArray
 
 # How often the arm is asked while it moves [s].
 _POLL_S = 0.02
-# How often the camera is, and for how long its picture is waited for [s]; both devices' failures
-# are noticed within a second.
+# How often the camera and the disk are, and for how long a picture is waited for [s]; what fails
+# is noticed within a second.
 _GLANCE_S, _FRAME_S = 0.3, 0.5
 # A motion may take so many times its time, and so much longer [s], before something is wrong.
 _TIMES, _MORE_S = 1.5, 3.0
@@ -34,7 +34,12 @@ def travel_s(start: FloatArray, end: FloatArray, speed: float, acceleration: flo
 
 
 def drive(
-    cell: LiveCell, arm: MovingArm, postures: Iterable[FloatArray], options: CaptureOptions
+    cell: LiveCell,
+    arm: MovingArm,
+    postures: Iterable[FloatArray],
+    options: CaptureOptions,
+    *,
+    look: Callable[[], None],
 ) -> None:
     """Drives through postures and waits until the arm has arrived at the last.
 
@@ -46,16 +51,30 @@ def drive(
         arm: Its arm.
         postures: (n,) joint angles each [rad].
         options: Speed and acceleration.
+        look: Called every now and then on the way; raises where it makes no sense to go on.
 
     Raises:
         DriverError: The arm was stopped, its link is lost, it takes too long, or it ended
             elsewhere.
+        VisioncalError: From `look`.
     """
+
+    def glance() -> None:
+        # What is gone is told now, not at the end of a long way.
+        cell.camera.frame(timeout_s=_FRAME_S)
+        look()
+
     for posture in postures:
-        _move(cell, arm, posture, options)
+        _move(cell, arm, posture, options, glance)
 
 
-def _move(cell: LiveCell, arm: MovingArm, goal: FloatArray, options: CaptureOptions) -> None:
+def _move(
+    cell: LiveCell,
+    arm: MovingArm,
+    goal: FloatArray,
+    options: CaptureOptions,
+    glance: Callable[[], None],
+) -> None:
     here = joints_of(cell)
     speed, acceleration = options.speed, options.acceleration
     expected_s = travel_s(here, goal, speed, acceleration)
@@ -66,8 +85,7 @@ def _move(cell: LiveCell, arm: MovingArm, goal: FloatArray, options: CaptureOpti
     while arm.moving():
         cell.state()
         if cell.clock.now() - glanced > _GLANCE_S:
-            # A camera that is gone is told now, not at the end of a long way.
-            cell.camera.frame(timeout_s=_FRAME_S)
+            glance()
             glanced = cell.clock.now()
         took = cell.clock.now() - begun
         if took > allowed_s:

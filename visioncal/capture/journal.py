@@ -142,6 +142,15 @@ class Journal:
         self.views, self._columns = views, columns
         return view
 
+    def check_room(self) -> None:
+        """Checks that the disk has room for one more view.
+
+        Raises:
+            DataError: It has not.
+        """
+        width, height = self._facts.resolution
+        self._check_room(width * height, "the next view")
+
     def image(self, view: View) -> bytes:
         """Reads the image of a view that is on the disk."""
         return read_bytes(self.folder / view.image)

@@ -132,7 +132,8 @@ def record(
     with closed_cleanly(cell, journal):
         for at, stop in enumerate(left):
             begun = cell.clock.now()
-            drive(cell, arm, ways.to(stop, joints_of(cell)), options)
+            way = ways.to(stop, joints_of(cell))
+            drive(cell, arm, way, options, look=journal.check_room)
             moved_s = cell.clock.now() - begun
             place = len(plan.stops) - len(left) + at + 1
             onward = left[at + 1].view if at + 1 < len(left) else None
