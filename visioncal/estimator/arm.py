@@ -176,10 +176,25 @@ def misfit_covariance(data: Closure, edges: Edges, noise: Noise, errors: ArmErro
     Returns:
         (12 + k, 12 + k).
     """
+    answer = errors.sigma * misfit_slopes(data, edges, noise, errors)
+    return np.asarray(answer @ answer.T)
+
+
+def misfit_slopes(data: Closure, edges: Edges, noise: Noise, errors: ArmErrors) -> FloatArray:
+    """How a fit that takes errors of the arm for white noise moves with them.
+
+    Args:
+        data: The views, one a stop.
+        edges: The answer.
+        noise: The white noise that it was weighted with.
+        errors: The arm's errors, at the same views.
+
+    Returns:
+        (12 + k, p) by how much the fit is off from the truth, for each error of one.
+    """
     _, jacobian, spread = residual_blocks(data, edges, noise)
     seen = data.under(edges.shared)
     moved = flange_to_residual(seen, edges) @ errors.basis
     weighted = np.linalg.solve(spread, moved)
     fitted = covariance(normal_equations(data, edges, noise)[0])
-    answer = fitted @ (errors.sigma * gram(jacobian, weighted))
-    return np.asarray(answer @ answer.T)
+    return np.asarray(fitted @ gram(jacobian, weighted))

@@ -15,6 +15,7 @@ from visioncal.estimator.boards import Placed, place
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.arm import kinematics_document
+from visioncal.pipeline.fit import conditions_document, fit_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -213,6 +214,11 @@ def _further(known: Known) -> dict[str, Any]:
         documents["kinematics"] = kinematics
     if known.diagnosis is not None:
         documents["uncertainty"] = _uncertainty(known, known.diagnosis)
+    conditions, fit = conditions_document(known), fit_document(known)
+    if conditions:
+        documents["conditions"] = conditions
+    if fit is not None:
+        documents["joint_fit"] = fit
     return documents
 
 

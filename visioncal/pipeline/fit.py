@@ -1,0 +1,77 @@
+"""What a later look at the same cell has to know of the joint fit, as calibration.json has it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.estimator.arm import misfit_slopes
+from visioncal.pipeline.known import Known
+from visioncal.targets import target_document
+from visioncal.types import FloatArray
+
+# Columns of views.csv that say under which conditions a view was taken.
+CONDITIONS = ("ambient_c", "payload_kg")
+
+
+def fit_document(known: Known) -> dict[str, Any] | None:
+    """Writes all unknowns of the fit with their covariance; None where an instrument read them.
+
+    The unknowns are, in this order: both edges of the chain, lens and board as far as something is
+    open about them, where further boards lie from the first, and the arm's errors.
+    """
+    if known.readings is not None:
+        return None
+    names, looks = tuple(known.session.boards), known.free
+    arm = _arm(known)
+    return {
+        "targets": {name: target_document(it) for name, it in known.session.boards.items()},
+        "boards": [names[it] for it in known.boards] if names else [""],
+        "looks": [] if looks is None else looks.columns.tolist(),
+        **({} if arm is None else {"arm": arm}),
+        "covariance": _covariance(known).tolist(),
+    }
+
+
+def conditions_document(known: Known) -> dict[str, float]:
+    """The mean conditions of the used views; those that a used view does not say are left out."""
+    views = [it for it in known.session.views if it.number in known.used]
+    return {
+        name: float(np.mean([it.numbers[name] for it in views]))
+        for name in CONDITIONS
+        if views and all(name in it.numbers for it in views)
+    }
+
+
+def _arm(known: Known) -> dict[str, Any] | None:
+    """What the arm's errors are of, and what they were found to be beside the arm that is told."""
+    model, errors = known.arm_model, known.arm
+    if errors is None:
+        return None
+    count = errors.basis.shape[2]
+    # Errors that only count are where they were stated; those of a model are in its arm already.
+    values = known.solved.edges.shared[-count:] if errors.is_estimated else np.zeros(count)
+    if model is None:
+        of = "links" if known.joints_rad is not None and known.robot is not None else "poses"
+        return {"of": of, "values": values.tolist()}
+    return {
+        "of": "model",
+        "values": values.tolist(),
+        "weights": dict(model.weights),
+        "flange_from_reported": model.flange_from_reported.tolist(),
+    }
+
+
+def _covariance(known: Known) -> FloatArray:
+    """The fit's own, and beside it what it has in common with errors that only count in it."""
+    result, errors, diagnosis = known.solved, known.arm, known.diagnosis
+    if errors is None or errors.is_estimated or diagnosis is None:
+        return result.covariance
+    data = known.closure(known.used).merged(known.stops)
+    first = np.unique(known.stops, return_index=True)[1]
+    by_stop = replace(errors, basis=known.arm_basis(known.used)[first])
+    slopes = misfit_slopes(data, result.edges, result.noise, by_stop)
+    size, variance = slopes.shape[1], diagnosis.inflation * errors.sigma**2
+    # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
+    between = -variance * slopes
+    return np.block([[result.covariance, between], [between.T, variance * np.eye(size)]])
