@@ -43,6 +43,7 @@ LAYERS = (
     ("planning", "report", "viewer", "drivers"),
     ("capture",),
     ("rehearsal",),
+    ("verification",),
     ("outputs",),
     ("stored", "formats", "exports"),
     ("joining",),

@@ -84,7 +84,7 @@ class Eye:
             _flange_sigmas(calibration),
             _arm_sigma(calibration),
             calibration.noise.get("pixel_px"),
-            _freedom(calibration),
+            noise_freedom(calibration),
             (bad,) if verdict.status == "bad" else (),
         )
 
@@ -254,7 +254,7 @@ def _arm_sigma(calibration: Calibration) -> float:
     return float(np.deg2rad(found.get("sigma_deg", 0.0)))
 
 
-def _freedom(calibration: Calibration) -> float:
+def noise_freedom(calibration: Calibration) -> float:
     """Degrees of freedom of the noise's levels, by the width of their 95 % intervals.
 
     A level with n degrees of freedom has a logarithm known to 1 / sqrt(2 n). Rotation and

@@ -73,7 +73,7 @@ def sighting(
     seen = detect(session, progress=progress, among=views)
     lost |= {it.view: it.reason for it in seen.rejections}
     views = _usable(session, asked, target, lost)
-    _check_resolution(session, calibration, seen.resolution)
+    check_resolution(session, calibration, seen.resolution)
     sights = [
         Sight(_label(it), seen.corners[it.number], poses.get(it.number), it.stop) for it in views
     ]
@@ -107,7 +107,7 @@ def pictured(
         if isinstance(image, Rejection):
             lost[view.number] = image.reason
             continue
-        _check_resolution(session, calibration, (image.shape[1], image.shape[0]))
+        check_resolution(session, calibration, (image.shape[1], image.shape[0]))
         sights.append(Sight(_label(view), image, poses.get(view.number), view.stop))
     views = _usable(session, asked, target, lost)
     return Sighting(
@@ -257,9 +257,14 @@ def _usable(
     )
 
 
-def _check_resolution(
+def check_resolution(
     session: Session, calibration: Calibration, resolution: tuple[int, int]
 ) -> None:
+    """Refuses images of another size than those of the calibrated camera.
+
+    Raises:
+        DataError: So they are.
+    """
     camera = calibration.camera
     if camera is None or resolution == camera.camera.resolution:
         return

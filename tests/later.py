@@ -1,0 +1,98 @@
+"""Later looks at a simulated cell that was calibrated: fresh stops, after some change or none."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from cells import calibrated, known_of
+from picks import seen_corners
+from test_kinematics import WRONG_LINKS, target_in_camera
+
+from visioncal.calibration import Calibration
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.result import result_of
+from visioncal.simulation import Cell, CellOptions, forward, simulate
+from visioncal.transforms import exp
+from visioncal.types import FloatArray
+
+# Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
+ANYHOW = replace(WRONG_LINKS, roll_rad=np.pi, branches=True)
+FITTED = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What has changed: twists (6,) on the right of x and z, offsets of the joints, the noise."""
+
+    camera: FloatArray = field(default_factory=lambda: np.zeros(6))
+    board: FloatArray = field(default_factory=lambda: np.zeros(6))
+    joints_rad: FloatArray = field(default_factory=lambda: np.zeros(6))
+    noise_factor: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lot:
+    """A cell of many views, the first of which its calibration rests on."""
+
+    cell: Cell
+    calibration: Calibration
+
+
+@lru_cache
+def lot(options: CellOptions = ANYHOW, further: int = 60) -> Lot:
+    """A calibrated cell, and as many further postures from which the board is in view."""
+    cell = simulate(replace(options, views=FITTED + further))
+    return Lot(cell, result_of(calibrated(part(cell, range(FITTED)))))
+
+
+def part(cell: Cell, views: Sequence[int]) -> Cell:
+    """Some views of a cell with one board, numbered anew."""
+    rows = list(views)
+    return replace(
+        cell,
+        joints=cell.joints[rows],
+        base_from_flange=cell.base_from_flange[rows],
+        true_base_from_flange=cell.true_base_from_flange[rows],
+        cam_from_target=cell.cam_from_target[rows],
+        corners=tuple(replace(cell.corners[it], view=at) for at, it in enumerate(rows)),
+    )
+
+
+def again(
+    cell: Cell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
+) -> Cell:
+    """Fresh stops of a cell at postures that its calibration has not seen, with noise of their own.
+
+    Args:
+        cell: With `FITTED` views and more.
+        rng: Which postures, and the noise.
+        change: What has changed since; nothing where None.
+        stops: How many.
+    """
+    change = change or Change()
+    rows = FITTED + rng.choice(len(cell.joints) - FITTED, stops, replace=False)
+    fresh, options = part(cell, rows.tolist()), cell.options
+    sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
+    jitter = exp(change.noise_factor * sigma * rng.standard_normal((stops, 6)))
+    flange = forward(cell.true_arm, fresh.joints + change.joints_rad) @ jitter
+    x, z = cell.transforms.values()
+    moved = x @ exp(change.camera), z @ exp(change.board)
+    seen = [
+        seen_corners(cell, it, options.target, rng)
+        for it in target_in_camera(options.mount, *moved, flange)
+    ]
+    corners = tuple(replace(it, view=at) for at, it in enumerate(seen))
+    return replace(fresh, true_base_from_flange=flange, corners=corners)
+
+
+def known_again(cell: Cell, rng: np.random.Generator, change: Change | None = None) -> Known:
+    """What is known of such stops after detection."""
+    return known_of(again(cell, rng, change))
+
+
+def knock(rng: np.random.Generator, mm: float, deg: float) -> FloatArray:
+    """A twist (6,) of so much, about and along some direction each."""
+    directions = rng.standard_normal((2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.concatenate([np.deg2rad(deg) * directions[0], 1e-3 * mm * directions[1]])

@@ -1,0 +1,146 @@
+"""What may have happened to a cell since it was calibrated: the causes that a check compares."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.causes import TURN_PER_M, Cause
+from visioncal.robot import Robot
+from visioncal.transforms import adjoint, invert, log, mean_transform
+from visioncal.types import FloatArray
+from visioncal.verification.footing import Footing
+from visioncal.verification.seeing import Seen
+
+CAMERA, BOARD, JOINT, LENGTH, NOISE, VIEW = (
+    "camera",
+    "board",
+    "joint",
+    "arm_length",
+    "robot_noise",
+    "view",
+)
+# What a robot's scatter may have grown by.
+_FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
+_KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
+
+
+def causes_of(seen: Seen, footing: Footing, *, board_placed_anew: bool) -> tuple[Cause, ...]:
+    """The single causes that a check of these stops compares.
+
+    Args:
+        seen: The stops.
+        footing: What the calibration rests on.
+        board_placed_anew: Whether the board's place is nothing to be checked.
+    """
+    return (
+        _camera(seen),
+        *(() if board_placed_anew else _boards(seen, footing)),
+        *_joints(seen, footing),
+        _noise(seen),
+        *_views(seen, footing),
+    )
+
+
+def kind_of(cause: str) -> str:
+    """The kind of a cause: `joint` of `joint 3`."""
+    return cause.partition(" ")[0]
+
+
+def _camera(seen: Seen) -> Cause:
+    """The camera's edge: a twist on its right, seen from the target's side."""
+    moved = adjoint(invert(seen.data.camera))
+    return _cause(CAMERA, seen, _KNOCK, by_camera=moved)
+
+
+def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
+    """Each board's edge: a twist on its right."""
+    boards, data = footing.boards, seen.data
+    names = tuple(footing.targets) or ("",)
+    away = log(invert(footing.edges.z) @ data.under(footing.edges.shared).placed(footing.edges.x))
+    shown = _shown(seen)
+    for at, board in enumerate(boards):
+        mine = shown == at
+        if not mine.any():
+            continue
+        carried = adjoint(invert(footing.from_first[at]))
+        # The chain ends at the first board: what turns this one is carried there.
+        by_camera = -np.where(mine[:, None, None], carried, 0.0)
+        start = adjoint(footing.from_first[at]) @ away[mine].mean(axis=0)
+        yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_camera, start=start)
+
+
+def _shown(seen: Seen) -> FloatArray:
+    """(m,) which of the calibration's boards each stop shows; the first of several."""
+    return np.array([seen.known.shown([views[0]]).shown[0] for views in seen.stops])
+
+
+def _joints(seen: Seen, footing: Footing) -> Iterator[Cause]:
+    """One offset a joint, and one stretch of all lengths."""
+    model, q = _arm(seen, footing), seen.joints_rad
+    if model is None or q is None:
+        return
+    offsets, robot = model.columns("offsets", q), model.robot
+    for joint in range(robot.joint_count):
+        unit = 1.0 if robot.chain.prismatic[joint] else TURN_PER_M
+        column = offsets[:, :, joint : joint + 1]
+        yield _cause(f"{JOINT} {joint + 1}", seen, np.array([unit]), by_flange=column)
+    yield _cause(LENGTH, seen, np.ones(1), by_flange=_stretch(robot, q)[:, :, None])
+
+
+def _arm(seen: Seen, footing: Footing) -> ArmModel | None:
+    """The arm that offsets are of; the nominal one where none was calibrated."""
+    robot, matched = footing.calibration.calibrated_robot, seen.known.matched
+    if footing.model is not None or robot is None or matched is None:
+        return footing.model
+    return ArmModel(robot, matched.flange_from_reported, {}, np.zeros(0))
+
+
+def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
+    """(m, 6) how the flange moves when all of an arm's lengths grow by as much as they are."""
+    placements = robot.chain.placements
+    # A placement's offset lies in the frame before it; its twist acts behind it.
+    twists = np.zeros((len(placements), 6))
+    twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
+    return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
+
+
+def _noise(seen: Seen) -> Cause:
+    nothing = np.zeros((len(seen.data), 6, 0))
+    return Cause(NOISE, nothing, nothing, np.zeros(0), np.zeros(0), _FACTORS)
+
+
+def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
+    """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
+    if len(seen.data) < 2:
+        return
+    data = seen.data.under(footing.edges.shared)
+    away = log(invert(footing.edges.z) @ data.placed(footing.edges.x))
+    for at, views in enumerate(seen.stops):
+        by_camera = np.zeros((len(data), 6, 6))
+        by_camera[at] = -np.eye(6)
+        yield _cause(f"{VIEW} {views[0]}", seen, _KNOCK, by_camera, start=away[at])
+
+
+def _cause(
+    name: str,
+    seen: Seen,
+    units: FloatArray,
+    by_camera: FloatArray | None = None,
+    by_flange: FloatArray | None = None,
+    start: FloatArray | None = None,
+) -> Cause:
+    nothing = np.zeros((len(seen.data), 6, len(units)))
+    return Cause(
+        name,
+        nothing if by_camera is None else by_camera,
+        nothing if by_flange is None else by_flange,
+        units,
+        np.zeros(len(units)) if start is None else start,
+    )
+
+
+def roughly_placed(seen: Seen, footing: Footing) -> FloatArray:
+    """(4, 4) where the stops place the board on average, by the calibration's camera and arm."""
+    data = seen.data.under(footing.edges.shared)
+    return mean_transform(data.placed(footing.edges.x))

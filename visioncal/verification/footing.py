@@ -1,0 +1,181 @@
+"""What a calibration rests on, as a later look at the same cell needs it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.calibration import Calibration
+from visioncal.errors import DataError
+from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Free, boards_basis
+from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.closure import Edges, Noise
+from visioncal.estimator.observability import edge_names
+from visioncal.frames.chain import noise_freedom
+from visioncal.robot import Robot
+from visioncal.targets import corner_positions, numbered_positions, target_from_document
+from visioncal.transforms import invert, log
+from visioncal.types import FloatArray, Target
+
+ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
+
+
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """The fit of a calibration: its unknowns, their covariance, and the noise.
+
+    Attributes:
+        calibration: Whose.
+        targets: What was printed, by the session's names for it; that of an only one is empty.
+        boards: Places among the targets: the one that the chain ends at, then the others.
+        edges: x, z, and the values of what all stops share: lens, board, other boards and arm.
+        from_first: (b, 4, 4) where the boards lie from the first.
+        covariance: (12 + k, 12 + k).
+        looks: (l,) which values of lens and board are among them.
+        arm: What the last of them are errors of.
+        arm_size: How many these are.
+        model: The calibrated arm, where they are of its model.
+    """
+
+    calibration: Calibration
+    targets: Mapping[str, Target]
+    boards: tuple[int, ...]
+    edges: Edges
+    from_first: FloatArray
+    covariance: FloatArray
+    looks: tuple[int, ...]
+    arm: ArmKind
+    arm_size: int
+    model: ArmModel | None
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> "Footing":
+        """Reads it from a calibration.
+
+        Raises:
+            DataError: The calibration does not say it: an instrument made it, or an older version.
+        """
+        if calibration.mount == "instrument":
+            raise DataError(
+                f"calibration {calibration.session_name!r} was made with a measuring instrument; "
+                "only one with a camera can be verified.",
+                next_step="Calibrate the new readings, and compare both with visioncal diff.",
+            )
+        document = calibration.stages.get("joint_fit")
+        if document is None:
+            raise DataError(
+                f"calibration {calibration.session_name!r} does not hold the covariance of its "
+                "fit (joint_fit): an older version made it.",
+                next_step="Calibrate its recording again: visioncal calibrate recording.rrd -o "
+                "FOLDER.",
+            )
+        try:
+            return _read(calibration, document)
+        except (LookupError, TypeError, ValueError) as error:
+            raise DataError(
+                f"calibration {calibration.session_name!r}: joint_fit cannot be read: {error!r}.",
+                next_step="Calibrate its session again.",
+            ) from error
+
+    @property
+    def free(self) -> Free | None:
+        """Lens and board as the calibration found them; None without a camera or a target."""
+        camera = self.calibration.camera
+        if camera is None or not self.targets:
+            return None
+        targets, size = tuple(self.targets.values()), len(self.looks)
+        return Free(
+            Appearance(camera.camera, _shape(self.calibration, tuple(self.targets))),
+            boards_basis([corner_positions(it) for it in targets]),
+            numbered_positions(targets),
+            np.array(self.looks, dtype=np.int64),
+            np.zeros(size, dtype=bool),
+            np.zeros((size, size)),
+            np.zeros(size),
+        )
+
+    def noise(self, *, from_corners: bool) -> Noise:
+        """The noise of one stop: of the flange, or with that of the camera's poses as one.
+
+        A level that the calibration knows badly is taken for what its 95 % interval allows.
+        """
+        stated, stages = self.calibration.noise, self.calibration.stages
+        of = "robot" if from_corners else "combined"
+        if f"{of}_rotation_deg" not in stated:
+            # Poses of another origin than the calibration's: as they scattered there in all.
+            rms = self.calibration.rms
+            return Noise(float(np.deg2rad(rms.deg or 0.0) / np.sqrt(3)), 1e-3 * rms.mm / np.sqrt(3))
+        intervals = stages.get("uncertainty", {}).get("noise_95", {})
+        deg, mm = (
+            max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
+            for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
+        )
+        return Noise(float(np.deg2rad(deg)), 1e-3 * mm)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that the noise was estimated with."""
+        return noise_freedom(self.calibration)
+
+    def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "Footing":
+        """The same with a board that lies somewhere else.
+
+        Args:
+            z: (4, 4) about where.
+            sigmas: (6,) how roughly that is known.
+        """
+        spread = self.covariance.copy()
+        spread[6:12], spread[:, 6:12] = 0.0, 0.0
+        spread[6:12, 6:12] = np.diag(sigmas**2)
+        return replace(self, edges=replace(self.edges, z=z), covariance=spread)
+
+
+def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
+    names = document["boards"]
+    x_name, z_name = edge_names(calibration.mount)
+    places = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
+    targets = {
+        name: target_from_document(it, name or "target") for name, it in document["targets"].items()
+    }
+    spread, looks = np.array(document["covariance"], dtype=float), tuple(document["looks"])
+    arm = document.get("arm", {"of": "none", "values": []})
+    size = len(arm["values"])
+    before = len(looks) + 6 * (len(names) - 1)
+    if spread.shape != (12 + before + size,) * 2:
+        raise ValueError(f"covariance has the shape {spread.shape}")
+    if not np.isfinite(spread).all():
+        raise ValueError("covariance has entries that are no finite numbers")
+    values = np.concatenate([np.zeros(before), np.array(arm["values"], dtype=float)])
+    return Footing(
+        calibration,
+        targets,
+        tuple(list(targets).index(it) for it in names) if targets else (0,),
+        Edges(calibration.edges[x_name].matrix, places[0], values),
+        invert(np.array(places)) @ places[0],
+        spread,
+        looks,
+        arm["of"],
+        size,
+        _model(calibration.calibrated_robot, arm),
+    )
+
+
+def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:
+    """The arm's model at what was found, so that no errors are left to be added."""
+    if document["of"] != "model" or arm is None:
+        return None
+    reported = np.array(document["flange_from_reported"], dtype=float)
+    mounted = np.zeros((arm.joint_count + 1, 6))
+    mounted[-1] = log(invert(reported))
+    nothing = np.zeros(len(document["values"]))
+    return ArmModel(arm.corrected(mounted), reported, document["weights"], nothing)
+
+
+def _shape(calibration: Calibration, names: tuple[str, ...]) -> FloatArray:
+    """(9 b,) what the boards were found to be like; those that were not looked at are flat."""
+    stages = calibration.stages
+    several = stages.get("boards", {})
+    shapes = [(several.get(it, {}) if it else stages.get("board", {})).get("shape") for it in names]
+    flat = dict.fromkeys(BOARD_NAMES, 0.0)
+    return np.array([(it or flat)[name] for it in shapes for name in BOARD_NAMES])

@@ -1,0 +1,256 @@
+"""A few stops of a session, seen with a calibration's own lens, boards and arm."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration import CameraResult
+from visioncal.errors import DataError
+from visioncal.estimator.arm import ArmErrors
+from visioncal.estimator.closure import Closure
+from visioncal.estimator.corners import CornerStack, reproject
+from visioncal.frames.sighting import check_mount, check_resolution
+from visioncal.pipeline import STAGES
+from visioncal.pipeline.known import Known
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.stages.choose import choose_by
+from visioncal.stages.handeye import robot_part
+from visioncal.targets import target_document
+from visioncal.transforms import invert, pose_difference
+from visioncal.types import FloatArray, Progress
+from visioncal.verification.footing import Footing
+
+# Models that place the flange alike to this are of one robot; tables are written with six digits.
+_ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
+_POSTURES = 5
+_STAGES = {it.name: it.run for it in STAGES}
+# Corners that scatter by so many times as much as when they were calibrated with are worth a word.
+_WORTH_A_WORD = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The stops of a session as a calibration sees them.
+
+    Attributes:
+        known: What is known of the session, with the calibration's lens, boards and arm.
+        data: The m stops, with all that the calibration's unknowns are.
+        stops: The views of each stop.
+        warnings: What is odd, in sentences.
+    """
+
+    known: Known
+    data: Closure
+    stops: tuple[tuple[int, ...], ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(m, n) joint angles of the stops [rad]; None where not all have them."""
+        if self.known.joints_rad is None or self.known.robot is None:
+            return None
+        return self.known.joints([views[0] for views in self.stops])
+
+    @property
+    def from_corners(self) -> bool:
+        """Whether the target's poses come from corners, whose noise is known."""
+        return self.data.camera_covariance is not None
+
+
+def see_again(session: Session, footing: Footing, progress: Progress | None = None) -> Seen:
+    """Looks at a session with what a calibration rests on, and estimates nothing anew.
+
+    Args:
+        session: Of the same cell.
+        footing: The calibration's.
+        progress: Told of long work.
+
+    Raises:
+        DataError: It is of another mount, camera, target or robot, lacks joint angles that the
+            calibrated arm needs, or shows nothing.
+    """
+    known = _STAGES["robot"](known_before(session, footing, progress))
+    known = _STAGES["detect"](known)
+    return seen_by(known, footing)
+
+
+def known_before(session: Session, footing: Footing, progress: Progress | None = None) -> Known:
+    """What is known before anything is looked at: that the session is of the same cell.
+
+    Raises:
+        DataError: It is of another mount, target or robot.
+    """
+    calibration = footing.calibration
+    check_mount(session, calibration)
+    if any(view.image for view in session.views):
+        _check_targets(session, footing)
+    document, robot = session.robot_document, calibration.robot
+    if robot is not None and document is not None:
+        _check_robot(session, Robot.from_document(document), robot)
+    if robot is not None:
+        # As calibrated, with its base in the frame of the poses.
+        session = replace(session, robot_document=robot.document)
+    return Known(session, "joint", progress)
+
+
+def seen_by(known: Known, footing: Footing) -> Seen:
+    """Carries on where targets have been detected; see `see_again`."""
+    calibration = footing.calibration
+    if known.resolution is not None:
+        if calibration.camera is None:
+            raise DataError(
+                f"calibration {calibration.session_name!r} holds no camera, and session "
+                f"{known.session.name!r} has images.",
+                next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
+            )
+        check_resolution(known.session, calibration, known.resolution)
+        camera = CameraResult(calibration.camera.camera, estimated=False)
+        known = replace(known, camera=camera)
+    known = _with_arm(_STAGES["pnp"](known), footing)
+    known = _posed(known, footing)
+    numbered = known.stops
+    stops = tuple(
+        tuple(np.array(known.used)[numbered == at].tolist()) for at in range(numbered.max() + 1)
+    )
+    data = known.closure(known.used).merged(numbered)
+    return Seen(known, data, stops, tuple(_warnings(known, footing)))
+
+
+def _with_arm(known: Known, footing: Footing) -> Known:
+    """Takes the arm for what the calibration has it for."""
+    known = replace(known, arm_model=footing.model)
+    if footing.arm in ("none", "poses"):
+        return known
+    if known.joints_rad is None:
+        missing = [it.number for it in known.session.views if it.joints_rad is None]
+        raise DataError(
+            f"session {known.session.name!r}: the calibration is of an arm by its joints, and "
+            + (f"{len(missing)} views have no joint angles." if missing else "its joints differ."),
+            culprits=[f"views.csv: view {it}" for it in missing],
+            next_step="Record q1_rad ... with every view.",
+        )
+    return known
+
+
+def _posed(known: Known, footing: Footing) -> Known:
+    """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
+    mount, targets = known.session.mount, tuple(footing.targets.values())
+    placed = footing.edges.z @ invert(footing.from_first)
+    order = {board: at for at, board in enumerate(footing.boards)}
+    views, chosen = [], []
+    for view in (it.number for it in known.session.views):
+        poses = known.poses.get(view)
+        if poses is None or view not in known.base_from_flange or poses.board not in order:
+            continue
+        robot = robot_part(known.flange_poses([view]), mount)[0]
+        at = replace(footing.edges, z=placed[order[poses.board]])
+        views.append(view)
+        chosen.append(choose_by(poses, robot, at, targets[poses.board] if targets else None))
+    if not views:
+        raise DataError(
+            f"session {known.session.name!r}: no view shows the target from a known pose of the "
+            "robot.",
+            culprits=known.lost_views,
+        )
+    known = replace(
+        known,
+        used=tuple(views),
+        boards=footing.boards,
+        from_first=footing.from_first,
+        free=footing.free,
+    ).posed(chosen)
+    if known.free is not None and all(it.corners is not None for it in chosen):
+        known = replace(known, pixel_px=_noise_px(known)).posed(chosen)
+    return _with_errors(known, footing)
+
+
+def _with_errors(known: Known, footing: Footing) -> Known:
+    """Adds the arm's errors as unknowns, as the calibration's covariance has them."""
+    if footing.arm == "none":
+        return known
+    if footing.arm == "poses":
+        basis = replace(known, joints_rad=None).arm_basis(known.used)
+    else:
+        basis = known.arm_basis(known.used)
+    errors = ArmErrors(basis, 1.0, np.inf, of_links=True)
+    joints = None if footing.arm == "poses" else known.joints_rad
+    return replace(known, arm=errors, joints_rad=joints)
+
+
+def _noise_px(known: Known) -> float:
+    """Noise of a corner's coordinate around the poses, by lens and boards as calibrated [px]."""
+    corners = {view: it for view, it in zip(known.used, known.seen(known.used), strict=True) if it}
+    free = known.free
+    if free is None or not corners:
+        return known.pixel_px or 0.0
+    shaped = free.positions + free.basis @ free.appearance.board
+    stack = CornerStack.of(corners, shaped)
+    poses = np.array([known.poses[view].cam_from_target[0] for view in corners])
+    left = reproject(stack, free.appearance.camera, poses).residuals
+    freedom = left.size - 6 * len(corners)
+    return float(np.sqrt(np.sum(left**2) / max(freedom, 1)))
+
+
+def _check_targets(session: Session, footing: Footing) -> None:
+    """Refuses other targets than were calibrated with; how well a size is known may differ."""
+    for name, target in session.boards.items():
+        known = footing.targets.get(name)
+        if known is None:
+            there = ", ".join(it or "one without a name" for it in footing.targets)
+            raise DataError(
+                f"session {session.name!r}: target {name or target.name!r} is none of those that "
+                f"were calibrated with ({there}).",
+                culprits=["session.toml: target"],
+                next_step="Name the targets as in the calibration's session.",
+            )
+        ours, theirs = target_document(known), target_document(target)
+        other = [it for it in {**ours, **theirs} if ours.get(it) != theirs.get(it)]
+        for field in other:
+            if field == "square_sigma_m":
+                continue
+            raise DataError(
+                f"session {session.name!r}: target {name or target.name!r} has {field} = "
+                f"{theirs.get(field)!r}, and the calibration was made with {ours.get(field)!r}: it "
+                "is another target.",
+                culprits=[f"target: {field}"],
+                next_step="Verify with the target that was calibrated with, as it was described "
+                "then.",
+            )
+
+
+def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
+    """Refuses another robot; the same model written otherwise passes."""
+    culprit = ["session.toml: robot.model"]
+    if stated.joint_count != known.joint_count:
+        raise DataError(
+            f"session {session.name!r} names robot {stated.name} with {stated.joint_count} joints, "
+            f"and the calibration is of {known.name} with {known.joint_count}.",
+            culprits=culprit,
+            next_step="Name the calibration of this robot.",
+        )
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, known.joint_count))
+    # The calibrated one's base may have been placed by the poses: motions are compared.
+    ours, theirs = (it.base_from_flange(q) for it in (known, stated))
+    between = [invert(it[0]) @ it for it in (ours, theirs)]
+    off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
+    if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
+        raise DataError(
+            f"session {session.name!r} names robot {stated.name}, whose flange is up to "
+            f"{off[0]:.3g} mm and {off[1]:.2g} deg off from the calibrated {known.name}'s: it is "
+            "another robot, or another tip.",
+            culprits=culprit,
+            next_step="Name the robot and tip as in the calibration's session.",
+        )
+
+
+def _warnings(known: Known, footing: Footing) -> Iterator[str]:
+    """What is odd about the session."""
+    yield from dict.fromkeys(known.warnings)
+    before, now = footing.calibration.noise.get("pixel_px"), known.pixel_px
+    if before is not None and now is not None and now > _WORTH_A_WORD * max(before, 1e-3):
+        yield (
+            f"The corners scatter by {now:.2g} px around the target's poses, and by {before:.2g} "
+            "px when it was calibrated: look whether the lens is clean, sharp and as it was."
+        )
