@@ -25,6 +25,7 @@ from visioncal.simulation import (
 from visioncal.transforms import invert, rotation_angle
 
 CONTRACT_KEYS = {
+    "joint_fit",
     "kinematics",
     "schema",
     "visioncal",

@@ -22,10 +22,12 @@ from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
 from visioncal.cli.target import target_app
 from visioncal.cli.tcp import tcp_command
+from visioncal.cli.verify import verify_command
 from visioncal.errors import VisioncalError
 from visioncal.version import __version__
 
-# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result.
+# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check said
+# no (verify).
 EXIT_NO_RESULT = 2
 
 app = typer.Typer(
@@ -42,6 +44,7 @@ app.command("record")(record_command)
 app.command("rehearse")(rehearse_command)
 app.command("calibrate")(calibrate_command)
 app.command("report")(report_command)
+app.command("verify")(verify_command)
 app.command("diff")(diff_command)
 app.command("convert")(convert_command)
 app.command("export")(export_command)

@@ -15,6 +15,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from visioncal.estimator.closure import Closure, Edges, Noise, residual_blocks
 from visioncal.estimator.shared import Shared
+from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.types import FloatArray
 
 # Changes come in all sizes: from a tenth of a millimetre to a tenth of a metre, by half decades.
@@ -78,7 +79,7 @@ class Explained:
 
     Attributes:
         likelihood: Logarithm of its marginal likelihood.
-        values: (p,) its most likely unknowns.
+        values: (p,) its unknowns, as the stops alone say them.
         covariance: (p, p) of these.
         noise_factor: What the noise has most likely grown by.
         misfit: Squared distance, in units of sigma, that the cause leaves unexplained.
@@ -101,32 +102,28 @@ def explain(data: Closure, belief: Belief, cause: Cause | None = None) -> Explai
         belief: What the calibration says.
         cause: The change; None where nothing has.
     """
-    count = 0 if cause is None else len(cause.units)
-    whole = data if cause is None else data.with_more(_shared(cause))
-    trials = ((0.0, 1.0),) if cause is None else cause.trials
-    units = np.zeros(0) if cause is None else cause.units
-    start = np.zeros(0) if cause is None else cause.start
-    factor = trials[-1][1]
-    widest = _prior(belief, trials[-1][0] * units)
-    stops = _rested(whole, belief, start, widest, factor)
+    cause = cause or _nothing(len(data))
+    units, (widest_m, factor) = cause.units, cause.trials[-1]
+    widest = _prior(belief, widest_m * units)
+    stops = _rested(data, belief, cause, widest, factor)
     scores = []
-    for size, grown in trials:
+    for size_m, grown in cause.trials:
         if grown != factor:
-            stops = _at(whole, belief, stops.change, grown)
-        scores.append(_score(stops, _prior(belief, size * units), belief.freedom))
-    best = int(np.argmax(scores))
-    size, grown = trials[best]
-    stops = _at(whole, belief, stops.change, grown)
-    mean, spread = _posterior(stops, _prior(belief, size * units))
-    wide = _prior(belief, max(trials[-1][0], size) * units)
-    tail = slice(len(mean) - count, None)
+            stops = _at(data, belief, cause, stops.change, grown)
+        scores.append(_score(stops, _prior(belief, size_m * units), belief.freedom))
+    grown = cause.trials[int(np.argmax(scores))][1]
+    stops = _at(data, belief, cause, stops.change, grown)
+    # The change's size is left to the stops: what is known of it beforehand would shrink it.
+    mean, spread = _posterior(stops, widest)
+    tail = slice(len(belief.covariance), None)
+    pulled = float(np.sum((mean[tail] / (widest_m * units)) ** 2))
     return Explained(
         float(np.logaddexp.reduce(scores) - np.log(len(scores))),
         mean[tail],
         spread[tail, tail],
         grown,
-        _misfit(stops, wide)[0],
-        len(stops.residuals) - count,
+        _misfit(stops, widest)[0] - pulled,
+        len(stops.residuals) - len(units),
     )
 
 
@@ -144,10 +141,10 @@ class _Stops:
     spread: FloatArray
 
 
-def _shared(cause: Cause) -> Shared:
-    size = len(cause.units)
-    nothing = np.zeros(size)
-    return Shared(np.zeros((size, size)), nothing, nothing, cause.by_camera, cause.by_flange)
+def _nothing(stops: int) -> Cause:
+    """No change at all."""
+    still, none = np.zeros((stops, 6, 0)), np.zeros(0)
+    return Cause("nothing", still, still, none, none, (1.0,))
 
 
 def _prior(belief: Belief, sigmas: FloatArray) -> FloatArray:
@@ -155,27 +152,70 @@ def _prior(belief: Belief, sigmas: FloatArray) -> FloatArray:
 
 
 def _rested(
-    whole: Closure, belief: Belief, start: FloatArray, prior: FloatArray, factor: float
+    data: Closure, belief: Belief, cause: Cause, prior: FloatArray, factor: float
 ) -> _Stops:
     """Linearises at the most likely unknowns, which linearising finds."""
-    change = np.concatenate([np.zeros(len(belief.covariance)), start])
-    stops = _at(whole, belief, change, factor)
+    change = np.concatenate([np.zeros(len(belief.covariance)), cause.start])
+    stops = _at(data, belief, cause, change, factor)
     for _ in range(_ROUNDS):
         after = _posterior(stops, prior)[0]
         moved = np.abs(after - stops.change).max()
-        stops = _at(whole, belief, after, factor)
+        stops = _at(data, belief, cause, after, factor)
         if moved < _AT_REST:
             break
     return stops
 
 
-def _at(whole: Closure, belief: Belief, change: FloatArray, factor: float) -> _Stops:
-    more = np.zeros(len(change) - len(belief.covariance))
+def _at(data: Closure, belief: Belief, cause: Cause, change: FloatArray, factor: float) -> _Stops:
+    """Linearises at a change (K,) of the calibration's unknowns and of the cause's behind them."""
+    known = len(belief.covariance)
+    undone = _undone(data, cause, change[known:])
+    more = np.zeros(len(cause.units))
     still = replace(belief.edges, shared=np.concatenate([belief.edges.shared, more]))
+    edges = still.moved(np.concatenate([change[:known], more]))
     noise = Noise(factor * belief.noise.sigma_rad, factor * belief.noise.sigma_m)
-    residuals, jacobian, spreads = residual_blocks(whole, still.moved(change), noise)
+    residuals, jacobian, spreads = residual_blocks(undone, edges, noise)
     slopes = jacobian.reshape(-1, len(change))
     return _Stops(change, residuals.reshape(-1) - slopes @ change, slopes, block_diag(*spreads))
+
+
+def _undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
+    """The stops as they would be without a change of some size, and how they go on moving with it.
+
+    A change may be large: a board that was put elsewhere has turned by any angle.
+    """
+    by_camera, by_flange = (
+        _stepped(slopes, values) for slopes in (cause.by_camera, cause.by_flange)
+    )
+    carried = adjoint(invert(by_camera.moved))
+    known, shared = data.camera_covariance, data.shared
+    nothing = np.zeros(len(values))
+    information = np.zeros((len(values), len(values)))
+    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
+    flange = flange @ by_flange.moved
+    return replace(
+        data,
+        robot=flange if data.mount == "eye-in-hand" else invert(flange),
+        camera=data.camera @ by_camera.moved,
+        camera_covariance=None if known is None else carried @ known @ np.swapaxes(carried, 1, 2),
+        shared=None if shared is None else replace(shared, by_camera=carried @ shared.by_camera),
+    ).with_more(Shared(information, nothing, nothing, by_camera.slopes, by_flange.slopes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Motions (m, 4, 4) by some values, and how they go on with them: (m, 6, p), on the right."""
+
+    moved: FloatArray
+    slopes: FloatArray
+
+
+def _stepped(slopes: FloatArray, values: FloatArray) -> _Step:
+    twists = slopes @ values
+    # Beyond, the series does not converge; no cause that leads there explains anything.
+    near = np.linalg.norm(twists[:, :3], axis=1) < np.pi
+    onward = inverse_right_jacobian(np.where(near[:, None], twists, 0.0))
+    return _Step(exp(twists), np.asarray(np.linalg.solve(onward, slopes), dtype=float))
 
 
 def _score(stops: _Stops, prior: FloatArray, freedom: float) -> float:

@@ -7,14 +7,15 @@ import numpy as np
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.causes import TURN_PER_M, Cause
 from visioncal.robot import Robot
-from visioncal.transforms import adjoint, invert, log, mean_transform
+from visioncal.transforms import adjoint, invert, log
 from visioncal.types import FloatArray
 from visioncal.verification.footing import Footing
 from visioncal.verification.seeing import Seen
 
-CAMERA, BOARD, JOINT, LENGTH, NOISE, VIEW = (
+CAMERA, BOARD, BOTH, JOINT, LENGTH, NOISE, VIEW = (
     "camera",
     "board",
+    "camera_and_board",
     "joint",
     "arm_length",
     "robot_noise",
@@ -33,9 +34,12 @@ def causes_of(seen: Seen, footing: Footing, *, board_placed_anew: bool) -> tuple
         footing: What the calibration rests on.
         board_placed_anew: Whether the board's place is nothing to be checked.
     """
+    camera = _camera(seen)
+    boards = () if board_placed_anew else tuple(_boards(seen, footing))
     return (
-        _camera(seen),
-        *(() if board_placed_anew else _boards(seen, footing)),
+        camera,
+        *boards,
+        *(_both(camera, it) for it in boards if len(footing.boards) == 1),
         *_joints(seen, footing),
         _noise(seen),
         *_views(seen, footing),
@@ -55,9 +59,8 @@ def _camera(seen: Seen) -> Cause:
 
 def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each board's edge: a twist on its right."""
-    boards, data = footing.boards, seen.data
-    names = tuple(footing.targets) or ("",)
-    away = log(invert(footing.edges.z) @ data.under(footing.edges.shared).placed(footing.edges.x))
+    boards, names = footing.boards, tuple(footing.targets) or ("",)
+    away = log(invert(footing.edges.z) @ placed_by(seen, footing))
     shown = _shown(seen)
     for at, board in enumerate(boards):
         mine = shown == at
@@ -68,6 +71,17 @@ def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
         by_camera = -np.where(mine[:, None, None], carried, 0.0)
         start = adjoint(footing.from_first[at]) @ away[mine].mean(axis=0)
         yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_camera, start=start)
+
+
+def _both(camera: Cause, board: Cause) -> Cause:
+    """Camera and board at once: nothing is left of the old hand-eye calibration but the arm."""
+    return Cause(
+        BOTH,
+        np.concatenate([camera.by_camera, board.by_camera], axis=2),
+        np.concatenate([camera.by_flange, board.by_flange], axis=2),
+        np.concatenate([camera.units, board.units]),
+        np.concatenate([camera.start, np.zeros(len(board.units))]),
+    )
 
 
 def _shown(seen: Seen) -> FloatArray:
@@ -114,10 +128,9 @@ def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
     if len(seen.data) < 2:
         return
-    data = seen.data.under(footing.edges.shared)
-    away = log(invert(footing.edges.z) @ data.placed(footing.edges.x))
+    away = log(invert(footing.edges.z) @ placed_by(seen, footing))
     for at, views in enumerate(seen.stops):
-        by_camera = np.zeros((len(data), 6, 6))
+        by_camera = np.zeros((len(seen.data), 6, 6))
         by_camera[at] = -np.eye(6)
         yield _cause(f"{VIEW} {views[0]}", seen, _KNOCK, by_camera, start=away[at])
 
@@ -140,7 +153,6 @@ def _cause(
     )
 
 
-def roughly_placed(seen: Seen, footing: Footing) -> FloatArray:
-    """(4, 4) where the stops place the board on average, by the calibration's camera and arm."""
-    data = seen.data.under(footing.edges.shared)
-    return mean_transform(data.placed(footing.edges.x))
+def placed_by(seen: Seen, footing: Footing) -> FloatArray:
+    """(m, 4, 4) where each stop places the board, by the calibration's camera and arm."""
+    return seen.data.under(footing.edges.shared).placed(footing.edges.x)

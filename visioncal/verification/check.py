@@ -12,8 +12,9 @@ from visioncal.errors import DataError
 from visioncal.estimator.causes import Belief, Cause, Explained, explain
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.session import Session
+from visioncal.transforms import invert, log, mean_transform
 from visioncal.types import FloatArray, Progress
-from visioncal.verification.causes import CAMERA, NOISE, causes_of, kind_of, roughly_placed
+from visioncal.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of, placed_by
 from visioncal.verification.footing import Footing
 from visioncal.verification.seeing import Seen, see_again
 
@@ -54,6 +55,8 @@ class Check:
         calibration: The one that was checked.
         seen: The stops.
         footing: What the calibration rests on.
+        away: (m, 6) where each stop places its board (of several, the first), from where it was
+            (rotation [rad], translation [m]), in its frame.
         log_evidence: Logarithm of how many times as likely the stops are with a change as without.
         misfit: Squared distance of the stops from the prediction, in units of sigma.
         freedom: What that is on average where nothing has changed.
@@ -69,6 +72,7 @@ class Check:
     calibration: Calibration
     seen: Seen
     footing: Footing
+    away: FloatArray
     log_evidence: float
     misfit: float
     freedom: int
@@ -118,7 +122,7 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
                 "known which of them still stand where they were.",
                 next_step="Verify with views of the boards that stayed, or calibrate again.",
             )
-        footing = footing.placed_anew(roughly_placed(seen, footing), _ANYWHERE)
+        footing = footing.placed_anew(mean_transform(placed_by(seen, footing)), _ANYWHERE)
     belief = Belief(
         footing.edges,
         footing.covariance,
@@ -144,6 +148,7 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
         footing.calibration,
         seen,
         footing,
+        log(invert(footing.edges.z) @ placed_by(seen, footing)),
         log_evidence,
         nothing.misfit,
         nothing.freedom,
@@ -168,7 +173,7 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     turned base looks like a slip of the first joint, however unlikely a turn about just that axis.
     """
     best, *others = suspects
-    if best.name == NOISE:
+    if best.name in (NOISE, BOTH):
         return (best,)
     margin = 2.0 * np.log(_TOLD_APART)
 
@@ -178,8 +183,12 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     rivals = [
         it
         for it in others
-        if it.probability * _TOLD_APART > best.probability
-        or (it.name != NOISE and price(it) < price(best) + margin)
+        # Camera and board at once imitate either: that says nothing against it.
+        if it.name != BOTH
+        and (
+            it.probability * _TOLD_APART > best.probability
+            or (it.name != NOISE and price(it) < price(best) + margin)
+        )
     ]
     return (best, *rivals)
 

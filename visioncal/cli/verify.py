@@ -1,0 +1,107 @@
+"""`visioncal verify`."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.stdout import write_stdout
+from visioncal.errors import DataError
+from visioncal.files import named_errors, write_atomically
+from visioncal.session import Session
+from visioncal.stored import load_calibration
+from visioncal.verification import (
+    Check,
+    Outcome,
+    facts_of,
+    load_policy,
+    outcomes,
+    sentences,
+    to_document,
+    verify,
+)
+
+FILE = "verify.json"
+# A check said no.
+_EXIT_FAILED = 3
+# What comes of the triggers of the policy.
+_TRIGGERED = {
+    "fired": "[bold yellow]calibrate again[/] because of",
+    "quiet": "not because of",
+    "unknown": "not known",
+}
+
+
+def verify_command(
+    session: Annotated[
+        Path, typer.Argument(help="Five stops or more of the same cell: a folder or an .rrd.")
+    ],
+    against: Annotated[
+        Path | None,
+        typer.Option(help="The calibration: an output folder of calibrate, or its .rrd."),
+    ] = None,
+    board_moved: Annotated[
+        bool, typer.Option("--board-moved", help="The board was put elsewhere on purpose.")
+    ] = False,
+    collision: Annotated[
+        bool, typer.Option("--collision", help="A collision was reported since.")
+    ] = False,
+    policy: Annotated[
+        Path | None,
+        typer.Option(help="A table of one's own of when to calibrate again (.toml)."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help=f"A folder for {FILE}.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help=f"Print {FILE}.")] = False,
+) -> None:
+    """Tell whether a calibration still holds, and what has changed if it does not.
+
+    Exit status 0: it holds; 3: it does not; 2: that cannot be told, for the reason given.
+    """
+    if against is None:
+        raise DataError(
+            "verify: the calibration to check (--against) is needed.",
+            culprits=["--against"],
+            next_step="Name the output folder of visioncal calibrate.",
+        )
+    triggers = load_policy(policy)
+    calibration, loaded = load_calibration(against), Session.load(session)
+    with shown_progress(quiet=as_json) as progress:
+        check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)
+    facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)
+    fired = outcomes(triggers, facts)
+    document = json.dumps(to_document(check, fired), indent=2, allow_nan=False) + "\n"
+    if output is not None:
+        with named_errors(output):
+            output.mkdir(parents=True, exist_ok=True)
+        write_atomically(output / FILE, document)
+    if as_json:
+        write_stdout(document)
+    else:
+        _tell(check, fired)
+    if not check.passed:
+        raise typer.Exit(_EXIT_FAILED)
+
+
+def _tell(check: Check, triggers: Sequence[Outcome]) -> None:
+    console = messages()
+    word, colour = ("pass", "green") if check.passed else ("fail", "red")
+    name = escape(check.seen.known.session.name)
+    console.print(f"[bold {colour}]{word}[/]  {name} against {escape(_named(check))}")
+    for sentence in (*sentences(check), *check.seen.warnings):
+        console.print(f"  - {escape(sentence)}")
+    for view, reason in sorted(check.seen.known.reasons.items()):
+        console.print(f"  view {view} was not used: {escape(reason)}")
+    for state, begin in _TRIGGERED.items():
+        words = "; ".join(it.words for it in triggers if it.state == state)
+        if words:
+            console.print(f"{begin}: {escape(words)}")
+
+
+def _named(check: Check) -> str:
+    return f"{check.calibration.session_name}, {check.calibration.created}"
