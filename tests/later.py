@@ -6,15 +6,15 @@ from functools import lru_cache
 
 import numpy as np
 from cells import calibrated, known_of
-from picks import seen_corners
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 from visioncal.calibration import Calibration
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.result import result_of
-from visioncal.simulation import Cell, CellOptions, forward, simulate
+from visioncal.simulation import Cell, CellOptions, forward, project, simulate
+from visioncal.simulation.boards import corners_m
 from visioncal.transforms import exp
-from visioncal.types import FloatArray
+from visioncal.types import Corners, FloatArray
 
 # Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
 ANYHOW = replace(WRONG_LINKS, roll_rad=np.pi, branches=True)
@@ -78,12 +78,18 @@ def again(
     flange = forward(cell.true_arm, fresh.joints + change.joints_rad) @ jitter
     x, z = cell.transforms.values()
     moved = x @ exp(change.camera), z @ exp(change.board)
-    seen = [
-        seen_corners(cell, it, options.target, rng)
-        for it in target_in_camera(options.mount, *moved, flange)
-    ]
-    corners = tuple(replace(it, view=at) for at, it in enumerate(seen))
+    poses = target_in_camera(options.mount, *moved, flange)
+    corners = tuple(_detected(cell, at, pose, rng) for at, pose in enumerate(poses))
     return replace(fresh, true_base_from_flange=flange, corners=corners)
+
+
+def _detected(cell: Cell, view: int, pose: FloatArray, rng: np.random.Generator) -> Corners:
+    """The board as it was printed, as a detector reports it."""
+    camera = cell.options.camera
+    px = project(camera, corners_m(cell.sheet) @ pose[:3, :3].T + pose[:3, 3])
+    ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
+    noise = cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
+    return Corners(view, ids, px[ids] + noise, cell.options.blur_px)
 
 
 def known_again(cell: Cell, rng: np.random.Generator, change: Change | None = None) -> Known:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from visioncal.frames.sight import Sight
     from visioncal.pipeline import calibrate
     from visioncal.session import Session
+    from visioncal.verification import verify
 
 _HOMES = {
     "CalibratedArm": "visioncal.compensation",
@@ -55,6 +56,7 @@ _HOMES = {
     "locate_views": "visioncal.frames.picks",
     "place_seen": "visioncal.frames.seen",
     "seen_frame": "visioncal.frames.seen_frame",
+    "verify": "visioncal.verification",
 }
 
 __all__ = [
@@ -78,6 +80,7 @@ __all__ = [
     "locate_views",
     "place_seen",
     "seen_frame",
+    "verify",
 ]
 
 

@@ -23,7 +23,7 @@ SIZES_M = tuple(float(it) for it in 10.0 ** np.arange(-4.0, -0.9, 0.5))
 # A knock that shifts by a millimetre turns by 4 mrad.
 TURN_PER_M = 4.0
 # Steps of a cause settle after two or three; far beyond any arm's repeatability is far enough.
-_ROUNDS, _AT_REST = 12, 1e-9
+_ROUNDS, _AT_REST = 12, 1e-8
 # No chain closes better [rad and m]; exact data would otherwise measure rounding by zero.
 _LEAST_SIGMA = 1e-9
 
@@ -104,38 +104,37 @@ def explain(data: Closure, belief: Belief, cause: Cause | None = None) -> Explai
     """
     cause = cause or _nothing(len(data))
     units, (widest_m, factor) = cause.units, cause.trials[-1]
-    widest = _prior(belief, widest_m * units)
-    stops = _rested(data, belief, cause, widest, factor)
+    stops = _rested(data, belief, cause, widest_m * units, factor)
     scores = []
     for size_m, grown in cause.trials:
         if grown != factor:
-            stops = _at(data, belief, cause, stops.change, grown)
-        scores.append(_score(stops, _prior(belief, size_m * units), belief.freedom))
+            stops = _at(data, belief, cause, stops.values, grown)
+        scores.append(_score(stops, size_m * units, belief.freedom))
     grown = cause.trials[int(np.argmax(scores))][1]
-    stops = _at(data, belief, cause, stops.change, grown)
+    stops = _at(data, belief, cause, stops.values, grown)
     # The change's size is left to the stops: what is known of it beforehand would shrink it.
-    mean, spread = _posterior(stops, widest)
-    tail = slice(len(belief.covariance), None)
-    pulled = float(np.sum((mean[tail] / (widest_m * units)) ** 2))
+    mean, spread = _posterior(stops, widest_m * units)
+    pulled = float(np.sum((mean / (widest_m * units)) ** 2))
     return Explained(
         float(np.logaddexp.reduce(scores) - np.log(len(scores))),
-        mean[tail],
-        spread[tail, tail],
+        mean,
+        spread,
         grown,
-        _misfit(stops, widest)[0] - pulled,
+        _misfit(stops, widest_m * units)[0] - pulled,
         len(stops.residuals) - len(units),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Stops:
-    """The residuals (n,) of all stops as they are linear in all unknowns around some change (K,).
+    """The residuals (n,) of all stops as they are linear in a cause's unknowns around some values.
 
-    `residuals` are those without any change, by that linearisation; `slopes` (n, K), `spread`
-    (n, n) of the noise.
+    `residuals` are those at zero, by that linearisation; `slopes` (n, p), `spread` (n, n) of the
+    noise and of the calibration's unknowns together, which are so small that they stay where the
+    calibration has them.
     """
 
-    change: FloatArray
+    values: FloatArray
     residuals: FloatArray
     slopes: FloatArray
     spread: FloatArray
@@ -147,36 +146,33 @@ def _nothing(stops: int) -> Cause:
     return Cause("nothing", still, still, none, none, (1.0,))
 
 
-def _prior(belief: Belief, sigmas: FloatArray) -> FloatArray:
-    return np.asarray(block_diag(belief.covariance, np.diag(sigmas**2)))
-
-
 def _rested(
-    data: Closure, belief: Belief, cause: Cause, prior: FloatArray, factor: float
+    data: Closure, belief: Belief, cause: Cause, sigmas: FloatArray, factor: float
 ) -> _Stops:
-    """Linearises at the most likely unknowns, which linearising finds."""
-    change = np.concatenate([np.zeros(len(belief.covariance)), cause.start])
-    stops = _at(data, belief, cause, change, factor)
-    for _ in range(_ROUNDS):
-        after = _posterior(stops, prior)[0]
-        moved = np.abs(after - stops.change).max()
+    """Linearises at a cause's most likely values, which linearising finds."""
+    stops = _at(data, belief, cause, cause.start, factor)
+    for _ in range(_ROUNDS if len(sigmas) else 0):
+        after = _posterior(stops, sigmas)[0]
+        moved = np.abs(after - stops.values).max()
         stops = _at(data, belief, cause, after, factor)
         if moved < _AT_REST:
             break
     return stops
 
 
-def _at(data: Closure, belief: Belief, cause: Cause, change: FloatArray, factor: float) -> _Stops:
-    """Linearises at a change (K,) of the calibration's unknowns and of the cause's behind them."""
-    known = len(belief.covariance)
-    undone = _undone(data, cause, change[known:])
-    more = np.zeros(len(cause.units))
-    still = replace(belief.edges, shared=np.concatenate([belief.edges.shared, more]))
-    edges = still.moved(np.concatenate([change[:known], more]))
+def _at(data: Closure, belief: Belief, cause: Cause, values: FloatArray, factor: float) -> _Stops:
+    """Linearises at some values (p,) of a cause."""
+    undone, known = _undone(data, cause, values), len(belief.covariance)
+    shared = np.concatenate([belief.edges.shared, np.zeros(len(values))])
     noise = Noise(factor * belief.noise.sigma_rad, factor * belief.noise.sigma_m)
-    residuals, jacobian, spreads = residual_blocks(undone, edges, noise)
-    slopes = jacobian.reshape(-1, len(change))
-    return _Stops(change, residuals.reshape(-1) - slopes @ change, slopes, block_diag(*spreads))
+    residuals, jacobian, spreads = residual_blocks(
+        undone, replace(belief.edges, shared=shared), noise
+    )
+    slopes = jacobian.reshape(-1, known + len(values))
+    before, own = slopes[:, :known], slopes[:, known:]
+    spread = block_diag(*spreads) + before @ belief.covariance @ before.T
+    spread += _LEAST_SIGMA**2 * np.eye(len(spread))
+    return _Stops(values, residuals.reshape(-1) - own @ values, own, spread)
 
 
 def _undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
@@ -218,29 +214,31 @@ def _stepped(slopes: FloatArray, values: FloatArray) -> _Step:
     return _Step(exp(twists), np.asarray(np.linalg.solve(onward, slopes), dtype=float))
 
 
-def _score(stops: _Stops, prior: FloatArray, freedom: float) -> float:
+def _score(stops: _Stops, sigmas: FloatArray, freedom: float) -> float:
     """Logarithm of the marginal likelihood, up to what all causes have in common."""
-    squares, log_det = _misfit(stops, prior)
+    squares, log_det = _misfit(stops, sigmas)
     if np.isinf(freedom):
         return -0.5 * (log_det + squares)
     count = len(stops.residuals)
     return -0.5 * (log_det + (freedom + count) * float(np.log1p(squares / freedom)))
 
 
-def _total(stops: _Stops, prior: FloatArray) -> FloatArray:
-    least = _LEAST_SIGMA**2 * np.eye(len(stops.residuals))
-    return np.asarray(stops.spread + stops.slopes @ prior @ stops.slopes.T + least)
-
-
-def _misfit(stops: _Stops, prior: FloatArray) -> tuple[float, float]:
+def _misfit(stops: _Stops, sigmas: FloatArray) -> tuple[float, float]:
     """Squared length of the residuals in units of their covariance, and its log-determinant."""
-    root, lower = cho_factor(_total(stops, prior), lower=True)
+    root, lower = _root(stops, sigmas)
     squares = float(stops.residuals @ cho_solve((root, lower), stops.residuals))
     return squares, 2.0 * float(np.log(np.diag(root)).sum())
 
 
-def _posterior(stops: _Stops, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (K,) and covariance (K, K) of all unknowns, given the residuals."""
-    carried = stops.slopes @ prior
-    taken = cho_solve(cho_factor(_total(stops, prior)), carried)
-    return -taken.T @ stops.residuals, prior - carried.T @ taken
+def _posterior(stops: _Stops, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (p,) and covariance (p, p) of a cause's values, given the residuals."""
+    carried = stops.slopes * sigmas**2
+    taken = cho_solve(_root(stops, sigmas), carried)
+    return -taken.T @ stops.residuals, np.diag(sigmas**2) - carried.T @ taken
+
+
+def _root(stops: _Stops, sigmas: FloatArray) -> tuple[FloatArray, bool]:
+    """Cholesky's root of the residuals' covariance, for a cause of some size."""
+    total = stops.spread + (stops.slopes * sigmas**2) @ stops.slopes.T
+    root, lower = cho_factor(total, lower=True)
+    return np.asarray(root), bool(lower)

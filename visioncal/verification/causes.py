@@ -6,6 +6,7 @@ import numpy as np
 
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.causes import TURN_PER_M, Cause
+from visioncal.estimator.observability import FEWEST_VIEWS
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert, log
 from visioncal.types import FloatArray
@@ -39,7 +40,7 @@ def causes_of(seen: Seen, footing: Footing, *, board_placed_anew: bool) -> tuple
     return (
         camera,
         *boards,
-        *(_both(camera, it) for it in boards if len(footing.boards) == 1),
+        *(_both(camera, it) for it in boards if _tell_both(seen, footing)),
         *_joints(seen, footing),
         _noise(seen),
         *_views(seen, footing),
@@ -71,6 +72,11 @@ def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
         by_camera = -np.where(mine[:, None, None], carried, 0.0)
         start = adjoint(footing.from_first[at]) @ away[mine].mean(axis=0)
         yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_camera, start=start)
+
+
+def _tell_both(seen: Seen, footing: Footing) -> bool:
+    """Whether camera and board at once are worth a thought: they fit any two stops."""
+    return len(footing.boards) == 1 and len(seen.data) >= FEWEST_VIEWS
 
 
 def _both(camera: Cause, board: Cause) -> Cause:
@@ -105,9 +111,10 @@ def _joints(seen: Seen, footing: Footing) -> Iterator[Cause]:
 def _arm(seen: Seen, footing: Footing) -> ArmModel | None:
     """The arm that offsets are of; the nominal one where none was calibrated."""
     robot, matched = footing.calibration.calibrated_robot, seen.known.matched
-    if footing.model is not None or robot is None or matched is None:
+    if footing.model is not None or robot is None:
         return footing.model
-    return ArmModel(robot, matched.flange_from_reported, {}, np.zeros(0))
+    reported = np.eye(4) if matched is None else matched.flange_from_reported
+    return ArmModel(robot, reported, {}, np.zeros(0))
 
 
 def _stretch(robot: Robot, q: FloatArray) -> FloatArray:

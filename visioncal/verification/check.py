@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc
+from scipy.special import fdtrc
 
 from visioncal.calibration import Calibration
 from visioncal.chance import f_limit
@@ -140,9 +140,6 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     suspects = tuple(Suspect(causes[it].name, float(shares[it]), found[it]) for it in order)
     log_evidence = evidence - nothing.likelihood
     named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
-    best = suspects[0]
-    freedom = footing.freedom
-    limit = best.explained.freedom * f_limit(_UNEXPLAINED, best.explained.freedom, freedom)
     camera = next(it for it in suspects if it.name == CAMERA)
     return Check(
         footing.calibration,
@@ -152,10 +149,10 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
         log_evidence,
         nothing.misfit,
         nothing.freedom,
-        _chance(nothing, freedom),
+        float(fdtrc(nothing.freedom, footing.freedom, nothing.misfit / nothing.freedom)),
         suspects,
         named,
-        bool(best.name == NOISE or best.explained.misfit < limit),
+        _is_explained(suspects[0], footing.freedom),
         np.sqrt(np.diag(camera.explained.covariance)),
     )
 
@@ -193,8 +190,9 @@ def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     return (best, *rivals)
 
 
-def _chance(nothing: Explained, freedom: float) -> float:
-    squares, count = nothing.misfit, nothing.freedom
-    if np.isinf(freedom):
-        return float(chdtrc(count, squares))
-    return float(fdtrc(count, freedom, squares / count))
+def _is_explained(best: Suspect, freedom: float) -> bool:
+    """Whether a change leaves no more than noise; one that fits anything cannot be judged."""
+    left = best.explained.freedom
+    if best.name == NOISE or left < 1:
+        return True
+    return bool(best.explained.misfit < left * f_limit(_UNEXPLAINED, left, freedom))

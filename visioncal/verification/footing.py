@@ -18,6 +18,9 @@ from visioncal.targets import corner_positions, numbered_positions, target_from_
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray, Target
 
+# A scale that is known by more degrees of freedom is as good as known.
+_MOST_FREEDOM = 1e6
+
 ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
 
 
@@ -115,8 +118,8 @@ class Footing:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom that the noise was estimated with."""
-        return noise_freedom(self.calibration)
+        """Degrees of freedom that the noise was estimated with, at most as many as matter."""
+        return min(noise_freedom(self.calibration), _MOST_FREEDOM)
 
     def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "Footing":
         """The same with a board that lies somewhere else.

@@ -1,0 +1,272 @@
+"""Whether a calibration still holds: what a few fresh stops say of a change, and of none."""
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from cells import calibrated, known_of, session_of
+from commands import visioncal
+from later import ANYHOW, FITTED, Change, again, knock, known_again, lot, part
+
+from visioncal.calibration import Calibration
+from visioncal.errors import DataError
+from visioncal.pipeline.result import result_of
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation.boards import centre_m
+from visioncal.simulation.second import Second
+from visioncal.transforms import adjoint, compose, exp, invert, log
+from visioncal.verification import facts_of, load_policy, outcomes, sentences, to_document
+from visioncal.verification.check import check
+from visioncal.verification.footing import Footing
+from visioncal.verification.seeing import known_before, seen_by
+
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+
+
+def checked(place, rng, change=None, **options):
+    footing = Footing.of(place.calibration)
+    return check(seen_by(known_again(place.cell, rng, change), footing), footing, **options)
+
+
+def names(found):
+    return [it.name for it in found.named]
+
+
+def slip(joint, deg):
+    offsets = np.zeros(6)
+    offsets[joint - 1] = np.deg2rad(deg)
+    return Change(joints_rad=offsets)
+
+
+@pytest.fixture(params=MOUNTS)
+def place(request):
+    return lot(replace(ANYHOW, mount=request.param))
+
+
+def test_an_unchanged_cell_passes_as_often_as_it_should(place):
+    rng = np.random.default_rng(0)
+    found = [checked(place, rng) for _ in range(8)]
+    assert all(it.passed and not it.named for it in found)
+    # Chi-square of thirty directions; the mean of eight is known to 2.7, and the noise's scale to
+    # a tenth, which is three more.
+    assert np.mean([it.misfit for it in found]) == pytest.approx(30.0, abs=12.0)
+
+
+def test_a_bumped_camera_is_told_with_its_size_and_direction(place):
+    bump = np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0])
+    found = checked(place, np.random.default_rng(1), Change(camera=bump))
+    assert names(found) == ["camera"]
+    assert not found.passed
+    assert found.explained
+    values, spread = found.named[0].explained.values, found.named[0].explained.covariance
+    error = values - bump
+    # Chi-square of six exceeds 22.5 in one case of a thousand.
+    assert error @ np.linalg.solve(spread, error) < 22.5
+    told = to_document(found, ())["changes"][0]
+    assert told["moved_mm"] == pytest.approx(1.0, abs=4 * told["sigma_mm"])
+    assert "The camera moved by" in sentences(found)[0]
+
+
+def test_a_turned_camera_a_moved_board_and_a_slip_are_told_apart(place):
+    rng = np.random.default_rng(2)
+    assert names(checked(place, rng, Change(camera=knock(rng, 0.0, 0.2)))) == ["camera"]
+    assert names(checked(place, rng, Change(board=knock(rng, 1.0, 0.0)))) == ["board"]
+    found = checked(place, rng, slip(3, -0.05))
+    assert names(found) == ["joint 3"]
+    told = to_document(found, ())["changes"][0]
+    assert told["offset_deg"] == pytest.approx(-0.05, abs=4 * told["sigma_deg"])
+    assert "Joint 3 (elbow_joint) off by -0.0" in sentences(found)[0]
+
+
+def test_what_no_stops_can_tell_apart_is_named_together(place):
+    rng = np.random.default_rng(3)
+    stands, carried = "board", "camera"
+    if place.cell.options.mount == "eye-to-hand":
+        stands, carried = carried, stands
+    # A slip of the first joint turns all that stands in the base; of the last, what is carried.
+    first = checked(place, rng, slip(1, 0.05))
+    assert set(names(first)) == {"joint 1", stands}
+    assert "No stops can tell that from" in sentences(first)[1]
+    assert set(names(checked(place, rng, slip(6, 0.05)))) == {"joint 6", carried}
+
+
+def test_a_board_that_was_turned_by_much_is_told(place):
+    middle = compose(np.eye(3), centre_m(place.cell.sheet))
+    turn = exp(np.array([0.02, -0.05, 2.5, 0.0, 0.02, 0.0]))
+    moved = log(middle @ turn @ invert(middle))
+    found = checked(place, np.random.default_rng(4), Change(board=moved))
+    assert names(found) == ["board"]
+    assert found.explained
+    # Known to some hundredths of a millimetre and of a degree.
+    assert found.named[0].explained.values == pytest.approx(moved, abs=1e-3)
+
+
+def test_a_board_that_was_placed_anew_is_no_fault(place):
+    rng = np.random.default_rng(5)
+    anew = Change(board=np.array([0.0, 0.0, 0.3, 0.02, 0.01, 0.0]))
+    assert checked(place, rng, anew, board_placed_anew=True).passed
+    slipped = replace(anew, joints_rad=slip(3, 0.1).joints_rad)
+    assert names(checked(place, rng, slipped, board_placed_anew=True)) == ["joint 3"]
+
+
+def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
+    rng = np.random.default_rng(6)
+    both = Change(camera=knock(rng, 2.0, 0.3), board=knock(rng, 2.0, 0.3))
+    found = checked(place, rng, both)
+    assert names(found) == ["camera_and_board"]
+    assert set(to_document(found, ())["changes"][0]) >= {"camera", "board"}
+    assert names(checked(place, rng, Change(noise_factor=8.0))) == ["robot_noise"]
+    footing, cell = Footing.of(place.calibration), again(place.cell, rng)
+    # The third image was taken at another pose than is written beside it.
+    wrong = cell.joints.copy()
+    wrong[2] = wrong[2] + 0.02
+    found = check(seen_by(known_of(replace(cell, joints=wrong)), footing), footing)
+    assert names(found) == ["view 2"]
+    assert "View 2 alone contradicts" in sentences(found)[0]
+
+
+def test_two_slips_are_more_than_one_change_explains():
+    place = lot(ANYHOW)
+    change = Change(joints_rad=np.deg2rad([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]))
+    found = checked(place, np.random.default_rng(7), change)
+    assert not found.passed
+    assert not found.explained or names(found)[0] == "robot_noise"
+
+
+def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
+    options = CellOptions(dh_sigma_m=5e-4, dh_sigma_rad=1e-3, seed=3)
+    cell = simulate(replace(options, views=FITTED + 20))
+    calibration = result_of(calibrated(part(cell, range(FITTED)), joints=False))
+    footing = Footing.of(calibration)
+    assert footing.arm == "poses"
+    # What the fit has in common with errors that only count in it leaves a covariance one.
+    assert np.linalg.eigvalsh(footing.covariance)[0] > -1e-12
+    rng = np.random.default_rng(8)
+    for _ in range(4):
+        known = known_of(again(cell, rng), joints=False)
+        assert check(seen_by(known, footing), footing).passed
+
+
+def test_one_of_two_boards_that_moved_is_named():
+    options = replace(ANYHOW, second=Second(), views=40, seed=2)
+    cell = simulate(options)
+    calibration = result_of(calibrated(cell))
+    footing = Footing.of(calibration)
+    assert len(footing.boards) == 2
+    known = known_of(cell)
+    shown = cell.shown.boards
+    pushed = np.array([0.0, 0.0, 0.0, 3e-3, 0.0, 0.0])
+    assert check(seen_by(known, footing), footing).passed
+    assert shown.max() == 1
+    moved = seen_by(known, footing)
+    mine = np.array([shown[views[0]] for views in moved.stops]) == 1
+    carry = adjoint(invert(footing.from_first[footing.boards.index(1)])) @ pushed
+    camera = np.where(mine[:, None, None], moved.data.camera @ exp(carry), moved.data.camera)
+    found = check(replace(moved, data=replace(moved.data, camera=camera)), footing)
+    assert names(found)[0] == f"board {tuple(footing.targets)[1]}"
+
+
+def test_other_cells_are_refused_by_what_differs():
+    place = lot(ANYHOW)
+    footing = Footing.of(place.calibration)
+    session = session_of(place.cell)
+    other = replace(session.target, columns=11)
+    for wrong, words in (
+        (replace(session, document={**session.document, "mount": "eye-to-hand"}), "eye-to-hand"),
+        (replace(session, target=other), "columns = 11"),
+        (replace(session, robot_document=load_robot("ur10e").document), "another robot"),
+    ):
+        with pytest.raises(DataError, match=words):
+            known_before(wrong, footing)
+    known = known_again(place.cell, np.random.default_rng(9))
+    with pytest.raises(DataError, match="no joint angles"):
+        seen_by(replace(known, joints_rad=None), footing)
+    with pytest.raises(DataError, match="640 x 480"):
+        seen_by(replace(known, resolution=(640, 480)), footing)
+    older = dict(place.calibration.stages)
+    del older["joint_fit"]
+    with pytest.raises(DataError, match="an older version"):
+        Footing.of(replace(place.calibration, stages=older))
+    spoilt = {**place.calibration.stages, "joint_fit": {"boards": [""], "covariance": [[1.0]]}}
+    with pytest.raises(DataError, match="joint_fit cannot be read"):
+        Footing.of(replace(place.calibration, stages=spoilt))
+
+
+def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
+    place = lot(ANYHOW)
+    stages = {**place.calibration.stages, "conditions": {"ambient_c": 21.0}}
+    created = datetime(2026, 1, 1, tzinfo=UTC)
+    calibration = replace(place.calibration, stages=stages, created=created.isoformat())
+    session = session_of(part(place.cell, range(5)))
+    warm = tuple(replace(it, numbers={"ambient_c": 33.0}) for it in session.views)
+    facts = facts_of(
+        replace(session, views=warm),
+        calibration,
+        failed=False,
+        collision=True,
+        now=created + timedelta(days=200),
+    )
+    told = {it.trigger.quantity: it for it in outcomes(load_policy(), facts)}
+    assert {name: it.state for name, it in told.items()} == {
+        "failed_check": "quiet",
+        "collision": "fired",
+        "ambient_change_k": "fired",
+        "payload_change_kg": "unknown",
+        "age_days": "quiet",
+    }
+    assert "12 K (limit 10)" in told["ambient_change_k"].words
+    assert told["age_days"].value == 200.0
+    strict = tmp_path / "strict.toml"
+    strict.write_text('[[trigger]]\nquantity = "age_days"\nlimit = 30\n')
+    (only,) = outcomes(load_policy(strict), facts)
+    assert only.state == "fired"
+    strict.write_text('[[trigger]]\nquantity = "age"\nlimit = 30\n')
+    with pytest.raises(DataError, match="trigger 1: quantity is 'age'"):
+        load_policy(strict)
+    strict.write_text("limit = 30\n")
+    with pytest.raises(DataError, match="holds no"):
+        load_policy(strict)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """A calibrated session of pose pairs, and five later ones of the same cell."""
+    folder = tmp_path_factory.mktemp("pairs")
+    whole = write_session(simulate(CellOptions(views=25, seed=5)), folder / "all", images=False)
+    session = Session.load(whole)
+    cold = [replace(it, numbers={**it.numbers, "ambient_c": 20.0}) for it in session.views]
+    columns = (*session.columns, "ambient_c")
+    for name, views in (("fit", cold[:20]), ("later", cold[20:])):
+        replace(session, columns=columns, views=tuple(views)).save(folder / name)
+    assert visioncal("calibrate", folder / "fit", "-o", folder / "out").status == 0
+    return folder
+
+
+def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
+    out = pairs / "out"
+    assert Calibration.load(out).stages["conditions"] == {"ambient_c": 20.0}
+    done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
+    assert done.status == 0
+    assert done.err.startswith("pass")
+    assert "the ambient temperature's change, 0 K (limit 10)" in done.err
+    written = json.loads((tmp_path / "check/verify.json").read_text())
+    assert written["passed"]
+    assert not written["recalibrate"]
+    session = Session.load(pairs / "later")
+    # The camera's poses as if it had been knocked by 20 mm along its own x.
+    pushed = tuple(
+        replace(it, numbers={**it.numbers, "cft_x_m": it.numbers["cft_x_m"] - 0.02})
+        for it in session.views
+    )
+    replace(session, views=pushed).save(tmp_path / "knocked")
+    done = visioncal("verify", tmp_path / "knocked", "--against", out, "--json")
+    assert done.status == 3
+    document = json.loads(done.out)
+    assert document["changes"][0]["cause"] == "camera"
+    assert document["changes"][0]["moved_mm"] == pytest.approx(20.0, rel=0.1)
+    assert document["recalibrate"]
+    assert visioncal("verify", pairs / "later").status == 2
