@@ -23,7 +23,7 @@ SIZES_M = tuple(float(it) for it in 10.0 ** np.arange(-4.0, -0.9, 0.5))
 # A knock that shifts by a millimetre turns by 4 mrad.
 TURN_PER_M = 4.0
 # Steps of a cause settle after two or three; far beyond any arm's repeatability is far enough.
-_ROUNDS, _AT_REST = 12, 1e-8
+_ROUNDS, _AT_REST = 6, 1e-7
 # No chain closes better [rad and m]; exact data would otherwise measure rounding by zero.
 _LEAST_SIGMA = 1e-9
 
