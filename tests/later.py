@@ -14,7 +14,7 @@ from visioncal.pipeline.result import result_of
 from visioncal.simulation import Cell, CellOptions, forward, project, simulate
 from visioncal.simulation.boards import corners_m
 from visioncal.transforms import exp
-from visioncal.types import Corners, FloatArray
+from visioncal.types import Corners, FloatArray, Mount
 
 # Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
 ANYHOW = replace(WRONG_LINKS, roll_rad=np.pi, branches=True)
@@ -40,6 +40,11 @@ class Lot:
 
 
 @lru_cache
+def usual(mount: Mount = "eye-in-hand") -> Lot:
+    """The lot that tests share."""
+    return lot(replace(ANYHOW, mount=mount))
+
+
 def lot(options: CellOptions = ANYHOW, further: int = 60) -> Lot:
     """A calibrated cell, and as many further postures from which the board is in view."""
     cell = simulate(replace(options, views=FITTED + further))
