@@ -40,7 +40,7 @@ class Lot:
 
 
 @lru_cache
-def usual(mount: Mount = "eye-in-hand") -> Lot:
+def usual(mount: Mount) -> Lot:
     """The lot that tests share."""
     return lot(replace(ANYHOW, mount=mount))
 

@@ -130,7 +130,7 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
 
 
 def test_two_slips_are_more_than_one_change_explains():
-    place = usual()
+    place = usual("eye-in-hand")
     change = Change(joints_rad=np.deg2rad([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]))
     found = checked(place, np.random.default_rng(7), change)
     assert not found.passed
@@ -171,7 +171,7 @@ def test_one_of_two_boards_that_moved_is_named():
 
 
 def test_other_cells_are_refused_by_what_differs():
-    place = usual()
+    place = usual("eye-in-hand")
     footing = Footing.of(place.calibration)
     session = session_of(place.cell)
     other = replace(session.target, columns=11)
@@ -197,7 +197,7 @@ def test_other_cells_are_refused_by_what_differs():
 
 
 def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
-    place = usual()
+    place = usual("eye-in-hand")
     stages = {**place.calibration.stages, "conditions": {"ambient_c": 21.0}}
     created = datetime(2026, 1, 1, tzinfo=UTC)
     calibration = replace(place.calibration, stages=stages, created=created.isoformat())

@@ -116,7 +116,7 @@ def main(checks: int) -> None:
             "the board. Nothing as stated, with the camera on the flange: eccentric joints (0.15",
             "mrad), gears that ripple (0.03 mrad), a board bent by 0.3 mm and 0.02 % too large,",
             "intrinsics 0.1 px off.\n",
-            "| cell | change | named right | named right and alone | failed | CPU seconds a check |",
+            "| cell | change | named right | named right and alone | failed | CPU seconds each |",
             "| --- | --- | --- | --- | --- | --- |",
             *rows,
         )
