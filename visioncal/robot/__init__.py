@@ -19,6 +19,7 @@ from visioncal.robot.files import (
     robot_file,
     robot_names,
 )
+from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bent_joints
 from visioncal.robot.model import BODY_KEYS, Robot
 from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
@@ -41,13 +42,17 @@ __all__ = [
     "BODY_KEYS",
     "CONVENTIONS",
     "FUNCTION_NAMES",
+    "MASS_KEYS",
     "PARALLEL_RAD",
     "ROBOT_SUFFIXES",
     "Chain",
     "Convention",
     "DHTable",
+    "Loads",
+    "Masses",
     "Recognised",
     "Robot",
+    "bent_joints",
     "convert_table",
     "corrected_tip",
     "corrected_urdf",

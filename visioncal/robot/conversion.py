@@ -5,12 +5,16 @@ What a row has to say of two consecutive axes is how the next one lies in the fr
 commute with its joint and go into its row.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from visioncal.robot.chain import Chain, chain_document
-from visioncal.robot.model import Robot
+from visioncal.robot.loads import MASS_KEYS
+from visioncal.robot.model import BODY_KEYS, Robot
 from visioncal.robot.tables import (
     Convention,
     DHTable,
@@ -155,13 +159,15 @@ def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
     Returns:
         The robot, whose base is the other frame.
     """
+    gravity = {"gravity_m_s2": (parent_from_base[:3, :3] @ robot.gravity).tolist()}
     table = _described(robot)
     if table is not None:
-        return _of_table(robot, replace(table, base=parent_from_base @ table.base))
+        return _of_table(robot, replace(table, base=parent_from_base @ table.base), gravity)
     placements = robot.chain.placements.copy()
     placements[0] = parent_from_base @ placements[0]
     chain = replace(robot.chain, placements=placements)
-    return Robot.from_document(chain_document(robot.name, robot.tip, chain))
+    document = robot.weighted(chain_document(robot.name, robot.tip, chain))
+    return Robot.from_document(document | gravity)
 
 
 def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
@@ -183,9 +189,19 @@ def _described(robot: Robot) -> DHTable | None:
     return table_from_document(robot.document) if "convention" in robot.document else None
 
 
-def _of_table(robot: Robot, table: DHTable) -> Robot:
+def _of_table(
+    robot: Robot, table: DHTable, gravity: Mapping[str, Any] = MappingProxyType({})
+) -> Robot:
+    """The robot with the numbers of a table of its own form; its links' bodies stay what they are.
+
+    A mass is told where a joint's row ends, and stays there.
+    """
     source = str(robot.document.get("source", ""))
-    return Robot.from_document(table_document(table, source))
+    document = table_document(table, source)
+    for row, known in zip(document["joint"], robot.document["joint"], strict=True):
+        row |= {key: known[key] for key in (*BODY_KEYS, *MASS_KEYS) if key in known}
+    kept = {it: robot.document[it] for it in ("gravity_m_s2",) if it in robot.document}
+    return Robot.from_document(document | kept | dict(gravity))
 
 
 def parallel_axes(robot: Robot, parallel_rad: float = PARALLEL_RAD) -> Mask:

@@ -7,6 +7,7 @@ import numpy as np
 from visioncal.errors import DataError
 from visioncal.files import Table, did_you_mean
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
+from visioncal.robot.loads import Masses
 from visioncal.types import FloatArray
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 _USUAL_TIPS = ("tool0", "flange")
 
 
-def build_model(name: str, tip: str, chain: Chain) -> "pin.Model":
+def build_model(name: str, tip: str, chain: Chain, masses: Masses | None = None) -> "pin.Model":
     """Builds Pinocchio's model of a chain, whose positions are the joints' effective ones."""
     import pinocchio as pin
 
@@ -35,6 +36,10 @@ def build_model(name: str, tip: str, chain: Chain) -> "pin.Model":
             else getattr(pin, f"JointModel{kind}{letter}")()
         )
         last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
+        if masses is not None:
+            # How a mass resists being turned does not matter to an arm at rest.
+            body = pin.Inertia(masses.kg[place], masses.centres_m[place], np.zeros((3, 3)))
+            model.appendBodyToJoint(last, body, pin.SE3.Identity())
     tip_placement = pin.SE3(chain.placements[-1])
     model.addFrame(pin.Frame(tip, last, 0, tip_placement, pin.FrameType.OP_FRAME))
     return model
@@ -96,8 +101,27 @@ def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -
     return halves.reshape(-1, 6, 6 * count)
 
 
-def chain_of_urdf(table: Table) -> tuple[Chain, str]:
-    """Reads the chain from a URDF's root to the tip: (the chain, the tip's name).
+def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
+    """What the joints have to hold against the weight of their links.
+
+    Args:
+        model: Of `build_model`, with masses.
+        positions: (m, n) effective positions [rad or m].
+        gravity: (3,) in the base's frame [m/s^2].
+
+    Returns:
+        (m, n) [N m, or N for a prismatic joint].
+    """
+    import pinocchio as pin
+
+    model.gravity.linear = gravity
+    data = model.createData()
+    held = [pin.computeGeneralizedGravity(model, data, it).copy() for it in positions]
+    return np.array(held).reshape(positions.shape)
+
+
+def chain_of_urdf(table: Table) -> tuple[Chain, str, Masses | None]:
+    """Reads the chain from a URDF's root to the tip: the chain, the tip's name, and its masses.
 
     Raises:
         DataError: The URDF cannot be parsed or lacks the tip, or a joint before it has more than
@@ -131,7 +155,17 @@ def chain_of_urdf(table: Table) -> tuple[Chain, str]:
             next_step="Name the frame of the reported poses as tip in [robot].",
         )
     others = [joint for joint in range(1, model.njoints) if joint not in on_way]
-    return _chain_of_model(pin.buildReducedModel(model, others, pin.neutral(model)), tip), tip
+    arm = pin.buildReducedModel(model, others, pin.neutral(model))
+    return _chain_of_model(arm, tip), tip, _masses_of_model(arm)
+
+
+def _masses_of_model(model: "pin.Model") -> Masses | None:
+    """What hangs on each joint; None where the URDF tells no mass that moves."""
+    bodies = list(model.inertias)[1:]
+    kg = np.array([it.mass for it in bodies])
+    if not kg.any():
+        return None
+    return Masses(kg, np.array([it.lever if it.mass else np.zeros(3) for it in bodies]))
 
 
 def _chain_of_model(model: "pin.Model", tip: str) -> Chain:

@@ -12,15 +12,17 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.files import Table
-from visioncal.robot.chain import Chain, chain_document, chain_from_document
+from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
 from visioncal.robot.kinematics import (
     build_model,
     chain_of_urdf,
     flange_poses,
+    gravity_torques,
     joint_frames,
     placement_derivatives,
 )
-from visioncal.robot.tables import chain_of_table, table_from_document
+from visioncal.robot.loads import Loads, Masses, gravity_of, load_torques, masses_of_rows
+from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
 from visioncal.transforms import exp
 from visioncal.types import FloatArray
 
@@ -44,12 +46,16 @@ class Robot:
         tip: The frame of its end, called flange here.
         document: What recreates it: `Robot.from_document(document)`.
         chain: Its geometry.
+        masses: What its links weigh; None where that is not known.
+        gravity: (3,) in the base's frame [m/s^2].
     """
 
     name: str
     tip: str
     document: Mapping[str, Any]
     chain: Chain
+    masses: Masses | None
+    gravity: FloatArray
     _model: "pin.Model" = field(repr=False)
 
     @classmethod
@@ -58,7 +64,9 @@ class Robot:
 
         Args:
             document: A DH table (name, tip, convention, [[joint]], base, flange); or name, tip and
-                the URDF's text; or a chain as `corrected` writes it.
+                the URDF's text; or a chain as `corrected` writes it. A table's or a chain's joints
+                may tell their links' `mass_kg` and its centre `com_m`, in the frame in which the
+                joint's row ends, and any description the `gravity_m_s2` in its base.
 
         Raises:
             DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
@@ -69,13 +77,19 @@ class Robot:
         tip = table.text("tip", "flange")
         table.integer("schema", 1, 1)
         if "urdf" in document:
-            chain, tip = chain_of_urdf(table)
-        elif "kind" in document:
-            table.choice("kind", ("chain",))
-            chain = chain_from_document(table)
+            chain, tip, masses = chain_of_urdf(table)
         else:
-            chain = chain_of_table(table_from_document(document))
-        return cls(name, tip, dict(document), chain, build_model(name, tip, chain))
+            if "kind" in document:
+                table.choice("kind", ("chain",))
+                chain = chain_from_document(table)
+                frames = np.broadcast_to(np.eye(4), (len(chain), 4, 4))
+            else:
+                rows = table_from_document(document)
+                chain, frames = chain_of_table(rows), row_frames(rows)
+            masses = masses_of_rows([row for _, row in joint_tables(table)], frames)
+        model = build_model(name, tip, chain, masses)
+        gravity = gravity_of(document, table.label)
+        return cls(name, tip, dict(document), chain, masses, gravity, model)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -166,7 +180,7 @@ class Robot:
         Raises:
             DataError: The number of joints differs from the robot's.
         """
-        return self._axis_jacobian(q) * self.chain.slopes(np.asarray(q, dtype=float))[:, None, :]
+        return self.axis_jacobian(q) * self.chain.slopes(np.asarray(q, dtype=float))[:, None, :]
 
     def function_jacobian(self, q: FloatArray) -> FloatArray:
         """How the flange moves when the joints' functions change.
@@ -181,10 +195,46 @@ class Robot:
         Raises:
             DataError: The number of joints differs from the robot's.
         """
-        moved = self._axis_jacobian(q)
+        moved = self.axis_jacobian(q)
         basis = self.chain.function_basis(np.asarray(q, dtype=float))
         columns = moved[:, :, :, None] * basis[:, None]
         return columns.reshape(*moved.shape[:2], 4 * self.joint_count)
+
+    def axis_jacobian(self, q: FloatArray) -> FloatArray:
+        """How the flange moves with the joints' effective positions.
+
+        A joint's motion commutes with a turn of its placement about the same axis.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, 6, n) right perturbations (rotation, translation) of `base_from_flange`.
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        links = placement_derivatives(self._model, self.tip, self._effective(q))
+        columns = links.reshape(-1, 6, self.joint_count, 6)
+        return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
+
+    def gravity_torques(self, q: FloatArray) -> FloatArray:
+        """What the joints have to hold against the weight of their links.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, n) [N m]; zero where the masses are not known.
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        return gravity_torques(self._model, self._effective(q), self.gravity)
+
+    def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """What weight, payload and force turn the joints by; see `loads.load_torques`."""
+        return load_torques(self, q, loads)
 
     def corrected(
         self, placements: FloatArray | None = None, functions: FloatArray | None = None
@@ -220,16 +270,17 @@ class Robot:
         document = chain_document(self.name, self.tip, chain)
         for row, known in zip(document["joint"], self.document.get("joint", ()), strict=False):
             row |= {key: known[key] for key in BODY_KEYS if key in known}
-        return Robot.from_document(document)
+        return Robot.from_document(self.weighted(document))
 
-    def _axis_jacobian(self, q: FloatArray) -> FloatArray:
-        """How the flange (m, 6, n) moves with the joints' effective positions.
-
-        A joint's motion commutes with a turn of its placement about the same axis.
-        """
-        links = placement_derivatives(self._model, self.tip, self._effective(q))
-        columns = links.reshape(-1, 6, self.joint_count, 6)
-        return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
+    def weighted(self, document: Mapping[str, Any]) -> dict[str, Any]:
+        """Adds this arm's masses and gravity to the description of a chain with its joints."""
+        weighted = dict(document)
+        if self.masses is not None:
+            rows = zip(document["joint"], self.masses.rows(), strict=True)
+            weighted["joint"] = [row | own for row, own in rows]
+        if "gravity_m_s2" in self.document:
+            weighted["gravity_m_s2"] = self.document["gravity_m_s2"]
+        return weighted
 
     def _effective(self, q: FloatArray) -> FloatArray:
         """The effective positions (m, n) of (m, n) joint angles, whose shape is checked."""

@@ -130,6 +130,16 @@ def chain_of_table(table: DHTable) -> Chain:
     )
 
 
+def row_frames(table: DHTable) -> FloatArray:
+    """(n, 4, 4) the frames in which a table's rows end, in the joints' frames after their motion.
+
+    Makers tell the centres of their links' masses in them.
+    """
+    if table.convention == "modified":
+        return np.broadcast_to(np.eye(4), (len(table), 4, 4))
+    return np.asarray(table.along_z @ table.along_x[1:])
+
+
 def table_from_document(document: Mapping[str, Any]) -> DHTable:
     """Reads a table from a robot's description.
 

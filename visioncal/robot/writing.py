@@ -187,4 +187,4 @@ def _in_controllers_base(robot: Robot) -> Robot:
         return robot
     placements = np.array([_HALF_TURN @ chain.placements[0], *chain.placements[1:]])
     turned = replace(chain, placements=placements)
-    return Robot.from_document(chain_document(robot.name, robot.tip, turned))
+    return Robot.from_document(robot.weighted(chain_document(robot.name, robot.tip, turned)))

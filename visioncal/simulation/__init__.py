@@ -4,7 +4,7 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 projection or a wrong chain cannot hide by being wrong in both.
 """
 
-from visioncal.simulation.arms import Arm, forward, ur_arm
+from visioncal.simulation.arms import Arm, arm_named, forward, industrial_arm, ur_arm
 from visioncal.simulation.cell import Cell, simulate
 from visioncal.simulation.optics import fine_camera, fisheye_camera, project, rays, wide_camera
 from visioncal.simulation.options import (
@@ -25,6 +25,7 @@ from visioncal.simulation.records import (
     write_sweep,
 )
 from visioncal.simulation.render import Scene, prepare_scene, render, render_view
+from visioncal.simulation.sag import Payload
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
 
 __all__ = [
@@ -32,17 +33,20 @@ __all__ = [
     "Cell",
     "CellOptions",
     "Motion",
+    "Payload",
     "Scene",
     "Second",
     "Sweep",
     "SweepOptions",
     "Truth",
+    "arm_named",
     "charuco_target",
     "checkerboard_target",
     "exact",
     "fine_camera",
     "fisheye_camera",
     "forward",
+    "industrial_arm",
     "measured_poses",
     "prepare_scene",
     "project",

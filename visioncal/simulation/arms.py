@@ -117,6 +117,32 @@ def ur_arm(name: str) -> Arm:
     )
 
 
+def industrial_arm() -> Arm:
+    """Nominal arm of 1.8 m reach in the proportions of a medium industrial one.
+
+    No maker's: round numbers, a shoulder that is off the first axis, and a spherical wrist.
+    """
+    quarter = 0.5 * np.pi
+    return Arm(
+        name="generic-6r-1800",
+        a=np.array([0.18, 0.8, 0.18, 0.0, 0.0, 0.0]),
+        d=np.array([0.5, 0.0, 0.0, 0.8, 0.0, 0.13]),
+        alpha=np.array([-quarter, 0.0, -quarter, quarter, -quarter, 0.0]),
+        beta=np.zeros(6),
+        offset=np.array([0.0, -quarter, 0.0, 0.0, 0.0, np.pi]),
+        waves=np.zeros((4, 6)),
+    )
+
+
+def arm_named(name: str) -> Arm:
+    """The nominal arm of a name: Universal Robots', or `generic-6r-1800`.
+
+    Raises:
+        DataError: There is none of that name.
+    """
+    return industrial_arm() if name == "generic-6r-1800" else ur_arm(name)
+
+
 def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
     """Draws a real arm around a nominal one.
 

@@ -11,17 +11,18 @@ from visioncal.errors import DataError
 from visioncal.simulation.arms import (
     Arm,
     ArmErrors,
+    arm_named,
     disturb,
     forward,
     inverse,
     link_frames,
     reach_m,
-    ur_arm,
 )
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import mistaken, project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
+from visioncal.simulation.sag import Payload, giving_of, sagging
 from visioncal.simulation.second import Shown, chains, sheets_of, shown_at, with_second
 from visioncal.transforms import compose, exp, invert
 from visioncal.types import Camera, Corners, FloatArray
@@ -74,6 +75,9 @@ class Cell:
         wrong_views: Views whose report is wrong, ascending.
         sheets: All boards as they were printed.
         shown: Which stop and which board each view is of: a stop that shows two has two views.
+        payloads: What the arm carried, view by view; empty where nothing.
+        approach: (m,) the side from which each stop was approached, +1 or -1; None where that is
+            not told.
     """
 
     options: CellOptions
@@ -91,6 +95,19 @@ class Cell:
     wrong_views: tuple[int, ...]
     sheets: tuple[Sheet, ...]
     shown: Shown
+    payloads: tuple[Payload, ...] = ()
+    approach: FloatArray | None = None
+
+    def flange_at(self, q: FloatArray, payloads: Sequence[Payload] = ()) -> FloatArray:
+        """Where the real arm's flange stands (k, 4, 4) at (k, n) joint angles [rad].
+
+        With k loads, or none but its own weight; from the middle of its play.
+        """
+        options = self.options
+        giving = giving_of(
+            self.true_arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad
+        )
+        return forward(self.true_arm, sagging(self.true_arm, giving, q, payloads))
 
 
 def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
@@ -108,7 +125,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         DataError: The arm is unknown, the camera's coefficients do not fit its model, or the
             arm cannot reach enough poses from which the board is in the image.
     """
-    arm = ur_arm(options.robot)
+    arm = arm_named(options.robot)
     if postures is not None:
         options = replace(options, views=len(postures))
     errors = ArmErrors(
@@ -129,7 +146,13 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         moved = np.array(postures, dtype=float)
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
-    true_base_from_flange = forward(true_arm, moved) @ exp(jitter)
+    payloads = _payloads(options)
+    approach = _approach(options)
+    giving = giving_of(
+        true_arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad
+    )
+    standing = sagging(true_arm, giving, moved, payloads, approach)
+    true_base_from_flange = forward(true_arm, standing) @ exp(jitter)
     joints, wrong_stops = _misreport(options, arm, moved)
     poses = [before_camera(chain, true_base_from_flange) for chain in chains(transforms)]
     shown = shown_at(options, sheets, poses)
@@ -153,7 +176,21 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         wrong_views=tuple(np.flatnonzero(np.isin(shown.stops, wrong_stops)).tolist()),
         sheets=sheets,
         shown=shown,
+        payloads=tuple(payloads[at] for at in shown.stops if payloads),
+        approach=approach[shown.stops] if options.backlash_rad else None,
     )
+
+
+def _payloads(options: CellOptions) -> list[Payload]:
+    """What the arm carries stop by stop; empty for nothing."""
+    carried = options.payloads
+    return [carried[at % len(carried)] for at in range(options.views)] if carried else []
+
+
+def _approach(options: CellOptions) -> FloatArray:
+    """(m,) the sides from which stops are approached: from either in turn where there is play."""
+    sides = np.where(np.arange(options.views) % 2, -1.0, 1.0)
+    return sides if options.backlash_rad else np.zeros(options.views)
 
 
 def stream(options: CellOptions, purpose: Stream, *index: int) -> np.random.Generator:

@@ -5,6 +5,7 @@ from typing import Literal, TypeAlias
 
 from visioncal.errors import DataError
 from visioncal.simulation.optics import wide_camera
+from visioncal.simulation.sag import Payload
 from visioncal.types import Camera, Mount, Target
 
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
@@ -61,7 +62,7 @@ class CellOptions:
     """A simulated cell. The defaults are a well-kept one; `exact` has no error at all.
 
     Attributes:
-        robot: `ur3e`, `ur5e` or `ur10e`.
+        robot: `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
         mount: Where the camera is.
         views: Number of views.
         target: The board as its file states it.
@@ -90,6 +91,11 @@ class CellOptions:
         eccentricity_sigma_rad: How far each joint turns with the sine and the cosine of its angle
             beyond what its encoder says [rad].
         ripple_sigma_rad: The same for the ripple of its gear, many times a turn [rad].
+        compliance_rad_per_nm: What each joint yields to a torque; empty for a rigid arm.
+        payloads: What the arm carries, view by view in turn; empty for nothing.
+        mass_share: Real over published masses of the links.
+        backlash_rad: Play of each joint; empty for none. With play, stops are approached from
+            either side in turn.
         lens_mismatch_px: How far the stated intrinsics put pixels elsewhere, as a root mean square
             over the image [px].
         wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
@@ -126,6 +132,10 @@ class CellOptions:
     offset_sigma_rad: float = 0.0
     eccentricity_sigma_rad: float = 0.0
     ripple_sigma_rad: float = 0.0
+    compliance_rad_per_nm: tuple[float, ...] = ()
+    payloads: tuple[Payload, ...] = ()
+    mass_share: float = 1.0
+    backlash_rad: tuple[float, ...] = ()
     lens_mismatch_px: float = 0.0
     wrong_views: int = 0
     board_scale: float = 1.0
@@ -165,6 +175,8 @@ def exact(options: CellOptions | None = None) -> CellOptions:
         offset_sigma_rad=0.0,
         eccentricity_sigma_rad=0.0,
         ripple_sigma_rad=0.0,
+        compliance_rad_per_nm=(),
+        backlash_rad=(),
         lens_mismatch_px=0.0,
         wrong_views=0,
         board_scale=1.0,

@@ -17,6 +17,7 @@ from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import charuco_target, checkerboard_target
 from visioncal.simulation.render import encode, prepare_scene, render
+from visioncal.simulation.sag import Payload
 from visioncal.simulation.second import BOARDS
 from visioncal.simulation.sweep import Sweep
 from visioncal.transforms import exp
@@ -205,8 +206,12 @@ def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | No
             progress((view + 1.0) / (len(cell.corners) + 1.0))
     document = {**_document(cell, name), **_targets(cell), "camera": _camera_table(cell)}
     numbers = list(_report_rows(cell))
-    views = [View(at, image=path, numbers=numbers[at]) for at, path in enumerate(files)]
-    return _session(cell, document, ("view", "image", *numbers[0]), views, MemoryImages(files))
+    views = [
+        View(at, image=path, numbers=numbers[at], text=_approach_text(cell, at))
+        for at, path in enumerate(files)
+    ]
+    columns = ("view", "image", *numbers[0], *_approach_text(cell, 0))
+    return _session(cell, document, columns, views, MemoryImages(files))
 
 
 def _pairs(cell: Cell, name: str) -> Session:
@@ -214,8 +219,11 @@ def _pairs(cell: Cell, name: str) -> Session:
         {**row, **{f"cft_{key}": value for key, value in _pose_row(pose).items()}}
         for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
     ]
-    views = [View(view, numbers=row) for view, row in enumerate(numbers)]
-    columns, document = ("view", *numbers[0]), _document(cell, name)
+    views = [
+        View(view, numbers=row, text=_approach_text(cell, view)) for view, row in enumerate(numbers)
+    ]
+    columns = ("view", *numbers[0], *_approach_text(cell, 0))
+    document = _document(cell, name)
     if len(cell.sheets) > 1:
         return _session(cell, document | _targets(cell), columns, views, MemoryImages({}))
     return Session(document, columns, tuple(views), None, None, MemoryImages({}))
@@ -238,7 +246,8 @@ def _session(
         document,
         ("view", "stop", "target", *columns[1:]),
         tuple(
-            replace(view, stop=stop, text={"target": BOARDS[board]}) for view, stop, board in shown
+            replace(view, stop=stop, text={**view.text, "target": BOARDS[board]})
+            for view, stop, board in shown
         ),
         target,
         {name: _target_document(it) for name, it in targets.items()},
@@ -304,7 +313,20 @@ def _report_rows(cell: Cell) -> Iterator[dict[str, float]]:
     """The numeric columns of each view: when, with which joints, at which reported pose."""
     for view in range(len(cell.corners)):
         joints = {f"q{i + 1}_rad": float(q) for i, q in enumerate(cell.joints[view])}
-        yield {"stamp_s": _PACE_S * view} | _pose_row(cell.base_from_flange[view]) | joints
+        load = _load_row(cell.payloads[view]) if cell.payloads else {}
+        yield {"stamp_s": _PACE_S * view} | _pose_row(cell.base_from_flange[view]) | joints | load
+
+
+def _load_row(load: Payload) -> dict[str, float]:
+    """The columns of what the flange carries and is pushed by."""
+    centre = {f"payload_{it}_m": at for it, at in zip("xyz", load.centre_m, strict=True)}
+    force = {f"force_{it}_n": at for it, at in zip("xyz", load.force_n, strict=True)}
+    return {"payload_kg": load.kg} | centre | force
+
+
+def _approach_text(cell: Cell, view: int) -> dict[str, str]:
+    """The column of the side from which a stop was approached, where that is told."""
+    return {} if cell.approach is None else {"approach": "+" if cell.approach[view] > 0 else "-"}
 
 
 def _pose_row(pose: FloatArray) -> dict[str, float]:

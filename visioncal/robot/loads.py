@@ -1,0 +1,184 @@
+"""What pulls at an arm: the weight of its links, its payload and an external force.
+
+A torque is what a load does to a joint, positive in the joint's sense: the motor holds against it,
+and a gear yields to it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.files import Table
+from visioncal.robot.chain import number_list
+from visioncal.types import FloatArray, IntArray, Mask
+
+if TYPE_CHECKING:
+    from visioncal.robot.model import Robot
+
+# What a joint's table says of its link's weight.
+MASS_KEYS = ("mass_kg", "com_m")
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+# An arm that yields by an angle changes its torques by about as large a share: two more looks at
+# the bent arm leave less than the cube of it.
+_LOOKS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Masses:
+    """What the links of an arm weigh.
+
+    Attributes:
+        kg: (n,) mass of what moves with each joint [kg].
+        centres_m: (n, 3) its centre, in the joint's frame after its motion [m].
+    """
+
+    kg: FloatArray
+    centres_m: FloatArray
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The joints' entries in a description whose rows are the joints' frames."""
+        columns = zip(self.kg.tolist(), self.centres_m.tolist(), strict=True)
+        return [dict(zip(MASS_KEYS, it, strict=True)) for it in columns]
+
+
+@dataclass(frozen=True, eq=False)
+class Loads:
+    """What an arm carries and is pushed by at m stops.
+
+    Attributes:
+        payload_kg: (m,) mass that the flange carries [kg].
+        payload_m: (m, 3) its centre, in the flange's frame [m].
+        force_n: (m, 3) external force on the flange's origin, in the base's frame [N].
+    """
+
+    payload_kg: FloatArray
+    payload_m: FloatArray
+    force_n: FloatArray
+
+    @classmethod
+    def none(cls, count: int) -> Self:
+        """No load but the arm's own weight."""
+        return cls(np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)))
+
+    @property
+    def any(self) -> bool:
+        """Whether a stop has a load beside the arm's own weight."""
+        return bool(self.payload_kg.any() or self.force_n.any())
+
+    def chosen(self, rows: IntArray | Mask) -> "Loads":
+        """The loads of some of the stops, by their places or a mask."""
+        return Loads(self.payload_kg[rows], self.payload_m[rows], self.force_n[rows])
+
+
+def masses_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Masses | None:
+    """Reads `mass_kg` and `com_m` of a table of joints.
+
+    Args:
+        rows: The joints' tables.
+        joint_from_row: (n, 4, 4) the frames in which the centres are told, in the joints' frames
+            after their motion.
+
+    Returns:
+        The masses; None where no joint tells one.
+
+    Raises:
+        DataError: Some joints tell their mass and others do not, or one is not a mass.
+    """
+    told = [row for row in rows if any(key in row.content for key in MASS_KEYS)]
+    if not told:
+        return None
+    kg, centres = [], []
+    for row, frame in zip(rows, joint_from_row, strict=True):
+        mass = row.number("mass_kg")
+        if mass < 0.0:
+            raise row.refuse("mass_kg", mass, "a mass of 0 kg or more")
+        kg.append(mass)
+        centres.append(frame[:3, :3] @ number_list(row, "com_m", 3) + frame[:3, 3])
+    return Masses(np.array(kg), np.array(centres))
+
+
+def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
+    """(3,) acceleration of gravity in the base's frame; along -z where nothing is said [m/s^2].
+
+    Raises:
+        DataError: It is no vector of three numbers, or is not that of the Earth.
+    """
+    if "gravity_m_s2" not in document:
+        return np.array(STANDARD_GRAVITY)
+    row = Table(document, label)
+    gravity = number_list(row, "gravity_m_s2", 3)
+    if not 9.5 < float(np.linalg.norm(gravity)) < 10.1:
+        raise row.refuse(
+            "gravity_m_s2",
+            gravity.tolist(),
+            "a vector of 9.81 m/s^2 in the robot's base, as [0, 0, -9.81] where it stands upright,",
+        )
+    return gravity
+
+
+def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> FloatArray:
+    """Torques by which weight, payload and force turn the joints.
+
+    That of the links' weight is the negative of Pinocchio's generalised gravity (Featherstone 2008,
+    section 5.3); those at the flange follow by the transpose of the geometric Jacobian.
+
+    Args:
+        robot: The arm; one whose masses are unknown is taken for weightless.
+        q: (m, n) joint angles [rad].
+        loads: What it carries; nothing where None.
+
+    Returns:
+        (m, n) [N m, or N for a prismatic joint].
+    """
+    torques = np.zeros((len(q), robot.joint_count))
+    if robot.masses is not None:
+        torques -= robot.gravity_torques(q)
+    if loads is None or not loads.any:
+        return torques
+    base_from_flange = robot.base_from_flange(q)
+    flange_from_base = np.swapaxes(base_from_flange[:, :3, :3], 1, 2)
+    weight = np.einsum("mij,mj->mi", flange_from_base, loads.payload_kg[:, None] * robot.gravity)
+    push = np.einsum("mij,mj->mi", flange_from_base, loads.force_n)
+    wrench = np.concatenate([np.cross(loads.payload_m, weight), weight + push], axis=1)
+    return np.asarray(torques + np.einsum("mij,mi->mj", robot.axis_jacobian(q), wrench))
+
+
+def bent_joints(
+    robot: "Robot", q: FloatArray, compliance: FloatArray, loads: Loads | None = None
+) -> FloatArray:
+    """Where the joints stand under their loads.
+
+    Args:
+        robot: The arm as it is without a load.
+        q: (m, n) joint angles as the encoders have them [rad].
+        compliance: (n,) what each joint yields to a torque [rad/(N m)].
+        loads: What it carries; nothing where None.
+
+    Returns:
+        (m, n) joint angles of the rigid arm that stands likewise [rad].
+    """
+    bent = np.asarray(q, dtype=float)
+    if not compliance.any():
+        return bent
+    for _ in range(_LOOKS):
+        bent = q + compliance * load_torques(robot, bent, loads)
+    return bent
+
+
+def check_loads(loads: Loads) -> None:
+    """Checks what was said of loads by hand.
+
+    Raises:
+        DataError: A mass is negative or a number is not finite.
+    """
+    numbers = np.concatenate([loads.payload_kg[:, None], loads.payload_m, loads.force_n], axis=1)
+    if not np.isfinite(numbers).all():
+        raise DataError("loads: payload and force must be finite numbers.")
+    if (loads.payload_kg < 0.0).any():
+        raise DataError(
+            f"loads: a payload of {loads.payload_kg.min():g} kg; 0 kg or more is needed.",
+            culprits=["payload_kg"],
+        )
