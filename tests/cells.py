@@ -11,6 +11,7 @@ from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell
+from visioncal.simulation.records import _load_row
 from visioncal.simulation.second import BOARDS
 from visioncal.transforms import invert, log
 
@@ -23,7 +24,10 @@ def session_of(cell: Cell) -> Session:
     if options.state_intrinsics:
         table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
     document = {"schema": 1, "name": "cell", "mount": options.mount, "camera": table}
-    views = [View(at, image=f"{at}.png") for at in range(len(cell.corners))]
+    views = [
+        View(at, image=f"{at}.png", numbers=_load_row(cell.payloads[at]) if cell.payloads else {})
+        for at in range(len(cell.corners))
+    ]
     if len(cell.sheets) == 1:
         columns = ("view", "image")
         return Session(document, columns, tuple(views), options.target, None, MemoryImages({}))

@@ -7,13 +7,16 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.estimator.arm import TWIST_UNITS, ArmErrors
-from visioncal.robot import Robot
+from visioncal.robot import Loads, Robot, bent_joints
 from visioncal.transforms import adjoint, invert, log, mean_transform
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mask
 
 # Columns of a joint's function (see `Robot.function_jacobian`) that a block changes.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
-BLOCKS = ("links", *_FUNCTIONS)
+# What bends under the loads of a stop, and what is the same at all stops.
+COMPLIANCE = "compliance"
+RIGID_BLOCKS = ("links", *_FUNCTIONS)
+BLOCKS = (*RIGID_BLOCKS, COMPLIANCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,14 +28,18 @@ class ArmModel:
         flange_from_reported: (4, 4) the frame of the reported poses in the model's flange.
         weights: The blocks by name with the size of their errors, as a share of the first's:
             `offsets` of the joints, `links` (each by six, behind its joint), `ratios` of the gears,
-            `eccentricity` (sine and cosine of each joint).
+            `eccentricity` (sine and cosine of each joint), `compliance` of the joints.
         values: (p,) present values [rad], block after block; all are of the first block's size.
+        torque_nm: The torque under which a joint whose compliance is 1 rad bends by that [N m].
+        yielding: (n,) which joints bend; None for all.
     """
 
     nominal: Robot
     flange_from_reported: FloatArray
     weights: Mapping[str, float]
     values: FloatArray
+    torque_nm: float = 1.0
+    yielding: Mask | None = None
 
     @classmethod
     def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
@@ -46,12 +53,24 @@ class ArmModel:
         tool = mean_transform(invert(nominal.base_from_flange(q)) @ reported)
         return cls(nominal, tool, {}, np.zeros(0))
 
+    def loaded(self, q: FloatArray, loads: Loads) -> "ArmModel":
+        """Returns the arm with compliances in units of the greatest torque of some stops.
+
+        Args:
+            q: (m, n) joint angles [rad].
+            loads: What the flange carried.
+        """
+        most = float(np.abs(self.robot.load_torques(q, loads)).max(initial=0.0))
+        return replace(self, torque_nm=most or 1.0)
+
     def erring(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
         """Returns the arm with the errors of some blocks to be estimated."""
         sizes = sum(it.basis.shape[2] for it in errors.values())
         first = next(iter(errors.values())).sigma
         weights = {name: it.sigma / first for name, it in errors.items()}
-        return replace(self, weights=weights, values=np.zeros(sizes))
+        bends = errors.get(COMPLIANCE)
+        yielding = None if bends is None else bends.basis.any(axis=(0, 1))
+        return replace(self, weights=weights, values=np.zeros(sizes), yielding=yielding)
 
     def moved(self, step: FloatArray) -> "ArmModel":
         """Returns the arm after a (p,) step of its values."""
@@ -69,6 +88,31 @@ class ArmModel:
         """The arm with its errors, up to its own flange."""
         return self.nominal.corrected(*self.changes(self.values))
 
+    @cached_property
+    def compliance(self) -> FloatArray:
+        """(n,) what each joint yields to a torque [rad/(N m)]."""
+        count, at = self.nominal.joint_count, 0
+        for name, weight in self.weights.items():
+            size = block_size(name, count)
+            if name == COMPLIANCE:
+                bends = weight * self.values[at : at + size] / self.torque_nm
+                return bends if self.yielding is None else np.where(self.yielding, bends, 0.0)
+            at += size
+        return np.zeros(count)
+
+    def bent(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """Where the joints stand under their loads, as angles (m, n) of the rigid arm [rad].
+
+        Args:
+            q: (m, n) joint angles [rad].
+            loads: What the flange carries; only the arm's own weight bends it where None.
+        """
+        return bent_joints(self.robot, q, self.compliance, loads)
+
+    def base_from_flange(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """Where the reported frame stands (m, 4, 4); see `bent`."""
+        return self.robot.base_from_flange(self.bent(q, loads))
+
     def changes(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What (p,) values change: twists (n + 1, 6) of the placements, and functions (n, 4)."""
         count, at = self.nominal.joint_count, 0
@@ -79,37 +123,46 @@ class ArmModel:
             at += size
             if name == "links":
                 placements[1:] += block.reshape(-1, 6) * TWIST_UNITS
-            else:
+            elif name in _FUNCTIONS:
                 functions[:, _FUNCTIONS[name]] += block.reshape(-1, count).T
         return placements, functions
 
-    def columns(self, name: str, q: FloatArray) -> FloatArray:
+    def columns(self, name: str, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """How the reported frame moves with a block's errors.
 
         Args:
             name: The block.
             q: (m, n) joint angles [rad].
+            loads: What the flange carries; nothing where None.
 
         Returns:
             (m, 6, p) right perturbations for a unit of each column.
         """
+        bent = self.bent(q, loads)
+        if name == COMPLIANCE:
+            torques = self.robot.load_torques(bent, loads) / self.torque_nm
+            if self.yielding is not None:
+                torques = torques * self.yielding
+            return np.asarray(self.robot.axis_jacobian(bent) * torques[:, None])
         if name == "links":
-            moved = self.robot.placement_jacobian(q)[:, :, 6:]
+            moved = self.robot.placement_jacobian(bent)[:, :, 6:]
             units = np.tile(TWIST_UNITS, self.nominal.joint_count)
             # The last link's own twist acts on the flange, before what is mounted on it.
             moved[:, :, -6:] = adjoint(invert(self.flange_from_reported))
             return np.asarray(moved * units)
         count = self.nominal.joint_count
-        functions = self.robot.function_jacobian(q).reshape(len(q), 6, count, 4)
+        functions = self.robot.function_jacobian(bent).reshape(len(q), 6, count, 4)
         return np.concatenate([functions[..., it] for it in _FUNCTIONS[name]], axis=2)
 
-    def basis(self, q: FloatArray) -> FloatArray:
-        """How the reported frame (m, 6, p) moves with all values."""
+    def basis(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """How the reported frame (m, 6, p) moves with all values, under the loads of each stop."""
         return np.concatenate(
-            [weight * self.columns(name, q) for name, weight in self.weights.items()], axis=2
+            [weight * self.columns(name, q, loads) for name, weight in self.weights.items()], axis=2
         )
 
 
 def block_size(name: str, joints: int) -> int:
     """How many values a block has, for an arm of so many joints."""
+    if name == COMPLIANCE:
+        return joints
     return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

@@ -6,13 +6,14 @@ estimates: what the data cannot tell stays where it was stated, and what they ca
 bound (Harville 1977, section 4, for the linear mixed model).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
+from visioncal.estimator.armmodel import COMPLIANCE
 from visioncal.estimator.closure import (
     Closure,
     ClosureFit,
@@ -23,14 +24,29 @@ from visioncal.estimator.closure import (
 )
 from visioncal.types import FloatArray
 
-# What is free at each level: blocks by name.
-LEVELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+
+@dataclass(frozen=True)
+class Blocks:
+    """What is free at a level.
+
+    Attributes:
+        names: Blocks of the arm's errors, in the order in which they are looked for.
+        own: Those that make the level what it is: without one of them it is another.
+    """
+
+    names: tuple[str, ...]
+    own: tuple[str, ...]
+
+
+LEVELS: Mapping[str, Blocks] = MappingProxyType(
     {
-        "offsets": ("offsets",),
-        "geometry": ("links",),
-        "eccentricity": ("links", "eccentricity", "ratios"),
+        "offsets": Blocks(("offsets",), ("offsets",)),
+        "geometry": Blocks(("links",), ("links",)),
+        "eccentricity": Blocks(("links", "eccentricity", "ratios"), ("eccentricity", "ratios")),
+        "elastic": Blocks(("links", COMPLIANCE, "eccentricity", "ratios"), (COMPLIANCE,)),
     }
 )
+_RIGID = Blocks((), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +74,7 @@ class LevelFit:
 
 
 def fit_level(
-    data: Closure, edges: Edges, bases: Mapping[str, FloatArray], blocks: Sequence[str]
+    data: Closure, edges: Edges, bases: Mapping[str, FloatArray], blocks: Blocks = _RIGID
 ) -> LevelFit | None:
     """Fits the chain with some blocks of the arm's errors free.
 
@@ -66,15 +82,16 @@ def fit_level(
         data: The views, one a stop, without errors of the arm.
         edges: Where to start.
         bases: (m, 6, p) columns of each block by its name.
-        blocks: Those to free, in the order in which they are looked for; behind the first, those
-            that explain no more than chance stay out.
+        blocks: Those to free; behind the first, those that explain no more than chance stay out.
 
     Returns:
-        The fit; None where there is nothing to free beyond chance, or no more than the first block.
+        The fit; None where nothing beyond chance makes it this level.
     """
     fit, gain = fit_closure(data, Edges(edges.x, edges.z, data.unchanged)), 0.0
     errors: dict[str, ArmErrors] = {}
-    for name in blocks:
+    if not bases.keys() >= set(blocks.own):
+        return None
+    for name in blocks.names:
         found = find_arm_errors(data, fit.edges, bases[name], of_links=True)
         if found is None or not found.is_significant:
             if not errors:
@@ -85,7 +102,7 @@ def fit_level(
         more = np.zeros(bases[name].shape[2])
         start = replace(fit.edges, shared=np.concatenate([fit.edges.shared, more]))
         fit = fit_closure(data, start)
-    if len(errors) < min(len(blocks), 2):
+    if blocks.own and not errors.keys() & set(blocks.own):
         return None
     inside = residual_blocks(data, fit.edges, fit.noise)[0]
     return LevelFit(errors, fit, gain, inside, left_out_residuals(data, fit.edges, fit.noise))

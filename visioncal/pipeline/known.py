@@ -17,8 +17,9 @@ from visioncal.estimator.joint import Scene
 from visioncal.estimator.measured import Measured
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
-from visioncal.robot import Convention, Robot, with_zeros
+from visioncal.robot import Convention, Loads, Robot, with_zeros
 from visioncal.session import Session
+from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult, robot_part
@@ -291,13 +292,18 @@ class Known:
         """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""
         if self.arm_model is None or self.joints_rad is None:
             return np.array([self.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
-        return self.arm_model.robot.base_from_flange(self.joints(views))
+        return self.arm_model.base_from_flange(self.joints(views), self.loads(views))
 
     def joints(self, views: Sequence[int]) -> FloatArray:
         """(m, n) joint angles of some views, where all have them [rad]."""
         joints = {} if self.joints_rad is None else self.joints_rad
         count = 0 if self.robot is None else self.robot.joint_count
         return np.array([joints[view] for view in views]).reshape(len(views), count)
+
+    def loads(self, views: Sequence[int]) -> Loads:
+        """What the flange carried at some views."""
+        rows = {view.number: view.numbers for view in self.session.views}
+        return loads_of([rows[view] for view in views])
 
     def with_readings(self, readings: Readings) -> Self:
         """Takes over an instrument's readings, and makes their poses by the present arm."""
@@ -340,7 +346,7 @@ class Known:
     def arm_basis(self, views: Sequence[int]) -> FloatArray:
         """How errors of the arm move each view's flange: of its links where these are known."""
         if self.arm_model is not None:
-            return self.arm_model.basis(self.joints(views))
+            return self.arm_model.basis(self.joints(views), self.loads(views))
         robot = self.zeroed_robot
         if self.joints_rad is not None and robot is not None:
             return link_basis(robot, np.array([self.joints_rad[view] for view in views]))

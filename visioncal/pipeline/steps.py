@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import BLOCKS, ArmModel
+from visioncal.estimator.armmodel import BLOCKS, RIGID_BLOCKS, ArmModel
 from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
@@ -306,9 +306,10 @@ def _kinematics(known: Known) -> Known:
         return known
     stated = replace(known, arm=None)
     first = np.unique(known.stops, return_index=True)[1]
-    q = known.joints(known.used)
-    model = ArmModel.of(robot, q, stated.flange_poses(known.used))
-    bases = {name: model.columns(name, q[first]) for name in BLOCKS}
+    q, loads = known.joints(known.used), known.loads(known.used)
+    model = ArmModel.of(robot, q, stated.flange_poses(known.used)).loaded(q, loads)
+    blocks = BLOCKS if robot.masses is not None or loads.any else RIGID_BLOCKS
+    bases = {name: model.columns(name, q[first], loads.chosen(first)) for name in blocks}
     data = stated.closure(known.used).merged(known.stops)
     lost = stated.stated_closure(known.used)
     told = None if lost is None else lost.merged(known.stops)

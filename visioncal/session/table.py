@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.errors import DataError
 from visioncal.session import columns as known
 from visioncal.session.images import image_path
+from visioncal.session.loads import load_problems
 from visioncal.types import FloatArray
 
 # Poses in micrometres stay under this many metres, and turns in degrees under this many radians; a
@@ -282,6 +283,9 @@ class _RowReader:
                 )
             if column.endswith("_rad") and abs(value) > _WIDEST_RAD:
                 self.report(column, f"{value:g} rad is no angle of a joint; write radians")
+
+        for column, words in load_problems(numbers):
+            self.report(column, words)
 
     def _check_groups(self, numbers: Mapping[str, float]) -> None:
         # A cell that was refused would be reported again as missing from its group.

@@ -23,6 +23,7 @@ _ZERO_SIGMA_RAD = 5e-4
 ASKED: Mapping[str, tuple[str, ...]] = {
     "offsets": ("offsets",),
     "kinematics": ("geometry", "eccentricity"),
+    "elastic": ("elastic",),
     "auto": tuple(LEVELS),
 }
 
@@ -86,7 +87,7 @@ def choose_level(
             it is; None where none is lost. Then offsets are what is taken at the least.
     """
     with one_blas_thread():
-        fits = {NOMINAL: fit_level(data, edges, bases, ())}
+        fits = {NOMINAL: fit_level(data, edges, bases)}
         fits |= {it: fit_level(data, edges, bases, blocks) for it, blocks in LEVELS.items()}
         if stated is not None:
             fits = _with_lost_zero(fits, data, stated, edges, bases)
@@ -107,7 +108,7 @@ def _with_lost_zero(
     bases: Mapping[str, FloatArray],
 ) -> dict[str, LevelFit | None]:
     """The levels beside the arm as it was stated, with what the zero explains in all others."""
-    nominal, zeroed = fit_level(stated, edges, bases, ()), fits[NOMINAL]
+    nominal, zeroed = fit_level(stated, edges, bases), fits[NOMINAL]
     if nominal is None or zeroed is None:
         return dict(fits)
     before = noise_likelihood(stated, nominal.fit.edges)[1]

@@ -1,0 +1,43 @@
+"""What a session says that the robot carried and was pushed by."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from visioncal.robot import Loads
+from visioncal.types import FloatArray
+
+_CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
+_FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
+# A payload or a force beyond these is in another unit [kg, N].
+_HEAVIEST_KG, _STRONGEST_N = 2500.0, 25000.0
+
+
+def loads_of(rows: Sequence[Mapping[str, float]]) -> Loads:
+    """The loads of some views by their numbers; where a view says nothing, there is none."""
+
+    def read(*names: str) -> FloatArray:
+        return np.array([[row.get(name, 0.0) for name in names] for row in rows])
+
+    return Loads(
+        read("payload_kg").reshape(-1),
+        read(*_CENTRE).reshape(-1, 3),
+        read(*_FORCE).reshape(-1, 3),
+    )
+
+
+def load_problems(numbers: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    """Columns of a row that say what no load can be, with what is wrong."""
+    mass = numbers.get("payload_kg")
+    if mass is not None and not 0.0 <= mass <= _HEAVIEST_KG:
+        yield "payload_kg", f"{mass:g} kg is no payload; 0 to {_HEAVIEST_KG:g} kg are taken"
+    placed = [name for name in _CENTRE if name in numbers]
+    if mass is None and placed:
+        yield (
+            placed[0],
+            "it tells where a payload's centre is, and payload_kg, its mass, is missing; a row "
+            "without a payload has payload_kg = 0 or leaves all of them empty",
+        )
+    for name in _FORCE:
+        if abs(numbers.get(name, 0.0)) > _STRONGEST_N:
+            yield name, f"{numbers[name]:g} N is no force on a robot's flange; write newtons"
