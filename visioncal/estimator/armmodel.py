@@ -69,7 +69,7 @@ class ArmModel:
         first = next(iter(errors.values())).sigma
         weights = {name: it.sigma / first for name, it in errors.items()}
         bends = errors.get(COMPLIANCE)
-        yielding = None if bends is None else bends.basis.any(axis=(0, 1))
+        yielding = None if bends is None else np.any(bends.basis, axis=(0, 1)) > 0
         return replace(self, weights=weights, values=np.zeros(sizes), yielding=yielding)
 
     def moved(self, step: FloatArray) -> "ArmModel":

@@ -10,8 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import numpy as np
-
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
 from visioncal.estimator.armmodel import COMPLIANCE
 from visioncal.estimator.closure import (
@@ -87,7 +85,8 @@ def fit_level(
     Returns:
         The fit; None where nothing beyond chance makes it this level.
     """
-    fit, gain = fit_closure(data, Edges(edges.x, edges.z, data.unchanged)), 0.0
+    plain, gain = data, 0.0
+    fit = fit_closure(data, Edges(edges.x, edges.z, data.unchanged))
     errors: dict[str, ArmErrors] = {}
     if not bases.keys() >= set(blocks.own):
         return None
@@ -97,12 +96,72 @@ def fit_level(
             if not errors:
                 return None
             continue
-        errors[name], gain = found, gain + found.gain
-        data = data.with_more(found.shared())
-        more = np.zeros(bases[name].shape[2])
-        start = replace(fit.edges, shared=np.concatenate([fit.edges.shared, more]))
-        fit = fit_closure(data, start)
+        errors, gain = errors | {name: found}, gain + found.gain
+        errors = _without_springs(plain, fit.edges, errors)
+        data = _erring(plain, errors)
+        fit = fit_closure(data, _at_rest(data, fit.edges))
     if blocks.own and not errors.keys() & set(blocks.own):
         return None
+    return _level_fit(data, errors, fit, gain)
+
+
+def resized(data: Closure, fit: LevelFit) -> LevelFit:
+    """Estimates the size of each block's errors anew, beside those of all others.
+
+    They were looked for one after the other: what explains the most takes too much at first.
+
+    Args:
+        data: The views of `fit_level`.
+        fit: Its answer.
+    """
+    errors, edges = dict(fit.errors), fit.fit.edges
+    for name, it in fit.errors.items():
+        others = _erring(data, {other: errors[other] for other in errors if other != name})
+        near = fit_closure(others, _at_rest(others, edges)).edges
+        errors[name] = find_arm_errors(others, near, it.basis, of_links=True) or it
+    whole = _erring(data, errors)
+    return _level_fit(whole, errors, fit_closure(whole, _at_rest(whole, edges)), fit.gain)
+
+
+def _level_fit(
+    data: Closure, errors: Mapping[str, ArmErrors], fit: ClosureFit, gain: float
+) -> LevelFit:
     inside = residual_blocks(data, fit.edges, fit.noise)[0]
     return LevelFit(errors, fit, gain, inside, left_out_residuals(data, fit.edges, fit.noise))
+
+
+def _erring(data: Closure, errors: Mapping[str, ArmErrors]) -> Closure:
+    """The views with errors of the arm among what they share."""
+    for it in errors.values():
+        data = data.with_more(it.shared())
+    return data
+
+
+def _at_rest(data: Closure, edges: Edges) -> Edges:
+    return Edges(edges.x, edges.z, data.unchanged)
+
+
+def _without_springs(
+    data: Closure, edges: Edges, errors: Mapping[str, ArmErrors]
+) -> dict[str, ArmErrors]:
+    """Holds joints rigid that would yield against their load: the bound of a compliance is zero.
+
+    An active set that only grows (Lawson and Hanson 1974, chapter 23, has the way back too, which
+    columns that hardly lean on one another do not need).
+    """
+    kept = dict(errors)
+    while COMPLIANCE in kept:
+        seen = _erring(data, kept)
+        values = fit_closure(seen, _at_rest(seen, edges)).edges.shared
+        basis = kept[COMPLIANCE].basis
+        behind = sum(it.basis.shape[2] for it in list(kept.values())[_place(kept) :])
+        bends = values[len(values) - behind :][: basis.shape[2]]
+        if not (bends < 0.0).any():
+            break
+        basis = basis * (bends >= 0.0)
+        kept[COMPLIANCE] = replace(kept[COMPLIANCE], basis=basis)
+    return kept
+
+
+def _place(errors: Mapping[str, ArmErrors]) -> int:
+    return list(errors).index(COMPLIANCE)

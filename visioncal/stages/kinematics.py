@@ -10,7 +10,7 @@ from visioncal.calibration import Rms
 from visioncal.errors import DataError
 from visioncal.estimator.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimator.closure import Closure, Edges, noise_likelihood
-from visioncal.estimator.kinematics import LEVELS, LevelFit, fit_level
+from visioncal.estimator.kinematics import LEVELS, LevelFit, fit_level, resized
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.figures import figure
 from visioncal.types import FloatArray
@@ -96,7 +96,8 @@ def choose_level(
     levels = tuple(_level(name, fit, turned=turned) for name, fit in found.items())
     least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
     best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
-    chosen = found[best.name]
+    with one_blas_thread():
+        chosen = resized(data, found[best.name])
     return Kinematics(best.name, levels, chosen.errors, asked != "auto", (found[NOMINAL], chosen))
 
 
