@@ -12,14 +12,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.simulation import Cell, forward
+from visioncal.simulation import Cell, Payload, forward
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import project
+from visioncal.simulation.sag import giving_of, sagging
 from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
 _STEP = 1e-5
+# Springs count by how far they bend under so much [N m].
+_TORQUE_NM = 100.0
 
 
 def edge_bound(cell: Cell, views: Sequence[int] | None = None) -> FloatArray:
@@ -81,50 +84,73 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
         cell: The cell.
         q: (k, n) postures at which the error counts, as the encoders have them [rad].
     """
-    sigmas = _arm_sigmas(cell)
-    size = 12 + len(sigmas)
-    information = np.zeros((size, size))
-    information[12:, 12:] = np.diag(sigmas**-2.0)
-    slack = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3) ** 2
-    for view, pose in enumerate(cell.cam_from_target):
-        seen = cell.corners[view].ids
-        by_pose = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
-        camera = np.linalg.inv(by_pose.T @ by_pose) * cell.options.pixel_sigma_px**2
-        by_flange = _pose_slopes(cell, cell.joints[view], slack=True)[:, -6:]
-        spread = camera + by_flange @ np.diag(slack) @ by_flange.T
-        slopes = _pose_slopes(cell, cell.joints[view])
-        information += slopes.T @ np.linalg.solve(spread, slopes)
-    scale = 1.0 / np.sqrt(np.diag(information))
-    spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    spread = _arm_bound(cell)
     at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheet)
     turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
     slopes = [turn @ _carried(cell, it) @ _pose_slopes(cell, it) for it in q]
     return float(np.sqrt(np.mean([np.trace(it @ spread @ it.T) for it in slopes])))
 
 
+def compliance_bound(cell: Cell) -> FloatArray:
+    """Least standard deviations (n,) of what the joints yield to a torque [rad/(N m)].
+
+    Beside all that `workspace_bound_m` has unknown. Of the springs no more is known beforehand than
+    how stiff the softest is.
+    """
+    return np.sqrt(np.diag(_arm_bound(cell))[-cell.arm.a.size :]) / _TORQUE_NM
+
+
+def _arm_bound(cell: Cell) -> FloatArray:
+    """Least covariance of x, z and the arm's parameters, those of its springs last."""
+    sigmas = _arm_sigmas(cell)
+    size = 12 + len(sigmas)
+    information = np.zeros((size, size))
+    information[12:, 12:] = np.diag(sigmas**-2.0)
+    slack = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3) ** 2
+    for view, pose in enumerate(cell.cam_from_target):
+        seen, load = cell.corners[view].ids, cell.payloads[view : view + 1]
+        by_pose = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
+        camera = np.linalg.inv(by_pose.T @ by_pose) * cell.options.pixel_sigma_px**2
+        by_flange = _pose_slopes(cell, cell.joints[view], load, slack=True)[:, -6:]
+        spread = camera + by_flange @ np.diag(slack) @ by_flange.T
+        slopes = _pose_slopes(cell, cell.joints[view], load)
+        information += slopes.T @ np.linalg.solve(spread, slopes)
+    scale = 1.0 / np.sqrt(np.diag(information))
+    return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+
+
 def _carried(cell: Cell, q: FloatArray) -> FloatArray:
     """(6, 6) from motions of the target seen from the camera to those of what the arm carries."""
     if cell.options.mount == "eye-to-hand":
         return np.eye(6)
-    return adjoint(_pose(cell, q, np.zeros(12 + 5 * cell.arm.a.size)))
+    return adjoint(_pose(cell, q, np.zeros(12 + len(_arm_sigmas(cell)))))
 
 
 def _arm_sigmas(cell: Cell) -> FloatArray:
-    """Standard deviations (5 n,) of a, d, alpha, beta and the joints' offsets."""
+    """Standard deviations of a, d, alpha, beta, the joints' offsets, and springs, (n,) each.
+
+    A spring's is how far it bends under `_TORQUE_NM`.
+    """
     options, count = cell.options, cell.arm.a.size
     offset = np.hypot(options.dh_sigma_rad, options.offset_sigma_rad)
     each = [options.dh_sigma_m] * 2 + [options.dh_sigma_rad] * 2 + [offset]
+    if cell.options.compliance_rad_per_nm:
+        each.append(_TORQUE_NM * max(cell.options.compliance_rad_per_nm))
     return np.repeat(each, count)
 
 
-def _pose_slopes(cell: Cell, q: FloatArray, *, slack: bool = False) -> FloatArray:
+def _pose_slopes(
+    cell: Cell, q: FloatArray, load: Sequence[Payload] = (), *, slack: bool = False
+) -> FloatArray:
     """How `cam_from_target` (6) moves with x, z and the arm, and with the flange's error."""
-    size = 12 + 5 * cell.arm.a.size + (6 if slack else 0)
-    middle = invert(_pose(cell, q, np.zeros(size)))
-    return _slopes(lambda it: log(middle @ _pose(cell, q, it)), size)
+    size = 12 + len(_arm_sigmas(cell)) + (6 if slack else 0)
+    middle = invert(_pose(cell, q, np.zeros(size), load))
+    return _slopes(lambda it: log(middle @ _pose(cell, q, it, load)), size)
 
 
-def _pose(cell: Cell, q: FloatArray, change: FloatArray) -> FloatArray:
+def _pose(
+    cell: Cell, q: FloatArray, change: FloatArray, load: Sequence[Payload] = ()
+) -> FloatArray:
     arm, count = cell.true_arm, cell.arm.a.size
     a, d, alpha, beta, offset = change[12 : 12 + 5 * count].reshape(5, count)
     moved = replace(
@@ -135,8 +161,12 @@ def _pose(cell: Cell, q: FloatArray, change: FloatArray) -> FloatArray:
         beta=arm.beta + beta,
         offset=arm.offset + offset,
     )
-    slack = change[12 + 5 * count :]
-    flange = forward(moved, q[None])[0] @ exp(slack if len(slack) else np.zeros(6))
+    options, rest, standing = cell.options, change[12 + 5 * count :], q[None]
+    if options.compliance_rad_per_nm:
+        springs = np.array(options.compliance_rad_per_nm) + rest[:count] / _TORQUE_NM
+        giving = giving_of(moved, tuple(springs), options.mass_share, ())
+        standing, rest = sagging(moved, giving, q[None], load), rest[count:]
+    flange = forward(moved, standing)[0] @ exp(rest if len(rest) else np.zeros(6))
     x, z = cell.transforms.values()
     robot = flange if cell.options.mount == "eye-in-hand" else invert(flange)
     return invert(robot @ x @ exp(change[:6])) @ z @ exp(change[6:12])

@@ -11,7 +11,7 @@ from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell
-from visioncal.simulation.records import _load_row
+from visioncal.simulation.records import load_row
 from visioncal.simulation.second import BOARDS
 from visioncal.transforms import invert, log
 
@@ -25,7 +25,7 @@ def session_of(cell: Cell) -> Session:
         table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
     document = {"schema": 1, "name": "cell", "mount": options.mount, "camera": table}
     views = [
-        View(at, image=f"{at}.png", numbers=_load_row(cell.payloads[at]) if cell.payloads else {})
+        View(at, image=f"{at}.png", numbers=load_row(cell.payloads[at]) if cell.payloads else {})
         for at in range(len(cell.corners))
     ]
     if len(cell.sheets) == 1:

@@ -33,11 +33,11 @@ def error_m(cell, known, robot):
     """Root mean square error of what the arm carries, all over the workspace [m].
 
     Seen from what stands still: the camera's place seen from the target, or that of the target's
-    middle seen from the camera.
+    middle seen from the camera. `robot` may be an `ArmModel`, which bends under its own weight.
     """
-    q = postures(robot)
+    q = postures(getattr(robot, "nominal", robot))
     mount, edges = cell.options.mount, known.solved.edges
-    true = target_in_camera(mount, *cell.transforms.values(), forward(cell.true_arm, q))
+    true = target_in_camera(mount, *cell.transforms.values(), cell.flange_at(q))
     ours = target_in_camera(mount, edges.x, edges.z, robot.base_from_flange(q))
     if mount == "eye-in-hand":
         away = (invert(true) - invert(ours))[:, :3, 3]

@@ -3,9 +3,7 @@
 Written with the simulation's own kinematics, so that the estimator is not judged with its own.
 """
 
-import tomllib
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation.arms import Arm, ArmErrors, disturb, forward, link_frames, ur_arm
+from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward, link_frames
+from visioncal.simulation.records import load_row
+from visioncal.simulation.sag import Payload, giving_of, sagging
 from visioncal.transforms import compose, exp, invert, log
 from visioncal.types import FloatArray
 
@@ -35,6 +35,8 @@ class Tracked:
         robot_sigma_rad: The same of its rotation [rad].
         dh_sigma_m: Errors of the arm's lengths [m].
         dh_sigma_rad: Errors of its angles [rad].
+        compliance: What each joint yields to a torque [rad/(N m)]; empty for a rigid arm.
+        payloads: What hangs on the flange, stop by stop in turn.
         seed: Of everything random.
     """
 
@@ -48,10 +50,11 @@ class Tracked:
     robot_sigma_rad: float = 3e-5
     dh_sigma_m: float = 0.0
     dh_sigma_rad: float = 0.0
+    compliance: tuple[float, ...] = ()
+    payloads: tuple[Payload, ...] = ()
     seed: int = 0
 
 
-ROBOTS = Path(__file__).parents[1] / "visioncal" / "robots"
 THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
 
 
@@ -80,7 +83,7 @@ class Shop:
 
 def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     rng = np.random.default_rng([7, options.seed])
-    arm = arm_of(options.robot)
+    arm = arm_named(options.robot)
     errors = ArmErrors(options.dh_sigma_m, options.dh_sigma_rad, options.dh_sigma_rad)
     true_arm = disturb(arm, errors, rng)
     x = compose(exp(np.array([[0.1, -0.2, 2.5, 0, 0, 0]]))[0, :3, :3], np.array([2.5, -1.0, 0.4]))
@@ -89,7 +92,9 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     if joints is None:
         joints = above(arm, options.stops, rng)
     sigmas = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
-    flange = forward(true_arm, joints) @ exp(rng.normal(size=(len(joints), 6)) * sigmas)
+    giving = giving_of(true_arm, options.compliance, 1.0, ())
+    standing = sagging(true_arm, giving, joints, payloads_of(options, len(joints)))
+    flange = forward(true_arm, standing) @ exp(rng.normal(size=(len(joints), 6)) * sigmas)
     rows = []
     for stop, pose in enumerate(flange):
         for point, place in enumerate(options.points):
@@ -101,16 +106,10 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
 
 
-def arm_of(name: str) -> Arm:
-    """A UR, or another arm by its standard table."""
-    if name.startswith("ur"):
-        return ur_arm(name)
-    rows = tomllib.loads((ROBOTS / f"{name}.toml").read_text(encoding="utf-8"))["joint"]
-    a, d, alpha, offset = (
-        np.array([row.get(key, 0.0) for row in rows])
-        for key in ("a_m", "d_m", "alpha_rad", "theta_offset_rad")
-    )
-    return Arm(name=name, a=a, d=d, alpha=alpha, beta=np.zeros(len(a)), offset=offset)
+def payloads_of(options: Tracked, stops: int) -> list[Payload]:
+    """What hung on the flange at each stop; empty for nothing."""
+    hung = options.payloads
+    return [hung[at % len(hung)] for at in range(stops)] if hung else []
 
 
 def above(arm: Arm, stops: int, rng: np.random.Generator) -> FloatArray:
@@ -136,6 +135,8 @@ def session_of(shop: Shop, *, joints: bool = True, poses: bool = False, **docume
     columns = ["view", "stop", "point", "meas_x_m", "meas_y_m", "meas_z_m"]
     columns += [f"meas_{it}" for it in POSE[3:]] * options.poses
     columns += list(POSE) * poses + [f"q{it + 1}_rad" for it in range(6)] * joints
+    payloads = payloads_of(options, len(shop.joints))
+    columns += list(load_row(payloads[0])) if payloads else []
     nominal = forward(shop.arm, shop.joints)
     cells = []
     for view, (stop, point, read) in enumerate(shop.rows):
@@ -143,6 +144,7 @@ def session_of(shop: Shop, *, joints: bool = True, poses: bool = False, **docume
         row += [*_quaternion(read)] * options.poses
         row += [*nominal[stop, :3, 3], *_quaternion(nominal[stop])] * poses
         row += [*shop.joints[stop]] * joints
+        row += [*load_row(payloads[stop]).values()] if payloads else []
         cells.append([repr(float(it)) if isinstance(it, float) else str(it) for it in row])
     noise = {"sigma_m": options.sigma_m}
     if options.poses:

@@ -1,7 +1,7 @@
 """The result of a calibration."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,7 @@ from visioncal.calibration.parts import (
 )
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
-from visioncal.robot import Robot
+from visioncal.robot import Loads, Robot, bent_joints
 from visioncal.types import FloatArray, Mount
 
 
@@ -94,14 +94,39 @@ class Calibration:
             raise DataError(f"no transform {name!r}: this calibration has {', '.join(placed)}.")
         return placed[name].covariance
 
-    def base_from_flange(self, q: FloatArray) -> RigidTransform:
-        """Forward kinematics of the calibrated robot.
+    def base_from_flange(
+        self,
+        q: FloatArray,
+        *,
+        payload_kg: float | FloatArray = 0.0,
+        payload_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
+        force_n: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> RigidTransform:
+        """Forward kinematics of the calibrated robot, which bends where that was calibrated.
 
         Args:
             q: (m, n) joint angles [rad].
+            payload_kg: Mass on the flange beside the arm's own weight; one for all, or (m,) [kg].
+            payload_m: (3,) or (m, 3) its centre in the flange's frame [m].
+            force_n: (3,) or (m, 3) external force on the flange's origin, in the base's frame [N].
 
         Returns:
             m transforms, as one batched RigidTransform.
+
+        Raises:
+            DataError: The session named no known robot, q has another number of joints, or a load
+                is none.
+        """
+        q = np.atleast_2d(q)
+        loads = Loads.alike(len(q), payload_kg, payload_m, force_n)
+        return RigidTransform.from_matrix(self.standing(q, loads))
+
+    def standing(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """What `base_from_flange` gives, as (m, 4, 4).
+
+        Args:
+            q: (m, n) joint angles [rad].
+            loads: What the flange carries; the arm's own weight alone where None.
 
         Raises:
             DataError: The session named no known robot, or q has another number of joints.
@@ -112,7 +137,15 @@ class Calibration:
                 "this calibration holds no robot model.",
                 next_step="Name one in the session's [robot] table and calibrate again.",
             )
-        return RigidTransform.from_matrix(arm.base_from_flange(np.atleast_2d(q)))
+        return arm.base_from_flange(bent_joints(arm, q, self.compliance, loads))
+
+    @cached_property
+    def compliance(self) -> FloatArray:
+        """(n,) what each joint yields to a torque [rad/(N m)]; zero where that is not known."""
+        rows = self.stages.get("elastic", {}).get("joints", ())
+        if not rows:
+            return np.zeros(0 if self.robot is None else self.robot.joint_count)
+        return np.array([float(row["compliance_rad_per_nm"]) for row in rows])
 
     @property
     def arm_is_calibrated(self) -> bool:

@@ -19,6 +19,7 @@ from visioncal.compensation.table import Targets, columns_to_send, read_targets,
 from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.files import check_free, did_you_mean, some_of, write_atomically
+from visioncal.robot import Loads
 from visioncal.stored import load_calibration
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray
@@ -67,6 +68,16 @@ def correct_command(
             "middle of the joints' limits. Each further target is reached near to the one before.",
         ),
     ] = None,
+    payload_kg: Annotated[
+        float,
+        typer.Option("--payload-kg", help="What hangs on the flange, for joints that bend [kg]."),
+    ] = 0.0,
+    payload_m: Annotated[
+        str,
+        typer.Option(
+            "--payload-m", metavar="X,Y,Z", help="Where its centre is, in the flange's frame [m]."
+        ),
+    ] = "0,0,0",
     widest_deg: Annotated[
         float,
         typer.Option(
@@ -98,6 +109,7 @@ def correct_command(
         base_from_flange,
         _seeds(wanted.q_seed, seed_joints),
         widest_rad=np.deg2rad(_widest(widest_deg)),
+        loads=_loads(len(base_from_flange), payload_kg, payload_m),
     )
     lost = tuple(_unreachable(wanted, corrected))
     rows = np.flatnonzero(corrected.reached)
@@ -108,6 +120,7 @@ def correct_command(
     columns = columns_to_send(wanted, corrected, base_from_tool, sigma_mm)
     warnings = [
         *_doubts(known),
+        *_rigid(arm, payload_kg),
         *_turns(arm, wanted, corrected, widest_deg),
         *_singular(arm, wanted, corrected.q, rows),
     ]
@@ -133,6 +146,20 @@ def _widest(degrees: float) -> float:
             culprits=["--widest-deg"],
         )
     return degrees
+
+
+def _loads(count: int, payload_kg: float, payload_m: str) -> Loads:
+    centre = numbers_in(payload_m, "--payload-m", "x,y,z")
+    return Loads.alike(count, payload_kg, centre, (0.0, 0.0, 0.0))
+
+
+def _rigid(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:
+    """Says where a payload changes nothing."""
+    if payload_kg and not arm.compliance.any():
+        yield (
+            f"--payload-kg {payload_kg:g} changes nothing: the calibration has no joints that bend "
+            "(level elastic)."
+        )
 
 
 def _tool(calibration: Calibration, name: str | None) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.robot import Robot
+from visioncal.robot import Loads, Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.types import FloatArray
 
@@ -26,12 +26,14 @@ class CalibratedArm:
     Attributes:
         nominal: What the controller computes with.
         real: What the calibration found.
-        inverse: The inverse kinematics of the real arm.
+        inverse: The inverse kinematics of the real arm without a load.
+        compliance: (n,) what its joints yield to a torque [rad/(N m)].
     """
 
     nominal: Robot
     real: Robot
     inverse: Inverse
+    compliance: FloatArray
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
@@ -49,7 +51,21 @@ class CalibratedArm:
                 "to reach a position.",
                 culprits=[real.name],
             )
-        return cls(nominal, real, Inverse(real))
+        return cls(nominal, real, Inverse(real), calibration.compliance)
+
+    def unbent(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """Where to send the joints so that under their loads they stand elsewhere.
+
+        Args:
+            q: (m, n) where they are to stand, as angles of the arm without a load [rad].
+            loads: What the flange carries; the arm's own weight alone where None.
+
+        Returns:
+            (m, n) what their encoders have to tell [rad].
+        """
+        if not self.compliance.any():
+            return q
+        return np.asarray(q - self.compliance * self.real.load_torques(q, loads))
 
     def turns_deg_per_mm(self, q: FloatArray) -> FloatArray:
         """How far joints turn at the most for a millimetre of the flange, its rotation kept.

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.calibration import Calibration
 from visioncal.compensation.arms import CalibratedArm
 from visioncal.errors import DataError
-from visioncal.robot import Robot
+from visioncal.robot import Loads, Robot
 from visioncal.robot.inverse import Posture
 from visioncal.transforms import compose, invert, nearest_rotation, rotation_angle
 from visioncal.types import FloatArray, Mask
@@ -77,6 +77,7 @@ def correct(
     q_seed: FloatArray | Sequence[float] | None = None,
     *,
     widest_rad: float = WIDEST_RAD,
+    loads: Loads | None = None,
 ) -> Corrected:
     """Computes what to send to the nominal controller so that the real arm reaches targets.
 
@@ -93,6 +94,8 @@ def correct(
             Without it, the first is the posture nearest to the middle of the joints' limits.
         widest_rad: Where a joint turns farther from its seed, other branches are looked at and the
             nearest is taken [rad].
+        loads: What the flange carries at each target, for an arm whose joints bend
+            (`Loads.alike`); its own weight alone where None.
 
     Raises:
         DataError: The calibration has no calibrated arm, or a target or a seed is none.
@@ -118,7 +121,7 @@ def correct(
             starts[at] = start
         last = found[-1].positions if found[-1].reached else start
     positions = np.array([it.positions for it in found]).reshape(seeds.shape)
-    q = chain.encoded(positions)
+    q = arm.unbent(chain.encoded(positions), loads)
     return Corrected(
         wanted=wanted,
         q=q,

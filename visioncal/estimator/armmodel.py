@@ -95,7 +95,7 @@ class ArmModel:
         for name, weight in self.weights.items():
             size = block_size(name, count)
             if name == COMPLIANCE:
-                bends = weight * self.values[at : at + size] / self.torque_nm
+                bends = np.maximum(weight * self.values[at : at + size] / self.torque_nm, 0.0)
                 return bends if self.yielding is None else np.where(self.yielding, bends, 0.0)
             at += size
         return np.zeros(count)

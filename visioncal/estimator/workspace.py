@@ -40,7 +40,7 @@ def pose_slopes(model: ArmModel, edges: Edges, mount: Mount, q: FloatArray) -> F
     Returns:
         (m, 6, 12 + p) right perturbations of `cam_from_target`.
     """
-    return chain_slopes(edges, mount, model.robot.base_from_flange(q), model.basis(q))
+    return chain_slopes(edges, mount, model.base_from_flange(q), model.basis(q))
 
 
 def chain_slopes(
@@ -87,7 +87,7 @@ def tool_slopes(
     """
     slopes = pose_slopes(model, edges, mount, q)
     if mount == "eye-in-hand":
-        flange = model.robot.base_from_flange(q)
+        flange = model.base_from_flange(q)
         at = invert(_cam_from_target(edges, mount, flange))[:, :3, 3]
     turned = -skew(np.broadcast_to(at, (len(q), 3))) @ slopes[:, :3]
     return np.asarray(turned + slopes[:, 3:])

@@ -12,6 +12,7 @@ from visioncal.frames.sight import Parent, Sight, needs_robot
 from visioncal.pipeline.known import HELD_BACK, by_reason
 from visioncal.robot import Robot
 from visioncal.session import Session, View
+from visioncal.session.loads import loads_of
 from visioncal.stages.detect import detect, image_of
 from visioncal.stages.reported import Reported, reported_poses
 from visioncal.types import FloatArray, Progress, Rejection, Target
@@ -228,7 +229,8 @@ def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...])
     for view in asked:
         joints = view.joints_rad
         if joints is not None and len(joints) == arm.joint_count:
-            poses[view.number] = arm.base_from_flange(joints[None])[0]
+            loads = loads_of([view.numbers])
+            poses[view.number] = calibration.standing(joints[None], loads)[0]
     return replace(reported, base_from_flange=poses)
 
 

@@ -131,6 +131,8 @@ def flange_poses(
             next_step="Fill in x_m to qw, or joint angles and --robot-model.",
         )
     first = modelled if calibrated else modelled & ~reported
+    if calibrated and calibration is not None and rows.joints_rad is not None:
+        poses[modelled] = calibration.standing(rows.joints_rad[modelled])
     return np.where(first[:, None, None], poses, rows.base_from_flange)
 
 

@@ -22,6 +22,7 @@ from visioncal.session import Session
 from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
+from visioncal.stages.elastic import Elastic
 from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
@@ -78,6 +79,7 @@ class Known:
         hand_eye: Both unknown edges.
         diagnosis: What the residuals show beyond noise.
         telling: What the stops tell of a calibrated arm.
+        elastic: What they tell of its joints as springs; None for a rigid one.
         held_out: Residuals of used views, left out of the fit.
         findings: What the verdict is made of.
         verdict: Whether to trust it all.
@@ -117,6 +119,7 @@ class Known:
     hand_eye: HandEyeResult | None = None
     diagnosis: Diagnosis | None = None
     telling: Telling | None = None
+    elastic: Elastic | None = None
     held_out: HeldOut | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None

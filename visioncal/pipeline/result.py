@@ -15,6 +15,7 @@ from visioncal.estimator.boards import Placed, place
 from visioncal.estimator.observability import edge_names
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.arm import kinematics_document
+from visioncal.pipeline.elastic import elastic_document
 from visioncal.pipeline.fit import conditions_document, fit_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
@@ -60,7 +61,7 @@ def calibrate(
         session: A session, or the path of its folder or recording.
         solver: `joint` for the fit of both edges, or the name of a closed form.
         level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
-            arm, `offsets` of its joints, or its `kinematics`.
+            arm, `offsets` of its joints, its `kinematics`, or `elastic` for joints that bend, too.
         convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         progress: Told of long work.
@@ -212,6 +213,9 @@ def _further(known: Known) -> dict[str, Any]:
     kinematics = kinematics_document(known)
     if kinematics is not None:
         documents["kinematics"] = kinematics
+    springs = elastic_document(known)
+    if springs is not None:
+        documents["elastic"] = springs
     if known.diagnosis is not None:
         documents["uncertainty"] = _uncertainty(known, known.diagnosis)
     conditions, fit = conditions_document(known), fit_document(known)

@@ -16,12 +16,14 @@ from visioncal.estimator.armmodel import BLOCKS, RIGID_BLOCKS, ArmModel
 from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
+from visioncal.pipeline.elastic import springs_told
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.stages import elastic
 from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clock import set_clock
@@ -397,7 +399,12 @@ def _validate(known: Known) -> Known:
 def _tell(known: Known) -> Known:
     telling = telling_of(known)
     advice = () if telling is None or not telling.advice else (telling.advice,)
-    return replace(known, telling=telling, notes=(*known.notes, *advice))
+    known = replace(known, telling=telling, notes=(*known.notes, *advice))
+    springs = springs_told(known)
+    if springs is None:
+        return known
+    known = replace(known, elastic=springs, notes=(*known.notes, *elastic.remarks(springs)))
+    return known.noting((), elastic.doubts(springs))
 
 
 def _judge(known: Known) -> Known:

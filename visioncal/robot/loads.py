@@ -63,6 +63,39 @@ class Loads:
         """No load but the arm's own weight."""
         return cls(np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)))
 
+    @classmethod
+    def alike(
+        cls,
+        count: int,
+        payload_kg: float | FloatArray,
+        payload_m: FloatArray | Sequence[float],
+        force_n: FloatArray | Sequence[float],
+    ) -> Self:
+        """The same loads at so many stops, or one each.
+
+        Raises:
+            DataError: A mass is negative, a number is not finite, or a shape does not fit.
+        """
+        try:
+            loads = cls(
+                np.broadcast_to(np.asarray(payload_kg, dtype=float), (count,)),
+                np.broadcast_to(np.asarray(payload_m, dtype=float), (count, 3)),
+                np.broadcast_to(np.asarray(force_n, dtype=float), (count, 3)),
+            )
+        except ValueError as error:
+            raise DataError(
+                f"loads: a payload in kg, its centre (3,) in m and a force (3,) in N are needed, "
+                f"or {count} of each: {error}."
+            ) from error
+        centre = np.concatenate([loads.payload_kg[:, None], loads.payload_m, loads.force_n], axis=1)
+        if not np.isfinite(centre).all() or (loads.payload_kg < 0.0).any():
+            raise DataError(
+                f"loads: a payload of {np.min(loads.payload_kg):g} kg; 0 kg or more, and finite "
+                "numbers, are needed.",
+                culprits=["payload_kg"],
+            )
+        return loads
+
     @property
     def any(self) -> bool:
         """Whether a stop has a load beside the arm's own weight."""
@@ -166,19 +199,3 @@ def bent_joints(
     for _ in range(_LOOKS):
         bent = q + compliance * load_torques(robot, bent, loads)
     return bent
-
-
-def check_loads(loads: Loads) -> None:
-    """Checks what was said of loads by hand.
-
-    Raises:
-        DataError: A mass is negative or a number is not finite.
-    """
-    numbers = np.concatenate([loads.payload_kg[:, None], loads.payload_m, loads.force_n], axis=1)
-    if not np.isfinite(numbers).all():
-        raise DataError("loads: payload and force must be finite numbers.")
-    if (loads.payload_kg < 0.0).any():
-        raise DataError(
-            f"loads: a payload of {loads.payload_kg.min():g} kg; 0 kg or more is needed.",
-            culprits=["payload_kg"],
-        )

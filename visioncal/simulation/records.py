@@ -313,11 +313,11 @@ def _report_rows(cell: Cell) -> Iterator[dict[str, float]]:
     """The numeric columns of each view: when, with which joints, at which reported pose."""
     for view in range(len(cell.corners)):
         joints = {f"q{i + 1}_rad": float(q) for i, q in enumerate(cell.joints[view])}
-        load = _load_row(cell.payloads[view]) if cell.payloads else {}
+        load = load_row(cell.payloads[view]) if cell.payloads else {}
         yield {"stamp_s": _PACE_S * view} | _pose_row(cell.base_from_flange[view]) | joints | load
 
 
-def _load_row(load: Payload) -> dict[str, float]:
+def load_row(load: Payload) -> dict[str, float]:
     """The columns of what the flange carries and is pushed by."""
     centre = {f"payload_{it}_m": at for it, at in zip("xyz", load.centre_m, strict=True)}
     force = {f"force_{it}_n": at for it, at in zip("xyz", load.force_n, strict=True)}

@@ -157,7 +157,7 @@ def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
     Raises:
         DataError: There are no joint angles that belong to a known model.
     """
-    if asked in ("offsets", "kinematics") and not can:
+    if asked in ("offsets", "kinematics", "elastic") and not can:
         raise DataError(
             f"level {asked!r} needs the joint angles of every view and a model of the robot that "
             "they belong to.",
