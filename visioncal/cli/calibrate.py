@@ -30,7 +30,8 @@ def calibrate_command(
     level: Annotated[
         str,
         typer.Option(
-            help="The arm: auto, hand-eye (none comes out), offsets (of its joints), kinematics."
+            help="The arm: auto, hand-eye (none comes out), offsets (of its joints), kinematics, "
+            "elastic (joints that bend, too)."
         ),
     ] = "auto",
     convention: Annotated[

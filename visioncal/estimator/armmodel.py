@@ -53,12 +53,12 @@ class ArmModel:
         tool = mean_transform(invert(nominal.base_from_flange(q)) @ reported)
         return cls(nominal, tool, {}, np.zeros(0))
 
-    def loaded(self, q: FloatArray, loads: Loads) -> "ArmModel":
+    def loaded(self, q: FloatArray, loads: Loads | None = None) -> "ArmModel":
         """Returns the arm with compliances in units of the greatest torque of some stops.
 
         Args:
             q: (m, n) joint angles [rad].
-            loads: What the flange carried.
+            loads: What the flange carries; nothing where None.
         """
         most = float(np.abs(self.robot.load_torques(q, loads)).max(initial=0.0))
         return replace(self, torque_nm=most or 1.0)

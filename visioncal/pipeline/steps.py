@@ -300,6 +300,27 @@ def _arm(known: Known) -> Arm:
 
 
 def _kinematics(known: Known) -> Known:
+    """Takes up the arm's errors, again with views that disagree with the arm as stated alone."""
+    found = _arm_told(known)
+    if found.arm_model is None or len(known.used) == len(known.candidates):
+        return found
+    more = _with_views_back(known, _hand_eye(found))
+    return found if more is None else _arm_told(more)
+
+
+def _with_views_back(stated: Known, calibrated: Known) -> Known | None:
+    """The views that agree when the arm is calibrated; None where that brings none back."""
+    before, all_of = stated.agreed, stated.candidates
+    if before is None:
+        return None
+    boards, stops = calibrated.shown(all_of), calibrated.stops_of(all_of)
+    again = agree(calibrated.closure(all_of), all_of, stops, before, boards)
+    if not (again.mask & ~before.mask).any():
+        return None
+    return without_lost_boards(stated.agreeing(replace(again, edges=before.edges)))
+
+
+def _arm_told(known: Known) -> Known:
     """Chooses which errors of the arm are told, and takes them up as unknowns."""
     robot, agreed = known.zeroed_robot, known.agreed
     can = robot is not None and known.joints_rad is not None and known.solver == "joint"

@@ -21,7 +21,7 @@ from visioncal.estimator.appearance import (
     compress,
 )
 from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import ArmModel, block_size
+from visioncal.estimator.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimator.closure import Closure, Edges, Noise, whitened_slopes
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance, one_blas_thread
@@ -282,7 +282,17 @@ def _shared(known: FloatArray, moved: list[FloatArray]) -> Shared:
 def _model(robot: Robot, purpose: Purpose) -> ArmModel:
     sigma = _sigma(purpose)
     weights = {name: it / sigma for name, it in purpose.blocks.items()}
-    return ArmModel(robot, np.eye(4), weights, np.zeros(sum(_arm_sizes(robot, purpose))))
+    model = ArmModel(robot, np.eye(4), weights, np.zeros(sum(_arm_sizes(robot, purpose))))
+    if COMPLIANCE not in weights:
+        return model
+    if robot.masses is None:
+        raise DataError(
+            f"stops for {purpose.name} cannot be planned: the model of {robot.name} does not tell "
+            "the masses of its links, and their weight is what bends it.",
+            culprits=[robot.name],
+            next_step="Add mass_kg and com_m to each [[joint]] of its table, or take its URDF.",
+        )
+    return model.loaded(postures(robot))
 
 
 def _sigma(purpose: Purpose) -> float:

@@ -55,8 +55,15 @@ _KINEMATICS = Purpose(
     # Arms come off by 1 mrad and 0.5 mm a link.
     {"links": 1e-3},
 )
+_ELASTIC = Purpose(
+    "elastic",
+    "workspace",
+    "the bending arm's place all over its workspace",
+    # A cobot's joints yield by 10 mrad to the arm's own weight where that turns them most.
+    {"links": 1e-3, "compliance": 1e-2},
+)
 PURPOSES: Mapping[str, Purpose] = MappingProxyType(
-    {it.name: it for it in (_HAND_EYE, _OFFSETS, _KINEMATICS)}
+    {it.name: it for it in (_HAND_EYE, _OFFSETS, _KINEMATICS, _ELASTIC)}
 )
 
 
