@@ -8,14 +8,14 @@ from (van Trees 1968, section 2.4).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.simulation import Cell, Payload, forward
+from visioncal.simulation import Cell, forward
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import project
-from visioncal.simulation.sag import giving_of, sagging
+from visioncal.simulation.sag import giving_of, load_torques, sagging
 from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray
 
@@ -87,7 +87,8 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
     spread = _arm_bound(cell)
     at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheet)
     turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
-    slopes = [turn @ _carried(cell, it) @ _pose_slopes(cell, it) for it in q]
+    stood = [_held(cell, it) for it in q]
+    slopes = [turn @ _carried(cell, it) @ _pose_slopes(cell, it) for it in stood]
     return float(np.sqrt(np.mean([np.trace(it @ spread @ it.T) for it in slopes])))
 
 
@@ -108,22 +109,43 @@ def _arm_bound(cell: Cell) -> FloatArray:
     information[12:, 12:] = np.diag(sigmas**-2.0)
     slack = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3) ** 2
     for view, pose in enumerate(cell.cam_from_target):
-        seen, load = cell.corners[view].ids, cell.payloads[view : view + 1]
+        seen, held = cell.corners[view].ids, _held(cell, cell.joints[view], view)
         by_pose = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
         camera = np.linalg.inv(by_pose.T @ by_pose) * cell.options.pixel_sigma_px**2
-        by_flange = _pose_slopes(cell, cell.joints[view], load, slack=True)[:, -6:]
+        slopes, by_flange = np.split(_pose_slopes(cell, held, slack=True), [size], axis=1)
         spread = camera + by_flange @ np.diag(slack) @ by_flange.T
-        slopes = _pose_slopes(cell, cell.joints[view], load)
         information += slopes.T @ np.linalg.solve(spread, slopes)
     scale = 1.0 / np.sqrt(np.diag(information))
     return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
 
 
-def _carried(cell: Cell, q: FloatArray) -> FloatArray:
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """Where the joints stand under their loads, (n,) [rad], and the torques on them [N m].
+
+    Other errors of the arm change the torques by as little as they are: that is left out.
+    """
+
+    standing: FloatArray
+    torques: FloatArray
+
+
+def _held(cell: Cell, q: FloatArray, view: int | None = None) -> _Held:
+    """The joints (n,) at a stop, with what it carried at a view."""
+    options, arm = cell.options, cell.true_arm
+    if not options.compliance_rad_per_nm:
+        return _Held(q, np.zeros(len(q)))
+    load = () if view is None else cell.payloads[view : view + 1]
+    giving = giving_of(arm, options.compliance_rad_per_nm, options.mass_share, ())
+    standing = sagging(arm, giving, q[None], load)
+    return _Held(standing[0], load_torques(arm, giving, standing, load)[0])
+
+
+def _carried(cell: Cell, held: _Held) -> FloatArray:
     """(6, 6) from motions of the target seen from the camera to those of what the arm carries."""
     if cell.options.mount == "eye-to-hand":
         return np.eye(6)
-    return adjoint(_pose(cell, q, np.zeros(12 + len(_arm_sigmas(cell)))))
+    return adjoint(_pose(cell, held, np.zeros(12 + len(_arm_sigmas(cell)))))
 
 
 def _arm_sigmas(cell: Cell) -> FloatArray:
@@ -139,18 +161,14 @@ def _arm_sigmas(cell: Cell) -> FloatArray:
     return np.repeat(each, count)
 
 
-def _pose_slopes(
-    cell: Cell, q: FloatArray, load: Sequence[Payload] = (), *, slack: bool = False
-) -> FloatArray:
+def _pose_slopes(cell: Cell, held: _Held, *, slack: bool = False) -> FloatArray:
     """How `cam_from_target` (6) moves with x, z and the arm, and with the flange's error."""
     size = 12 + len(_arm_sigmas(cell)) + (6 if slack else 0)
-    middle = invert(_pose(cell, q, np.zeros(size), load))
-    return _slopes(lambda it: log(middle @ _pose(cell, q, it, load)), size)
+    middle = invert(_pose(cell, held, np.zeros(size)))
+    return _slopes(lambda it: log(middle @ _pose(cell, held, it)), size)
 
 
-def _pose(
-    cell: Cell, q: FloatArray, change: FloatArray, load: Sequence[Payload] = ()
-) -> FloatArray:
+def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
     arm, count = cell.true_arm, cell.arm.a.size
     a, d, alpha, beta, offset = change[12 : 12 + 5 * count].reshape(5, count)
     moved = replace(
@@ -161,12 +179,10 @@ def _pose(
         beta=arm.beta + beta,
         offset=arm.offset + offset,
     )
-    options, rest, standing = cell.options, change[12 + 5 * count :], q[None]
-    if options.compliance_rad_per_nm:
-        springs = np.array(options.compliance_rad_per_nm) + rest[:count] / _TORQUE_NM
-        giving = giving_of(moved, tuple(springs), options.mass_share, ())
-        standing, rest = sagging(moved, giving, q[None], load), rest[count:]
-    flange = forward(moved, standing)[0] @ exp(rest if len(rest) else np.zeros(6))
+    rest, standing = change[12 + 5 * count :], held.standing
+    if cell.options.compliance_rad_per_nm:
+        standing, rest = standing + rest[:count] / _TORQUE_NM * held.torques, rest[count:]
+    flange = forward(moved, standing[None])[0] @ exp(rest if len(rest) else np.zeros(6))
     x, z = cell.transforms.values()
     robot = flange if cell.options.mount == "eye-in-hand" else invert(flange)
     return invert(robot @ x @ exp(change[:6])) @ z @ exp(change[6:12])

@@ -122,7 +122,7 @@ def sagging(
     sagged = at_rest
     if giving.compliance.any():
         for _ in range(_ROUNDS):
-            sagged = at_rest + giving.compliance * _torques(arm, giving, sagged, payloads)
+            sagged = at_rest + giving.compliance * load_torques(arm, giving, sagged, payloads)
     return np.asarray(sagged)
 
 
@@ -145,7 +145,7 @@ def giving_of(
     )
 
 
-def _torques(
+def load_torques(
     arm: Arm, giving: Giving, joints: FloatArray, payloads: Sequence[Payload]
 ) -> FloatArray:
     """(m, n) by which weight and force turn the joints [N m]: their moments about the axes."""
