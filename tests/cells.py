@@ -11,7 +11,7 @@ from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell
-from visioncal.simulation.records import load_row
+from visioncal.simulation.records import approach_text, load_row
 from visioncal.simulation.second import BOARDS
 from visioncal.transforms import invert, log
 
@@ -25,7 +25,12 @@ def session_of(cell: Cell) -> Session:
         table |= {"matrix": camera.matrix.tolist(), "distortion": camera.distortion.tolist()}
     document = {"schema": 1, "name": "cell", "mount": options.mount, "camera": table}
     views = [
-        View(at, image=f"{at}.png", numbers=load_row(cell.payloads[at]) if cell.payloads else {})
+        View(
+            at,
+            image=f"{at}.png",
+            numbers=load_row(cell.payloads[at]) if cell.payloads else {},
+            text=approach_text(cell, at),
+        )
         for at in range(len(cell.corners))
     ]
     if len(cell.sheets) == 1:
@@ -38,7 +43,8 @@ def session_of(cell: Cell) -> Session:
         document,
         ("view", "stop", "target", "image"),
         tuple(
-            replace(view, stop=stop, text={"target": BOARDS[board]}) for view, stop, board in shown
+            replace(view, stop=stop, text={**view.text, "target": BOARDS[board]})
+            for view, stop, board in shown
         ),
         options.target,
         None,

@@ -20,11 +20,7 @@ def postures(count=12, seed=0):
 
 
 def loads_of(payload, count):
-    return Loads(
-        np.full(count, payload.kg),
-        np.tile(payload.centre_m, (count, 1)),
-        np.tile(payload.force_n, (count, 1)),
-    )
+    return Loads.alike(count, payload.kg, payload.centre_m, payload.force_n)
 
 
 @pytest.mark.parametrize("name", ["ur3e", "ur5e", "ur10e", "generic-6r-1800"])

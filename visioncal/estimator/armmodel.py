@@ -13,10 +13,10 @@ from visioncal.types import FloatArray, Mask
 
 # Columns of a joint's function (see `Robot.function_jacobian`) that a block changes.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
-# What bends under the loads of a stop, and what is the same at all stops.
-COMPLIANCE = "compliance"
-RIGID_BLOCKS = ("links", *_FUNCTIONS)
-BLOCKS = (*RIGID_BLOCKS, COMPLIANCE)
+# What goes by the loads of a stop, and by the side from which it was approached; the others are
+# the same at all stops.
+COMPLIANCE, BACKLASH = "compliance", "backlash"
+_BY_STOP = (COMPLIANCE, BACKLASH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,8 @@ class ArmModel:
         flange_from_reported: (4, 4) the frame of the reported poses in the model's flange.
         weights: The blocks by name with the size of their errors, as a share of the first's:
             `offsets` of the joints, `links` (each by six, behind its joint), `ratios` of the gears,
-            `eccentricity` (sine and cosine of each joint), `compliance` of the joints.
+            `eccentricity` (sine and cosine of each joint), `compliance` and `backlash` of each
+            joint.
         values: (p,) present values [rad], block after block; all are of the first block's size.
         torque_nm: The torque under which a joint whose compliance is 1 rad bends by that [N m].
         yielding: (n,) which joints bend; None for all.
@@ -91,22 +92,40 @@ class ArmModel:
     @cached_property
     def compliance(self) -> FloatArray:
         """(n,) what each joint yields to a torque [rad/(N m)]."""
-        count, at = self.nominal.joint_count, 0
-        for name, weight in self.weights.items():
-            size = block_size(name, count)
-            if name == COMPLIANCE:
-                bends = np.maximum(weight * self.values[at : at + size] / self.torque_nm, 0.0)
-                return bends if self.yielding is None else np.where(self.yielding, bends, 0.0)
+        bends = np.maximum(self._joint_values(COMPLIANCE) / self.torque_nm, 0.0)
+        return bends if self.yielding is None else np.where(self.yielding, bends, 0.0)
+
+    @cached_property
+    def backlash(self) -> FloatArray:
+        """(n,) play of each joint: how far apart it stands when approached from its sides [rad]."""
+        return self._joint_values(BACKLASH)
+
+    def place_of(self, name: str) -> slice:
+        """Where a block's values stand among all; empty where it is not there."""
+        at = 0
+        for block in self.weights:
+            size = block_size(block, self.nominal.joint_count)
+            if block == name:
+                return slice(at, at + size)
             at += size
-        return np.zeros(count)
+        return slice(at, at)
+
+    def _joint_values(self, name: str) -> FloatArray:
+        """The values (n,) of a block that has one a joint; zeros where it is not there."""
+        if name not in self.weights:
+            return np.zeros(self.nominal.joint_count)
+        return np.asarray(self.weights[name] * self.values[self.place_of(name)])
 
     def bent(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Where the joints stand under their loads, as angles (m, n) of the rigid arm [rad].
 
         Args:
             q: (m, n) joint angles [rad].
-            loads: What the flange carries; only the arm's own weight bends it where None.
+            loads: What the flange carries, and from where it came; only the arm's own weight bends
+                it, in the middle of its play, where None.
         """
+        if loads is not None and self.backlash.any():
+            q = q - 0.5 * loads.side[:, None] * self.backlash
         return bent_joints(self.robot, q, self.compliance, loads)
 
     def base_from_flange(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
@@ -139,6 +158,9 @@ class ArmModel:
             (m, 6, p) right perturbations for a unit of each column.
         """
         bent = self.bent(q, loads)
+        if name == BACKLASH:
+            sides = np.zeros(len(q)) if loads is None else loads.side
+            return np.asarray(-0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
         if name == COMPLIANCE:
             torques = self.robot.load_torques(bent, loads) / self.torque_nm
             if self.yielding is not None:
@@ -161,8 +183,15 @@ class ArmModel:
         )
 
 
+def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
+    """The blocks of which stops with such loads can tell something."""
+    bends = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
+    plays = (BACKLASH,) if loads.from_both_sides else ()
+    return ("links", *_FUNCTIONS, *bends, *plays)
+
+
 def block_size(name: str, joints: int) -> int:
     """How many values a block has, for an arm of so many joints."""
-    if name == COMPLIANCE:
+    if name in _BY_STOP:
         return joints
     return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.armmodel import COMPLIANCE, ArmModel, block_size
+from visioncal.estimator.armmodel import COMPLIANCE, ArmModel
 from visioncal.estimator.closure import (
     Closure,
     Edges,
@@ -35,17 +35,6 @@ class Factor:
         return abs(self.value - 1.0) > 3.0 * self.sigma
 
 
-def compliance_columns(model: ArmModel) -> slice:
-    """Where the springs stand among the arm's values."""
-    at = 0
-    for name in model.weights:
-        size = block_size(name, model.nominal.joint_count)
-        if name == COMPLIANCE:
-            return slice(at, at + size)
-        at += size
-    return slice(at, at)
-
-
 def compliance_unit(model: ArmModel) -> float:
     """What compliance a value of 1 stands for [rad/(N m)]."""
     return model.weights[COMPLIANCE] / model.torque_nm
@@ -70,7 +59,7 @@ def bends_seen(
         (m, n) [rad]; NaN where the torque is too small to tell.
     """
     residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    arm = jacobian[:, :, -len(model.values) :][:, :, compliance_columns(model)]
+    arm = jacobian[:, :, -len(model.values) :][:, :, model.place_of(COMPLIANCE)]
     weighted = np.linalg.solve(spread, arm)
     pulled = np.einsum("mij,mi->mj", weighted, residuals)
     square = np.einsum("mij,mij->mj", weighted, arm)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
-from visioncal.estimator.armmodel import COMPLIANCE
+from visioncal.estimator.armmodel import BACKLASH, COMPLIANCE
 from visioncal.estimator.closure import (
     Closure,
     ClosureFit,
@@ -38,10 +38,13 @@ class Blocks:
 
 LEVELS: Mapping[str, Blocks] = MappingProxyType(
     {
-        "offsets": Blocks(("offsets",), ("offsets",)),
-        "geometry": Blocks(("links",), ("links",)),
-        "eccentricity": Blocks(("links", "eccentricity", "ratios"), ("eccentricity", "ratios")),
-        "elastic": Blocks(("links", COMPLIANCE, "eccentricity", "ratios"), (COMPLIANCE,)),
+        "backlash": Blocks((BACKLASH,), (BACKLASH,)),
+        "offsets": Blocks(("offsets", BACKLASH), ("offsets",)),
+        "geometry": Blocks(("links", BACKLASH), ("links",)),
+        "eccentricity": Blocks(
+            ("links", "eccentricity", "ratios", BACKLASH), ("eccentricity", "ratios")
+        ),
+        "elastic": Blocks(("links", COMPLIANCE, "eccentricity", "ratios", BACKLASH), (COMPLIANCE,)),
     }
 )
 _RIGID = Blocks((), ())
@@ -88,9 +91,9 @@ def fit_level(
     plain, gain = data, 0.0
     fit = fit_closure(data, Edges(edges.x, edges.z, data.unchanged))
     errors: dict[str, ArmErrors] = {}
-    if not bases.keys() >= set(blocks.own):
+    if blocks.own and not bases.keys() & set(blocks.own):
         return None
-    for name in blocks.names:
+    for name in (it for it in blocks.names if it in bases):
         found = find_arm_errors(data, fit.edges, bases[name], of_links=True)
         if found is None or not found.is_significant:
             if not errors:

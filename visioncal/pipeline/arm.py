@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.estimator.armmodel import BACKLASH
 from visioncal.estimator.told import EDGES
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
 from visioncal.robot import Robot
+from visioncal.stages.backlash import plays_of
 from visioncal.stages.kinematics import Level
 from visioncal.stages.tell import ArmData, Estimate, Telling, tell
 from visioncal.targets import corner_positions
@@ -18,9 +20,10 @@ _PLACES = 200
 
 
 def telling_of(known: Known) -> Telling | None:
-    """What the stops tell of a calibrated arm; None for a nominal one."""
+    """What the stops tell of a calibrated arm; None for one that stands as stated."""
     found, model = known.kinematics, known.arm_model
-    if found is None or model is None:
+    # In the middle of its play an arm that has nothing but play stands as stated.
+    if found is None or model is None or not found.errors.keys() - {BACKLASH}:
         return None
     targets, boards = tuple(known.session.boards.values()), known.shown(known.used)
     first = np.unique(known.stops, return_index=True)[1]
@@ -49,6 +52,7 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
     document: dict[str, Any] = {
         "level": found.level,
         "levels": [_level(it) for it in found.levels],
+        **_backlash(known),
     }
     if model is None or telling is None:
         return document
@@ -71,6 +75,17 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
         "not_told": list(telling.not_told),
         "stops": _stops(known, telling),
     }
+
+
+def _backlash(known: Known) -> dict[str, list[dict[str, Any]]]:
+    """The play of the joints, where stops were approached from both sides."""
+    if known.arm_model is None:
+        return {}
+    rows = [
+        {"joint": it.joint, "deadband_rad": it.deadband_rad, "sigma_rad": it.sigma_rad}
+        for it in plays_of(known.arm_model, known.solved)
+    ]
+    return {"backlash": rows} if rows else {}
 
 
 def _level(level: Level) -> dict[str, Any]:

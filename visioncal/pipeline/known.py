@@ -304,9 +304,12 @@ class Known:
         return np.array([joints[view] for view in views]).reshape(len(views), count)
 
     def loads(self, views: Sequence[int]) -> Loads:
-        """What the flange carried at some views."""
-        rows = {view.number: view.numbers for view in self.session.views}
-        return loads_of([rows[view] for view in views])
+        """What the flange carried at some views, and from which side the joints came."""
+        rows = {view.number: view for view in self.session.views}
+        return loads_of(
+            [rows[view].numbers for view in views],
+            [rows[view].text.get("approach", "") for view in views],
+        )
 
     def with_readings(self, readings: Readings) -> Self:
         """Takes over an instrument's readings, and makes their poses by the present arm."""

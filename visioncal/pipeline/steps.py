@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import BLOCKS, RIGID_BLOCKS, ArmModel
+from visioncal.estimator.armmodel import ArmModel, blocks_of
 from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
@@ -23,8 +23,9 @@ from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.stages import elastic
+from visioncal.stages import backlash, elastic
 from visioncal.stages.agree import agree
+from visioncal.stages.backlash import plays_of
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clock import set_clock
 from visioncal.stages.detect import detect
@@ -331,8 +332,8 @@ def _arm_told(known: Known) -> Known:
     first = np.unique(known.stops, return_index=True)[1]
     q, loads = known.joints(known.used), known.loads(known.used)
     model = ArmModel.of(robot, q, stated.flange_poses(known.used)).loaded(q, loads)
-    blocks = BLOCKS if robot.masses is not None or loads.any else RIGID_BLOCKS
-    bases = {name: model.columns(name, q[first], loads.chosen(first)) for name in blocks}
+    loads = loads.chosen(first)
+    bases = {name: model.columns(name, q[first], loads) for name in blocks_of(robot, loads)}
     data = stated.closure(known.used).merged(known.stops)
     lost = stated.stated_closure(known.used)
     told = None if lost is None else lost.merged(known.stops)
@@ -420,7 +421,9 @@ def _validate(known: Known) -> Known:
 def _tell(known: Known) -> Known:
     telling = telling_of(known)
     advice = () if telling is None or not telling.advice else (telling.advice,)
-    known = replace(known, telling=telling, notes=(*known.notes, *advice))
+    plays = () if known.arm_model is None else plays_of(known.arm_model, known.solved)
+    played = backlash.remarks(plays)
+    known = replace(known, telling=telling, notes=(*known.notes, *advice, *played))
     springs = springs_told(known)
     if springs is None:
         return known

@@ -14,9 +14,11 @@ NOMINAL = "nominal"
 # What each level frees, for people.
 LEVELS = {
     NOMINAL: "the arm as stated",
+    "backlash": "play of the joints",
     "offsets": "offsets of the joints",
     "geometry": "geometry of the links",
     "eccentricity": "geometry and eccentric gears",
+    "elastic": "geometry, gears, and joints that bend",
 }
 _SYMBOLS = {
     "theta": "\N{GREEK SMALL LETTER THETA}",

@@ -13,9 +13,20 @@ from visioncal.calibration import Calibration, ViewResult
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence, magnification
 from visioncal.files import write_atomically
+from visioncal.recording.elastic import Elastic
 from visioncal.recording.findings import Findings
 from visioncal.recording.kinematics import Kinematics
-from visioncal.report import advice, arm, armplots, content, plots, sources, tools, uncertainty
+from visioncal.report import (
+    advice,
+    arm,
+    armplots,
+    content,
+    plots,
+    sources,
+    springs,
+    tools,
+    uncertainty,
+)
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
@@ -144,6 +155,18 @@ def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str
         "side_plot": "" if workspace is None else armplots.side_map(workspace, stops_m),
         "top_plot": "" if workspace is None else armplots.top_map(workspace, stops_m),
         "has_stops": len(stops_m) > 0,
+        **_springs(calibration),
+    }
+
+
+def _springs(calibration: Calibration) -> dict[str, object]:
+    found = Elastic.of(calibration)
+    if found is None:
+        return {"springs": (), "spring_facts": (), "spring_plot": ""}
+    return {
+        "springs": springs.spring_rows(found),
+        "spring_facts": springs.spring_facts(found),
+        "spring_plot": springs.deflection_against_load(found),
     }
 
 

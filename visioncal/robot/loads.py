@@ -46,22 +46,25 @@ class Masses:
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """What an arm carries and is pushed by at m stops.
+    """What an arm carries and is pushed by at m stops, and from where it came there.
 
     Attributes:
         payload_kg: (m,) mass that the flange carries [kg].
         payload_m: (m, 3) its centre, in the flange's frame [m].
         force_n: (m, 3) external force on the flange's origin, in the base's frame [N].
+        side: (m,) the side from which the joints came to the stop, +1 from above, -1 from below;
+            0 where that is not told, in the middle of their play.
     """
 
     payload_kg: FloatArray
     payload_m: FloatArray
     force_n: FloatArray
+    side: FloatArray
 
     @classmethod
     def none(cls, count: int) -> Self:
         """No load but the arm's own weight."""
-        return cls(np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3)))
+        return cls.alike(count, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     @classmethod
     def alike(
@@ -81,6 +84,7 @@ class Loads:
                 np.broadcast_to(np.asarray(payload_kg, dtype=float), (count,)),
                 np.broadcast_to(np.asarray(payload_m, dtype=float), (count, 3)),
                 np.broadcast_to(np.asarray(force_n, dtype=float), (count, 3)),
+                np.zeros(count),
             )
         except ValueError as error:
             raise DataError(
@@ -103,7 +107,13 @@ class Loads:
 
     def chosen(self, rows: IntArray | Mask) -> "Loads":
         """The loads of some of the stops, by their places or a mask."""
-        return Loads(self.payload_kg[rows], self.payload_m[rows], self.force_n[rows])
+        parts = (self.payload_kg, self.payload_m, self.force_n, self.side)
+        return Loads(*(it[rows] for it in parts))
+
+    @property
+    def from_both_sides(self) -> bool:
+        """Whether stops were approached from either side: only that tells play from an offset."""
+        return bool((self.side > 0.0).any() and (self.side < 0.0).any())
 
 
 def masses_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Masses | None:

@@ -9,12 +9,20 @@ from visioncal.types import FloatArray
 
 _CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
 _FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
+# From which side the joints came to a stop, as the column approach has it.
+SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
 # A payload or a force beyond these is in another unit [kg, N].
 _HEAVIEST_KG, _STRONGEST_N = 2500.0, 25000.0
 
 
-def loads_of(rows: Sequence[Mapping[str, float]]) -> Loads:
-    """The loads of some views by their numbers; where a view says nothing, there is none."""
+def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | None = None) -> Loads:
+    """The loads of some views; where a view says nothing, there is none.
+
+    Args:
+        rows: The views' numbers.
+        approaches: Their cells of the column approach; None where that does not matter.
+    """
+    sides = [SIDES.get(it.strip(), 0.0) for it in approaches or [""] * len(rows)]
 
     def read(*names: str) -> FloatArray:
         return np.array([[row.get(name, 0.0) for name in names] for row in rows])
@@ -23,6 +31,7 @@ def loads_of(rows: Sequence[Mapping[str, float]]) -> Loads:
         read("payload_kg").reshape(-1),
         read(*_CENTRE).reshape(-1, 3),
         read(*_FORCE).reshape(-1, 3),
+        np.array(sides),
     )
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.errors import DataError
 from visioncal.session import columns as known
 from visioncal.session.images import image_path
-from visioncal.session.loads import load_problems
+from visioncal.session.loads import SIDES, load_problems
 from visioncal.types import FloatArray
 
 # Poses in micrometres stay under this many metres, and turns in degrees under this many radians; a
@@ -244,6 +244,10 @@ class _RowReader:
         role = self._take(cells, "role", _role, keep=True)
         numbers = self._numbers(cells)
         text = {name: cell for name, cell in cells.items() if cell}
+        if text.get("approach", "").strip() not in SIDES:
+            self.report(
+                "approach", f'{text["approach"]!r} is no side; "+", "-" or nothing is needed'
+            )
         self._check_sizes(numbers)
         self._check_groups(numbers)
         observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text

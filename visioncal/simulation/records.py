@@ -207,10 +207,10 @@ def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | No
     document = {**_document(cell, name), **_targets(cell), "camera": _camera_table(cell)}
     numbers = list(_report_rows(cell))
     views = [
-        View(at, image=path, numbers=numbers[at], text=_approach_text(cell, at))
+        View(at, image=path, numbers=numbers[at], text=approach_text(cell, at))
         for at, path in enumerate(files)
     ]
-    columns = ("view", "image", *numbers[0], *_approach_text(cell, 0))
+    columns = ("view", "image", *numbers[0], *approach_text(cell, 0))
     return _session(cell, document, columns, views, MemoryImages(files))
 
 
@@ -220,9 +220,9 @@ def _pairs(cell: Cell, name: str) -> Session:
         for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
     ]
     views = [
-        View(view, numbers=row, text=_approach_text(cell, view)) for view, row in enumerate(numbers)
+        View(view, numbers=row, text=approach_text(cell, view)) for view, row in enumerate(numbers)
     ]
-    columns = ("view", *numbers[0], *_approach_text(cell, 0))
+    columns = ("view", *numbers[0], *approach_text(cell, 0))
     document = _document(cell, name)
     if len(cell.sheets) > 1:
         return _session(cell, document | _targets(cell), columns, views, MemoryImages({}))
@@ -324,7 +324,7 @@ def load_row(load: Payload) -> dict[str, float]:
     return {"payload_kg": load.kg} | centre | force
 
 
-def _approach_text(cell: Cell, view: int) -> dict[str, str]:
+def approach_text(cell: Cell, view: int) -> dict[str, str]:
     """The column of the side from which a stop was approached, where that is told."""
     return {} if cell.approach is None else {"approach": "+" if cell.approach[view] > 0 else "-"}
 

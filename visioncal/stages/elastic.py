@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.armmodel import COMPLIANCE, ArmModel
 from visioncal.estimator.bending import (
     Factor,
     bends_seen,
-    compliance_columns,
     compliance_unit,
     flange_bends,
     payload_factor,
@@ -111,7 +110,8 @@ def springs_of(
     """
     torques = model.robot.load_torques(model.bent(q, loads), loads)
     size = len(model.values)
-    spread = result.covariance[-size:, -size:][compliance_columns(model), compliance_columns(model)]
+    springs = model.place_of(COMPLIANCE)
+    spread = result.covariance[-size:, -size:][springs, springs]
     sigmas = compliance_unit(model) * np.sqrt(np.diag(spread))
     told = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _TOLD * prior)
     return Elastic(
