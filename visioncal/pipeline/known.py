@@ -367,20 +367,21 @@ class Known:
         """(m,) which stop of the robot each view was taken at, numbered from 0.
 
         Views of one stop share the robot's error. Where the session does not number its stops,
-        views with the same reported pose are of one. Poses that were measured by others are not
-        told apart from the robot's: of several boards, each has stops of its own then.
+        views with the same reported pose and load are of one. Poses that were measured by others
+        are not told apart from the robot's: of several boards, each has stops of its own then.
         """
         declared = {view.number: view.stop for view in self.session.views}
+        loads = self.loads(views).rows
         keys: dict[object, int] = {}
         stops = np.array(
             [
                 keys.setdefault(
-                    self.base_from_flange[view].tobytes()
+                    self.base_from_flange[view].tobytes() + load.tobytes()
                     if (stop := declared[view]) is None
                     else stop,
                     len(keys),
                 )
-                for view in views
+                for view, load in zip(views, loads, strict=True)
             ],
             dtype=np.int64,
         )

@@ -34,6 +34,7 @@ from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
+from visioncal.stages.loads import check_elastic, check_poses, check_stops
 from visioncal.stages.measured import doubts as doubts_of_measured
 from visioncal.stages.measured import remarks as remarks_on_measured
 from visioncal.stages.motion import waits_for_clock
@@ -100,6 +101,7 @@ def _reported(known: Known, session: Session) -> Known:
             next_step=" ".join(known.session.warnings)
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
+    _check_loads(known)
     return known
 
 
@@ -116,6 +118,13 @@ def _clock(known: Known) -> Known:
         notes=(*known.notes, *clocked.notes),
     ).noting(clocked.rejections, clocked.warnings)
     return _reported(known, replace(session, views=clocked.views))
+def _check_loads(known: Known) -> None:
+    """Refuses loads that tell nothing."""
+    views = tuple(known.base_from_flange)
+    declared = {it.number: it.stop for it in known.session.views}
+    check_stops(known.loads(views), views, [declared[it] for it in views])
+    check_poses(known.loads(views), known.flange_poses(views))
+    check_elastic(known.level, known.robot, known.loads(views))
 
 
 def _readings(known: Known) -> Known:

@@ -111,6 +111,12 @@ class Loads:
         return Loads(*(it[rows] for it in parts))
 
     @property
+    def rows(self) -> FloatArray:
+        """(m, 8) all that is said of each stop, for comparison."""
+        parts = [self.payload_kg[:, None], self.payload_m, self.force_n, self.side[:, None]]
+        return np.concatenate(parts, axis=1)
+
+    @property
     def from_both_sides(self) -> bool:
         """Whether stops were approached from either side: only that tells play from an offset."""
         return bool((self.side > 0.0).any() and (self.side < 0.0).any())

@@ -41,10 +41,14 @@ class CameraTable(_TableModel):
 
 
 class RobotTable(_TableModel):
-    """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json."""
+    """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
+
+    gravity_m_s2: its acceleration in the robot's base, for a base that does not stand upright.
+    """
 
     model: str
     tip: str | None = None
+    gravity_m_s2: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None
 
 
 class InstrumentTable(_TableModel):

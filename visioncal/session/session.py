@@ -337,6 +337,8 @@ def _build(
     if robot is not None and robot_document is None:
         try:
             robot_document = read_robot_document(robot.model, tip=robot.tip, folder=folder)
+            if robot.gravity_m_s2 is not None:
+                robot_document |= {"gravity_m_s2": robot.gravity_m_s2}
         except DataError as error:
             warnings.append(f"session.toml: robot.model: {error}")
     return Session(
