@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from visioncal.frames.seen_frame import seen_frame
     from visioncal.frames.sight import Sight
     from visioncal.pipeline import calibrate
+    from visioncal.robot import Loads
     from visioncal.session import Session
     from visioncal.verification import verify
 
@@ -45,6 +46,7 @@ _HOMES = {
     "DataError": "visioncal.errors",
     "DegenerateError": "visioncal.errors",
     "DriverError": "visioncal.errors",
+    "Loads": "visioncal.robot",
     "Located": "visioncal.frames.located",
     "Plane": "visioncal.frames.plane",
     "Session": "visioncal.session",
@@ -67,6 +69,7 @@ __all__ = [
     "DataError",
     "DegenerateError",
     "DriverError",
+    "Loads",
     "Located",
     "Plane",
     "Session",
