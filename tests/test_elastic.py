@@ -7,6 +7,7 @@ import pytest
 from bound import compliance_bound
 from cells import calibrated
 from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded, predicted_m
+from planned import postures_in_view, true_cell
 from test_kinematics import GOOD, WRONG_LINKS, error_m
 
 import visioncal
@@ -14,9 +15,12 @@ from visioncal.compensation.correction import correct
 from visioncal.errors import DataError
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.workspace import postures
+from visioncal.exports import document
 from visioncal.pipeline.result import result_of
+from visioncal.planning.information import stop_factors
+from visioncal.planning.purposes import PURPOSES
 from visioncal.robot import Loads, load_robot
-from visioncal.simulation import Payload, simulate
+from visioncal.simulation import CellOptions, Payload, simulate
 from visioncal.stages.elastic import deflection_words
 from visioncal.transforms import invert, log
 
@@ -97,6 +101,29 @@ def test_corrected_targets_bring_the_bent_arm_to_its_place(carrying):
     # Three looks at a bent cobot leave some tenths of a microradian.
     assert sent.q == pytest.approx(q, abs=2e-6)
     assert correct(result, wanted, q).q != pytest.approx(q, abs=1e-4)
+
+
+def test_files_of_others_say_that_they_hold_no_springs(carrying):
+    arm = result_of(carrying[1])
+    written = document(arm, "robot-dh")
+    assert any("its joints bend under load" in it for it in written.warnings)
+    assert "its joints bend under load" in written.text
+    rigid = replace(arm, stages={"kinematics": arm.stages["kinematics"]})
+    assert not any("bend" in it for it in document(rigid, "robot-dh").warnings)
+
+
+def test_stops_are_planned_that_tell_springs():
+    options = CellOptions(robot="ur10e")
+    cell, q = true_cell(options), postures_in_view(options, 12)
+    springs, rigid = (stop_factors(cell, PURPOSES[it], q) for it in ("elastic", "kinematics"))
+    # One unknown a joint more; the upright first axis bears no weight, wherever the arm stands.
+    assert springs.shape[2] == rigid.shape[2] + 6
+    told = np.abs(springs[:, :, -6:]).max(axis=(0, 1))
+    assert told[0] < 1e-6 * told[1]
+    assert told[1:5].min() > 0.0
+    bare = replace(cell, robot=replace(cell.robot, masses=None))
+    with pytest.raises(DataError, match="does not tell the masses of its links"):
+        stop_factors(bare, PURPOSES["elastic"], q)
 
 
 def test_a_payload_that_is_not_as_stated_is_told(carrying):

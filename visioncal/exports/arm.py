@@ -17,6 +17,7 @@ from visioncal.robot import (
     Convention,
     DHTable,
     Robot,
+    bent_joints,
     parallel_axes,
     table_from_document,
     table_of,
@@ -42,6 +43,7 @@ class ArmContent:
             calibration.json has it; empty where it has none.
         convention: In which form joints are tabulated, where that was said.
         calibration_hash: What marks the arm for its driver, where that was said.
+        compliance: (n,) what its joints yield to a torque [rad/(N m)]; empty for a rigid arm.
     """
 
     nominal: Robot
@@ -51,6 +53,21 @@ class ArmContent:
     sigma_mm: Mapping[str, float]
     convention: Convention | None = None
     calibration_hash: str | None = None
+    compliance: tuple[float, ...] = ()
+
+    @property
+    def sagging(self) -> str:
+        """What no file holds of an arm whose joints bend, and what that costs; else empty."""
+        if not any(self.compliance):
+            return ""
+        q = postures(self.robot)
+        stands = self.robot.base_from_flange(bent_joints(self.robot, q, np.array(self.compliance)))
+        away = stands[:, :3, 3] - self.robot.base_from_flange(q)[:, :3, 3]
+        most_mm = 1e3 * float(np.linalg.norm(away, axis=1).max())
+        return (
+            "its joints bend under load, which has no place in it: this is the arm without weight. "
+            f"Under its own it stands off by up to {most_mm:.2g} mm (visioncal correct counts that)"
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -64,6 +81,7 @@ class ArmContent:
             worth,
             f"{self.robot.name}, calibrated: base_from_flange, the pose of {self.robot.tip} in the "
             "base; the calibration's transforms go with this arm, not with the nominal one",
+            *([self.sagging] if self.sagging else []),
         ]
 
     @property
@@ -138,6 +156,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         found.get("workspace_sigma_mm", {}),
         None if selection.convention is None else _convention(selection.convention),
         selection.calibration_hash,
+        tuple(source.compliance.tolist()),
     )
 
 
