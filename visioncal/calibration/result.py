@@ -137,7 +137,9 @@ class Calibration:
                 "this calibration holds no robot model.",
                 next_step="Name one in the session's [robot] table and calibrate again.",
             )
-        return arm.base_from_flange(bent_joints(arm, q, self.compliance, loads))
+        return arm.base_from_flange(
+            bent_joints(arm, q, self.compliance, loads, self.weight_moments)
+        )
 
     @cached_property
     def compliance(self) -> FloatArray:
@@ -157,6 +159,15 @@ class Calibration:
         """The arm as it was calibrated, or else its nominal model, where there is one."""
         found = self.stages.get("kinematics", {})
         return Robot.from_document(found["robot"]) if "robot" in found else self.robot
+
+    @cached_property
+    def weight_moments(self) -> FloatArray | None:
+        """(n, 4 n) compliance times unknown masses and first moments; None where none were found.
+
+        What `bent_joints` takes of an arm whose model does not tell the masses of its links.
+        """
+        rows = self.stages.get("elastic", {}).get("weight_moments")
+        return None if rows is None else np.array(rows, dtype=float)
 
     def save(self, path: Path | str) -> None:
         """Writes calibration.json, whole or not at all."""

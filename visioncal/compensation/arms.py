@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.robot import Loads, Robot
+from visioncal.robot import Loads, Robot, bends
 from visioncal.robot.inverse import Inverse
 from visioncal.types import FloatArray
 
@@ -28,12 +28,15 @@ class CalibratedArm:
         real: What the calibration found.
         inverse: The inverse kinematics of the real arm without a load.
         compliance: (n,) what its joints yield to a torque [rad/(N m)].
+        weight_moments: (n, 4 n) how they yield to the weight of links of unknown masses; None
+            where these are known (see `bent_joints`).
     """
 
     nominal: Robot
     real: Robot
     inverse: Inverse
     compliance: FloatArray
+    weight_moments: FloatArray | None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
@@ -51,7 +54,7 @@ class CalibratedArm:
                 "to reach a position.",
                 culprits=[real.name],
             )
-        return cls(nominal, real, Inverse(real), calibration.compliance)
+        return cls(nominal, real, Inverse(real), calibration.compliance, calibration.weight_moments)
 
     def unbent(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Where to send the joints so that under their loads they stand elsewhere.
@@ -63,9 +66,9 @@ class CalibratedArm:
         Returns:
             (m, n) what their encoders have to tell [rad].
         """
-        if not self.compliance.any():
+        if not self.compliance.any() and self.weight_moments is None:
             return q
-        return np.asarray(q - self.compliance * self.real.load_torques(q, loads))
+        return np.asarray(q - bends(self.real, q, self.compliance, loads, self.weight_moments))
 
     def turns_deg_per_mm(self, q: FloatArray) -> FloatArray:
         """How far joints turn at the most for a millimetre of the flange, its rotation kept.

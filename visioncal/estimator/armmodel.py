@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.estimator.arm import TWIST_UNITS, ArmErrors
-from visioncal.robot import Loads, Robot, bent_joints
+from visioncal.robot import Loads, Robot, WeightFunctions, bent_joints
 from visioncal.transforms import adjoint, invert, log, mean_transform
 from visioncal.types import FloatArray, Mask
 
@@ -15,8 +15,7 @@ from visioncal.types import FloatArray, Mask
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
 # What goes by the loads of a stop, and by the side from which it was approached; the others are
 # the same at all stops.
-COMPLIANCE, BACKLASH = "compliance", "backlash"
-_BY_STOP = (COMPLIANCE, BACKLASH)
+COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,7 @@ class ArmModel:
         weights: The blocks by name with the size of their errors, as a share of the first's:
             `offsets` of the joints, `links` (each by six, behind its joint), `ratios` of the gears,
             `eccentricity` (sine and cosine of each joint), `compliance` and `backlash` of each
-            joint.
+            joint, and how far it yields to the `weight` of links whose masses are not known.
         values: (p,) present values [rad], block after block; all are of the first block's size.
         torque_nm: The torque under which a joint whose compliance is 1 rad bends by that [N m].
         yielding: (n,) which joints bend; None for all.
@@ -69,8 +68,8 @@ class ArmModel:
         sizes = sum(it.basis.shape[2] for it in errors.values())
         first = next(iter(errors.values())).sigma
         weights = {name: it.sigma / first for name, it in errors.items()}
-        bends = errors.get(COMPLIANCE)
-        yielding = None if bends is None else np.any(bends.basis, axis=(0, 1)) > 0
+        springs = errors.get(COMPLIANCE)
+        yielding = None if springs is None else np.any(springs.basis, axis=(0, 1)) > 0
         return replace(self, weights=weights, values=np.zeros(sizes), yielding=yielding)
 
     def moved(self, step: FloatArray) -> "ArmModel":
@@ -92,19 +91,35 @@ class ArmModel:
     @cached_property
     def compliance(self) -> FloatArray:
         """(n,) what each joint yields to a torque [rad/(N m)]."""
-        bends = np.maximum(self._joint_values(COMPLIANCE) / self.torque_nm, 0.0)
-        return bends if self.yielding is None else np.where(self.yielding, bends, 0.0)
+        springs = np.maximum(self._joint_values(COMPLIANCE) / self.torque_nm, 0.0)
+        return springs if self.yielding is None else np.where(self.yielding, springs, 0.0)
 
     @cached_property
     def backlash(self) -> FloatArray:
         """(n,) play of each joint: how far apart it stands when approached from its sides [rad]."""
         return self._joint_values(BACKLASH)
 
+    @cached_property
+    def functions(self) -> WeightFunctions:
+        """What the weight of links of unknown masses may do."""
+        return WeightFunctions.of(self.nominal)
+
+    @cached_property
+    def moments(self) -> FloatArray | None:
+        """(n, 4 n) compliances times unknown masses and first moments; None without any."""
+        if WEIGHT not in self.weights:
+            return None
+        return self.functions.moments(self.weights[WEIGHT] * self.values[self.place_of(WEIGHT)])
+
+    def size_of(self, name: str) -> int:
+        """How many values a block has."""
+        return self.functions.size if name == WEIGHT else block_size(name, self.nominal.joint_count)
+
     def place_of(self, name: str) -> slice:
         """Where a block's values stand among all; empty where it is not there."""
         at = 0
         for block in self.weights:
-            size = block_size(block, self.nominal.joint_count)
+            size = self.size_of(block)
             if block == name:
                 return slice(at, at + size)
             at += size
@@ -126,7 +141,7 @@ class ArmModel:
         """
         if loads is not None and self.backlash.any():
             q = q - 0.5 * loads.side[:, None] * self.backlash
-        return bent_joints(self.robot, q, self.compliance, loads)
+        return bent_joints(self.robot, q, self.compliance, loads, self.moments)
 
     def base_from_flange(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Where the reported frame stands (m, 4, 4); see `bent`."""
@@ -137,7 +152,7 @@ class ArmModel:
         count, at = self.nominal.joint_count, 0
         placements, functions = np.zeros((count + 1, 6)), np.zeros((count, 4))
         for name, weight in self.weights.items():
-            size = block_size(name, count)
+            size = self.size_of(name)
             block = weight * values[at : at + size]
             at += size
             if name == "links":
@@ -161,6 +176,8 @@ class ArmModel:
         if name == BACKLASH:
             sides = np.zeros(len(q)) if loads is None else loads.side
             return np.asarray(-0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
+        if name == WEIGHT:
+            return np.asarray(self.robot.axis_jacobian(bent) @ self.functions.bends(bent))
         if name == COMPLIANCE:
             torques = self.robot.load_torques(bent, loads) / self.torque_nm
             if self.yielding is not None:
@@ -185,13 +202,14 @@ class ArmModel:
 
 def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
     """The blocks of which stops with such loads can tell something."""
-    bends = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
+    springs = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
+    weighs = () if robot.masses is not None else (WEIGHT,)
     plays = (BACKLASH,) if loads.from_both_sides else ()
-    return ("links", *_FUNCTIONS, *bends, *plays)
+    return ("links", *_FUNCTIONS, *springs, *weighs, *plays)
 
 
 def block_size(name: str, joints: int) -> int:
-    """How many values a block has, for an arm of so many joints."""
-    if name in _BY_STOP:
+    """How many values a block has, for an arm of so many joints; of all but `weight`."""
+    if name in (COMPLIANCE, BACKLASH):
         return joints
     return (6 if name == "links" else len(_FUNCTIONS[name])) * joints

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from visioncal.estimator.arm import ArmErrors, find_arm_errors
-from visioncal.estimator.armmodel import BACKLASH, COMPLIANCE
+from visioncal.estimator.armmodel import BACKLASH, COMPLIANCE, WEIGHT
 from visioncal.estimator.closure import (
     Closure,
     ClosureFit,
@@ -44,7 +44,9 @@ LEVELS: Mapping[str, Blocks] = MappingProxyType(
         "eccentricity": Blocks(
             ("links", "eccentricity", "ratios", BACKLASH), ("eccentricity", "ratios")
         ),
-        "elastic": Blocks(("links", COMPLIANCE, "eccentricity", "ratios", BACKLASH), (COMPLIANCE,)),
+        "elastic": Blocks(
+            ("links", COMPLIANCE, WEIGHT, "eccentricity", "ratios", BACKLASH), (COMPLIANCE, WEIGHT)
+        ),
     }
 )
 _RIGID = Blocks((), ())

@@ -17,7 +17,6 @@ from visioncal.robot import (
     Convention,
     DHTable,
     Robot,
-    bent_joints,
     parallel_axes,
     table_from_document,
     table_of,
@@ -43,7 +42,8 @@ class ArmContent:
             calibration.json has it; empty where it has none.
         convention: In which form joints are tabulated, where that was said.
         calibration_hash: What marks the arm for its driver, where that was said.
-        compliance: (n,) what its joints yield to a torque [rad/(N m)]; empty for a rigid arm.
+        sag_mm: How far the flange of an arm whose joints bend stands off at the most under its own
+            weight [mm]; zero for a rigid one.
     """
 
     nominal: Robot
@@ -53,20 +53,17 @@ class ArmContent:
     sigma_mm: Mapping[str, float]
     convention: Convention | None = None
     calibration_hash: str | None = None
-    compliance: tuple[float, ...] = ()
+    sag_mm: float = 0.0
 
     @property
     def sagging(self) -> str:
         """What no file holds of an arm whose joints bend, and what that costs; else empty."""
-        if not any(self.compliance):
+        if not self.sag_mm:
             return ""
-        q = postures(self.robot)
-        stands = self.robot.base_from_flange(bent_joints(self.robot, q, np.array(self.compliance)))
-        away = stands[:, :3, 3] - self.robot.base_from_flange(q)[:, :3, 3]
-        most_mm = 1e3 * float(np.linalg.norm(away, axis=1).max())
         return (
             "its joints bend under load, which has no place in it: this is the arm without weight. "
-            f"Under its own it stands off by up to {most_mm:.2g} mm (visioncal correct counts that)"
+            f"Under its own it stands off by up to {self.sag_mm:.2g} mm (visioncal correct counts "
+            "that)"
         )
 
     @property
@@ -156,8 +153,18 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         found.get("workspace_sigma_mm", {}),
         None if selection.convention is None else _convention(selection.convention),
         selection.calibration_hash,
-        tuple(source.compliance.tolist()),
+        _sag_mm(source),
     )
+
+
+def _sag_mm(calibration: Calibration) -> float:
+    """How far the flange stands off under its own weight at worst, over the workspace [mm]."""
+    arm = calibration.calibrated_robot
+    if arm is None or "elastic" not in calibration.stages:
+        return 0.0
+    q = postures(arm)
+    away = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
+    return 1e3 * float(np.linalg.norm(away, axis=1).max())
 
 
 def omission_mm(robot: Robot) -> float:

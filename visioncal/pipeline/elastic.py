@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.armmodel import COMPLIANCE
+from visioncal.estimator.armmodel import COMPLIANCE, WEIGHT
 from visioncal.pipeline.known import Known
 from visioncal.stages.elastic import Elastic, Spring, springs_of
 
@@ -13,12 +13,13 @@ from visioncal.stages.elastic import Elastic, Spring, springs_of
 def springs_told(known: Known) -> Elastic | None:
     """What the stops tell of the arm's springs; None where they tell of none."""
     found, model = known.kinematics, known.arm_model
-    if found is None or model is None or COMPLIANCE not in found.errors:
+    if found is None or model is None or not found.errors.keys() & {COMPLIANCE, WEIGHT}:
         return None
     first = np.unique(known.stops, return_index=True)[1]
     data = known.closure(known.used).merged(known.stops)
     q, loads = known.joints(known.used)[first], known.loads(known.used).chosen(first)
-    prior = found.errors[COMPLIANCE].sigma / model.torque_nm
+    springs = found.errors.get(COMPLIANCE)
+    prior = 0.0 if springs is None else springs.sigma / model.torque_nm
     return springs_of(data, known.solved, model, q, loads, prior)
 
 
@@ -38,6 +39,8 @@ def elastic_document(known: Known) -> dict[str, Any] | None:
         },
         "stops": list(_stops(known, found)),
     }
+    if found.weight_moments is not None:
+        document["weight_moments"] = found.weight_moments.tolist()
     if found.payload is not None:
         document["payload_factor"] = {
             "value": found.payload.value,

@@ -19,7 +19,7 @@ from visioncal.robot.files import (
     robot_file,
     robot_names,
 )
-from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bent_joints
+from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
 from visioncal.robot.model import BODY_KEYS, Robot
 from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
@@ -30,6 +30,7 @@ from visioncal.robot.tables import (
     table_from_document,
 )
 from visioncal.robot.urdfs import corrected_tip, corrected_urdf
+from visioncal.robot.weights import WeightFunctions
 from visioncal.robot.writing import (
     small_urdf,
     table_toml,
@@ -52,6 +53,8 @@ __all__ = [
     "Masses",
     "Recognised",
     "Robot",
+    "WeightFunctions",
+    "bends",
     "bent_joints",
     "convert_table",
     "corrected_tip",

@@ -120,6 +120,30 @@ def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArr
     return np.array(held).reshape(positions.shape)
 
 
+def weight_slopes(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
+    """How the joints would be turned by the weight of what hangs on them.
+
+    Args:
+        model: Of `build_model`.
+        positions: (m, n) effective positions [rad or m].
+        gravity: (3,) in the base's frame [m/s^2].
+
+    Returns:
+        (m, n, 4 n) derivatives of the torques by each body's mass [kg] and first moments [kg m].
+    """
+    import pinocchio as pin
+
+    model.gravity.linear = gravity
+    data, count = model.createData(), model.nv
+    still = np.zeros(count)
+    rows = np.empty((len(positions), count, count, 4))
+    for row, configuration in enumerate(positions):
+        found = pin.computeJointTorqueRegressor(model, data, configuration, still, still)
+        # Ten a body: mass, first moments, and inertias, which do not matter at rest.
+        rows[row] = -found.reshape(count, count, 10)[:, :, :4]
+    return rows.reshape(len(positions), count, 4 * count)
+
+
 def chain_of_urdf(table: Table) -> tuple[Chain, str, Masses | None]:
     """Reads the chain from a URDF's root to the tip: the chain, the tip's name, and its masses.
 

@@ -196,7 +196,11 @@ def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> F
 
 
 def bent_joints(
-    robot: "Robot", q: FloatArray, compliance: FloatArray, loads: Loads | None = None
+    robot: "Robot",
+    q: FloatArray,
+    compliance: FloatArray,
+    loads: Loads | None = None,
+    moments: FloatArray | None = None,
 ) -> FloatArray:
     """Where the joints stand under their loads.
 
@@ -205,13 +209,29 @@ def bent_joints(
         q: (m, n) joint angles as the encoders have them [rad].
         compliance: (n,) what each joint yields to a torque [rad/(N m)].
         loads: What it carries; nothing where None.
+        moments: (n, 4 n) compliance times masses and first moments of links that weigh what is not
+            known, joint by joint; None where it is known, or they weigh nothing.
 
     Returns:
         (m, n) joint angles of the rigid arm that stands likewise [rad].
     """
     bent = np.asarray(q, dtype=float)
-    if not compliance.any():
+    if not compliance.any() and moments is None:
         return bent
     for _ in range(_LOOKS):
-        bent = q + compliance * load_torques(robot, bent, loads)
+        bent = q + bends(robot, bent, compliance, loads, moments)
     return bent
+
+
+def bends(
+    robot: "Robot",
+    stands: FloatArray,
+    compliance: FloatArray,
+    loads: Loads | None = None,
+    moments: FloatArray | None = None,
+) -> FloatArray:
+    """How far the joints (m, n) yield where they stand at (m, n) [rad]; see `bent_joints`."""
+    yields = compliance * load_torques(robot, stands, loads)
+    if moments is None:
+        return np.asarray(yields)
+    return np.asarray(yields + np.einsum("mjk,jk->mj", robot.weight_slopes(stands), moments))

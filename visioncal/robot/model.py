@@ -20,6 +20,7 @@ from visioncal.robot.kinematics import (
     gravity_torques,
     joint_frames,
     placement_derivatives,
+    weight_slopes,
 )
 from visioncal.robot.loads import Loads, Masses, gravity_of, load_torques, masses_of_rows
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
@@ -231,6 +232,21 @@ class Robot:
             DataError: The number of joints differs from the robot's.
         """
         return gravity_torques(self._model, self._effective(q), self.gravity)
+
+    def weight_slopes(self, q: FloatArray) -> FloatArray:
+        """How the weight of what hangs on the joints turns them.
+
+        Args:
+            q: (m, n) joint angles [rad].
+
+        Returns:
+            (m, n, 4 n) derivatives of the torques [N m] by mass [kg] and first moments [kg m] of
+            what moves with each joint.
+
+        Raises:
+            DataError: The number of joints differs from the robot's.
+        """
+        return weight_slopes(self._model, self._effective(q), self.gravity)
 
     def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """What weight, payload and force turn the joints by; see `loads.load_torques`."""

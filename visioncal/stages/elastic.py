@@ -79,6 +79,8 @@ class Elastic:
         payload: By which factor payload and force bend the arm beyond what is stated; None where
             nothing hung on the flange.
         weighs: Whether the model of the arm tells the masses of its links.
+        weight_moments: (n, 4 n) how the joints yield to the weight of links whose masses are not
+            known (see `bent_joints`); None where they are, or where they hardly yield.
     """
 
     springs: tuple[Spring, ...]
@@ -88,6 +90,7 @@ class Elastic:
     payload_kg: FloatArray
     payload: Factor | None
     weighs: bool
+    weight_moments: FloatArray | None
 
     @property
     def untold(self) -> tuple[str, ...]:
@@ -112,16 +115,21 @@ def springs_of(
     size = len(model.values)
     springs = model.place_of(COMPLIANCE)
     spread = result.covariance[-size:, -size:][springs, springs]
-    sigmas = compliance_unit(model) * np.sqrt(np.diag(spread))
+    sigmas = np.full(model.nominal.joint_count, prior)
+    bends_rad = np.full(torques.shape, np.nan)
+    if COMPLIANCE in model.weights:
+        sigmas = compliance_unit(model) * np.sqrt(np.diag(spread))
+        bends_rad = bends_seen(data, result.edges, result.noise, model, torques)
     told = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _TOLD * prior)
     return Elastic(
         tuple(_springs(model, np.minimum(sigmas, prior), told, torques)),
         torques,
-        bends_seen(data, result.edges, result.noise, model, torques),
+        bends_rad,
         1e3 * flange_bends(model, q, loads),
         loads.payload_kg,
         payload_factor(data, result.edges, result.noise, model, q, loads),
         model.nominal.masses is not None,
+        model.moments,
     )
 
 
@@ -143,7 +151,13 @@ def remarks(elastic: Elastic) -> Iterator[str]:
             f"The joints bend under load: their stiffness is {words}. At these stops that moves "
             f"the flange by up to {figure(float(elastic.sag_mm.max()))} mm."
         )
-    if elastic.untold:
+    if elastic.weight_moments is not None:
+        yield (
+            "The arm yields to its own weight, of which its model tells nothing: how far, is told "
+            "at every posture, and counted. Stiffness is told by payload_kg that changes, or by "
+            "mass_kg and com_m in the joints' table."
+        )
+    elif elastic.untold:
         several = len(elastic.untold) > 1
         yield (
             f"{some_of(elastic.untold)} {'are' if several else 'is'} not seen to bend under the "
