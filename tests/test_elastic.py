@@ -63,6 +63,8 @@ def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
 
 def test_springs_are_told_to_their_bound(carrying):
     cell, known = carrying
+    # Some disagree with the arm as stated, which does not bend; they come back.
+    assert len(known.used) == len(cell.corners)
     bound = compliance_bound(cell)
     for at, spring in enumerate(known.elastic.springs[1:5], start=1):
         assert spring.is_told
