@@ -7,6 +7,7 @@ import rerun as rr
 
 from visioncal.calibration import Calibration
 from visioncal.recording import paths
+from visioncal.recording.elastic import Elastic
 from visioncal.recording.kinematics import Kinematics, Level, Parameter, joint_words
 from visioncal.recording.notes import plain
 from visioncal.recording.numbers import decimals_for, fixed, signed, significant
@@ -31,9 +32,10 @@ class ParameterRow:
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
     """Logs what is to be said of the arm, where levels of it were tried."""
-    found = Kinematics.of(calibration)
+    found, springs = Kinematics.of(calibration), Elastic.of(calibration)
     if found is not None:
-        text = rr.TextDocument(markdown(found), media_type=rr.MediaType.MARKDOWN)
+        words = markdown(found) + ("" if springs is None else "\n".join(_springs(springs)))
+        text = rr.TextDocument(words, media_type=rr.MediaType.MARKDOWN)
         stream.log(paths.ARM_NOTE, text, static=True)
 
 
@@ -76,6 +78,21 @@ def _level(level: Level, *, taken: bool) -> str:
     figures = (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
     cells = [words, str(level.unknowns), *("" if it is None else f"{it:.2g}" for it in figures)]
     return f"| {' | '.join([*cells, f'{level.likelihood_ratio:.0f}'])} |"
+
+
+def _springs(found: Elastic) -> Iterator[str]:
+    yield from ("", "", "## Joints that bend", "")
+    yield "| joint | stiffness kN m/rad | sigma | torque N m |"
+    yield "|---|---:|---:|---:|"
+    for it in found.springs:
+        told = it.stiffness is not None and it.stiffness_sigma is not None
+        stiffness = f"{1e-3 * it.stiffness:.4g}" if it.stiffness is not None else "taken for rigid"
+        sigma = significant(1e-3 * it.stiffness_sigma) if told and it.stiffness_sigma else ""
+        low, high = (f"{round(torque, 1) + 0.0:g}" for torque in it.torque_nm)
+        yield f"| {plain(joint_words(it.joint))} | {stiffness} | {sigma} | {low} to {high} |"
+    median, most = map(significant, found.sag_mm)
+    yield ""
+    yield f"The loads of the stops move the flange by {median} mm in the median, {most} mm at most."
 
 
 def _worth_over_workspace(found: Kinematics) -> Iterator[str]:
