@@ -1,17 +1,46 @@
-"""The springs of a calibrated arm, as calibration.json has them."""
+"""The springs of a calibrated arm: what loads can tell, what they do, and how that is written."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from visioncal.estimator.armmodel import COMPLIANCE, WEIGHT
 from visioncal.pipeline.known import Known
+from visioncal.stages import backlash, elastic
+from visioncal.stages.backlash import plays_of
 from visioncal.stages.elastic import Elastic, Spring, springs_of
+from visioncal.stages.loads import check_elastic, check_poses, check_stops
 
 
-def springs_told(known: Known) -> Elastic | None:
-    """What the stops tell of the arm's springs; None where they tell of none."""
+def check_loads(known: Known) -> None:
+    """Refuses loads that tell nothing.
+
+    Raises:
+        DataError: Views of one stop differ in them, or springs are asked for that nothing bends.
+        DegenerateError: They change while the arm stands still.
+    """
+    views = tuple(known.base_from_flange)
+    declared = {it.number: it.stop for it in known.session.views}
+    check_stops(known.loads(views), views, [declared[it] for it in views])
+    check_poses(known.loads(views), known.flange_poses(views))
+    check_elastic(known.level, known.robot, known.loads(views))
+
+
+def with_springs(known: Known) -> Known:
+    """Adds what the stops tell of the arm's springs, and of the play in its joints."""
+    plays = () if known.arm_model is None else plays_of(known.arm_model, known.solved)
+    known = replace(known, notes=(*known.notes, *backlash.remarks(plays)))
+    found = _springs(known)
+    if found is None:
+        return known
+    known = replace(known, elastic=found, notes=(*known.notes, *elastic.remarks(found)))
+    return known.noting((), elastic.doubts(found))
+
+
+def _springs(known: Known) -> Elastic | None:
+    """What the stops tell of the springs; None for a rigid arm."""
     found, model = known.kinematics, known.arm_model
     if found is None or model is None or not found.errors.keys() & {COMPLIANCE, WEIGHT}:
         return None

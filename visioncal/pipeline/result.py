@@ -203,6 +203,20 @@ def _further(known: Known) -> dict[str, Any]:
         documents["boards"] = {
             names[it]: _board(known, known.free, it) for it in sorted(known.boards)
         }
+    documents |= _arm(known)
+    if known.diagnosis is not None:
+        documents["uncertainty"] = _uncertainty(known, known.diagnosis)
+    conditions, fit = conditions_document(known), fit_document(known)
+    if conditions:
+        documents["conditions"] = conditions
+    if fit is not None:
+        documents["joint_fit"] = fit
+    return documents
+
+
+def _arm(known: Known) -> dict[str, Any]:
+    """What was found of the arm."""
+    documents: dict[str, Any] = {}
     if known.arm is not None:
         documents["arm_errors"] = {
             "sigma_mm": 1e3 * LEVER_M * known.arm.sigma,
@@ -216,13 +230,6 @@ def _further(known: Known) -> dict[str, Any]:
     springs = elastic_document(known)
     if springs is not None:
         documents["elastic"] = springs
-    if known.diagnosis is not None:
-        documents["uncertainty"] = _uncertainty(known, known.diagnosis)
-    conditions, fit = conditions_document(known), fit_document(known)
-    if conditions:
-        documents["conditions"] = conditions
-    if fit is not None:
-        documents["joint_fit"] = fit
     return documents
 
 

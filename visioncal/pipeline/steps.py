@@ -12,20 +12,18 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import ArmModel, blocks_of
 from visioncal.estimator.joint import Arm
 from visioncal.estimator.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
-from visioncal.pipeline.elastic import springs_told
+from visioncal.pipeline.choosing import arm_told, with_views_back
+from visioncal.pipeline.elastic import check_loads, with_springs
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.stages import backlash, elastic
 from visioncal.stages.agree import agree
-from visioncal.stages.backlash import plays_of
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clock import set_clock
 from visioncal.stages.detect import detect
@@ -33,8 +31,7 @@ from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
-from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
-from visioncal.stages.loads import check_elastic, check_poses, check_stops
+from visioncal.stages.kinematics import check_asked
 from visioncal.stages.measured import doubts as doubts_of_measured
 from visioncal.stages.measured import remarks as remarks_on_measured
 from visioncal.stages.motion import waits_for_clock
@@ -101,7 +98,7 @@ def _reported(known: Known, session: Session) -> Known:
             next_step=" ".join(known.session.warnings)
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
-    _check_loads(known)
+    check_loads(known)
     return known
 
 
@@ -118,13 +115,6 @@ def _clock(known: Known) -> Known:
         notes=(*known.notes, *clocked.notes),
     ).noting(clocked.rejections, clocked.warnings)
     return _reported(known, replace(session, views=clocked.views))
-def _check_loads(known: Known) -> None:
-    """Refuses loads that tell nothing."""
-    views = tuple(known.base_from_flange)
-    declared = {it.number: it.stop for it in known.session.views}
-    check_stops(known.loads(views), views, [declared[it] for it in views])
-    check_poses(known.loads(views), known.flange_poses(views))
-    check_elastic(known.level, known.robot, known.loads(views))
 
 
 def _readings(known: Known) -> Known:
@@ -311,48 +301,11 @@ def _arm(known: Known) -> Arm:
 
 def _kinematics(known: Known) -> Known:
     """Takes up the arm's errors, again with views that disagree with the arm as stated alone."""
-    found = _arm_told(known)
+    found = arm_told(known)
     if found.arm_model is None or len(known.used) == len(known.candidates):
         return found
-    more = _with_views_back(known, _hand_eye(found))
-    return found if more is None else _arm_told(more)
-
-
-def _with_views_back(stated: Known, calibrated: Known) -> Known | None:
-    """The views that agree when the arm is calibrated; None where that brings none back."""
-    before, all_of = stated.agreed, stated.candidates
-    if before is None:
-        return None
-    boards, stops = calibrated.shown(all_of), calibrated.stops_of(all_of)
-    again = agree(calibrated.closure(all_of), all_of, stops, before, boards)
-    if not (again.mask & ~before.mask).any():
-        return None
-    return without_lost_boards(stated.agreeing(replace(again, edges=before.edges)))
-
-
-def _arm_told(known: Known) -> Known:
-    """Chooses which errors of the arm are told, and takes them up as unknowns."""
-    robot, agreed = known.zeroed_robot, known.agreed
-    can = robot is not None and known.joints_rad is not None and known.solver == "joint"
-    check_asked(known.level, can=can)
-    if not can or known.level == "hand-eye" or robot is None or agreed is None:
-        return known
-    stated = replace(known, arm=None)
-    first = np.unique(known.stops, return_index=True)[1]
-    q, loads = known.joints(known.used), known.loads(known.used)
-    model = ArmModel.of(robot, q, stated.flange_poses(known.used)).loaded(q, loads)
-    loads = loads.chosen(first)
-    bases = {name: model.columns(name, q[first], loads) for name in blocks_of(robot, loads)}
-    data = stated.closure(known.used).merged(known.stops)
-    lost = stated.stated_closure(known.used)
-    told = None if lost is None else lost.merged(known.stops)
-    found = choose_level(data, agreed.edges, bases, known.level, told)
-    known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
-    known = replace(known, compared_from_first=known.from_first)
-    known = known.noting((), doubts(found))
-    if not found.errors:
-        return known
-    return replace(known, arm_model=model.erring(found.errors))
+    more = with_views_back(known, _hand_eye(found))
+    return found if more is None else arm_told(more)
 
 
 def _hand_eye(known: Known) -> Known:
@@ -430,14 +383,7 @@ def _validate(known: Known) -> Known:
 def _tell(known: Known) -> Known:
     telling = telling_of(known)
     advice = () if telling is None or not telling.advice else (telling.advice,)
-    plays = () if known.arm_model is None else plays_of(known.arm_model, known.solved)
-    played = backlash.remarks(plays)
-    known = replace(known, telling=telling, notes=(*known.notes, *advice, *played))
-    springs = springs_told(known)
-    if springs is None:
-        return known
-    known = replace(known, elastic=springs, notes=(*known.notes, *elastic.remarks(springs)))
-    return known.noting((), elastic.doubts(springs))
+    return with_springs(replace(known, telling=telling, notes=(*known.notes, *advice)))
 
 
 def _judge(known: Known) -> Known:

@@ -59,6 +59,7 @@ _ELASTIC = Purpose(
     "elastic",
     "workspace",
     "the bending arm's place all over its workspace",
+    30,
     # A cobot's joints yield by 10 mrad to the arm's own weight where that turns them most.
     {"links": 1e-3, "compliance": 1e-2},
 )
