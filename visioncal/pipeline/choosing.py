@@ -1,0 +1,48 @@
+"""Which errors of the arm are told, and by which views."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.estimator.armmodel import ArmModel, blocks_of
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.layout import without_lost_boards
+from visioncal.stages.agree import agree
+from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
+
+
+def with_views_back(stated: Known, calibrated: Known) -> Known | None:
+    """The views that agree when the arm is calibrated; None where that brings none back."""
+    before, all_of = stated.agreed, stated.candidates
+    if before is None:
+        return None
+    boards, stops = calibrated.shown(all_of), calibrated.stops_of(all_of)
+    again = agree(calibrated.closure(all_of), all_of, stops, before, boards)
+    if not (again.mask & ~before.mask).any():
+        return None
+    return without_lost_boards(stated.agreeing(replace(again, edges=before.edges)))
+
+
+def arm_told(known: Known) -> Known:
+    """Chooses which errors of the arm are told, and takes them up as unknowns."""
+    robot, agreed = known.zeroed_robot, known.agreed
+    can = robot is not None and known.joints_rad is not None and known.solver == "joint"
+    check_asked(known.level, can=can)
+    if not can or known.level == "hand-eye" or robot is None or agreed is None:
+        return known
+    stated = replace(known, arm=None)
+    first = np.unique(known.stops, return_index=True)[1]
+    q, loads = known.joints(known.used), known.loads(known.used)
+    model = ArmModel.of(robot, q, stated.flange_poses(known.used)).loaded(q, loads)
+    loads = loads.chosen(first)
+    bases = {name: model.columns(name, q[first], loads) for name in blocks_of(robot, loads)}
+    data = stated.closure(known.used).merged(known.stops)
+    lost = stated.stated_closure(known.used)
+    told = None if lost is None else lost.merged(known.stops)
+    found = choose_level(data, agreed.edges, bases, known.level, told)
+    known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
+    known = replace(known, compared_from_first=known.from_first)
+    known = known.noting((), doubts(found))
+    if not found.errors:
+        return known
+    return replace(known, arm_model=model.erring(found.errors))
