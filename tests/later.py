@@ -11,7 +11,7 @@ from test_kinematics import WRONG_LINKS, target_in_camera
 from visioncal.calibration import Calibration
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.result import result_of
-from visioncal.simulation import Cell, CellOptions, forward, project, simulate
+from visioncal.simulation import Cell, CellOptions, project, simulate
 from visioncal.simulation.boards import corners_m
 from visioncal.transforms import exp
 from visioncal.types import Corners, FloatArray, Mount
@@ -61,6 +61,7 @@ def part(cell: Cell, views: Sequence[int]) -> Cell:
         true_base_from_flange=cell.true_base_from_flange[rows],
         cam_from_target=cell.cam_from_target[rows],
         corners=tuple(replace(cell.corners[it], view=at) for at, it in enumerate(rows)),
+        payloads=tuple(cell.payloads[it] for it in rows if cell.payloads),
     )
 
 
@@ -80,7 +81,7 @@ def again(
     fresh, options = part(cell, rows.tolist()), cell.options
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = exp(change.noise_factor * sigma * rng.standard_normal((stops, 6)))
-    flange = forward(cell.true_arm, fresh.joints + change.joints_rad) @ jitter
+    flange = cell.flange_at(fresh.joints + change.joints_rad, fresh.payloads) @ jitter
     x, z = cell.transforms.values()
     moved = x @ exp(change.camera), z @ exp(change.board)
     poses = target_in_camera(options.mount, *moved, flange)

@@ -15,7 +15,7 @@ from visioncal.errors import DataError
 from visioncal.pipeline.result import result_of
 from visioncal.robot import load_robot
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import CellOptions, Payload, simulate, write_session
 from visioncal.simulation.boards import centre_m
 from visioncal.simulation.second import Second
 from visioncal.transforms import adjoint, compose, exp, invert, log
@@ -149,6 +149,22 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     for _ in range(4):
         known = known_of(again(cell, rng), joints=False)
         assert check(seen_by(known, footing), footing).passed
+
+
+@pytest.mark.parametrize("weighed", [True, False])
+def test_a_bent_arm_under_its_loads_is_no_change(weighed):
+    """Springs and loads are in what is predicted, whether or not the arm's masses are known."""
+    loads = (Payload(), Payload(8.0, (0.0, 0.0, 0.1)))
+    springs = {"compliance_rad_per_nm": (6e-5,) * 6, "payloads": loads}
+    cell = simulate(replace(ANYHOW, robot="ur10e", views=FITTED + 20, seed=2, **springs))
+    robot = load_robot("ur10e") if weighed else replace(load_robot("ur10e"), masses=None)
+    lot = result_of(calibrated(part(cell, range(FITTED)), robot=robot))
+    assert lot.stages["kinematics"]["level"] == "elastic"
+    rng, footing = np.random.default_rng(4), Footing.of(lot)
+    found = check(seen_by(known_of(again(cell, rng), robot=robot), footing), footing)
+    assert found.passed, found.misfit
+    bumped = again(cell, rng, Change(camera=knock(rng, 2.0, 0.0)))
+    assert not check(seen_by(known_of(bumped, robot=robot), footing), footing).passed
 
 
 def test_one_of_two_boards_that_moved_is_named():

@@ -32,6 +32,7 @@ class ArmModel:
         values: (p,) present values [rad], block after block; all are of the first block's size.
         torque_nm: The torque under which a joint whose compliance is 1 rad bends by that [N m].
         yielding: (n,) which joints bend; None for all.
+        functions: What the weight of links of unknown masses may do; None where it is known.
     """
 
     nominal: Robot
@@ -40,6 +41,7 @@ class ArmModel:
     values: FloatArray
     torque_nm: float = 1.0
     yielding: Mask | None = None
+    functions: WeightFunctions | None = None
 
     @classmethod
     def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
@@ -51,7 +53,8 @@ class ArmModel:
             reported: (m, 4, 4) what the controller reported for them.
         """
         tool = mean_transform(invert(nominal.base_from_flange(q)) @ reported)
-        return cls(nominal, tool, {}, np.zeros(0))
+        functions = WeightFunctions.of(nominal) if nominal.masses is None else None
+        return cls(nominal, tool, {}, np.zeros(0), functions=functions)
 
     def loaded(self, q: FloatArray, loads: Loads | None = None) -> "ArmModel":
         """Returns the arm with compliances in units of the greatest torque of some stops.
@@ -100,20 +103,25 @@ class ArmModel:
         return self._joint_values(BACKLASH)
 
     @cached_property
-    def functions(self) -> WeightFunctions:
-        """What the weight of links of unknown masses may do."""
-        return WeightFunctions.of(self.nominal)
-
-    @cached_property
     def moments(self) -> FloatArray | None:
         """(n, 4 n) compliances times unknown masses and first moments; None without any."""
-        if WEIGHT not in self.weights:
+        if WEIGHT not in self.weights or self.functions is None:
             return None
         return self.functions.moments(self.weights[WEIGHT] * self.values[self.place_of(WEIGHT)])
 
     def size_of(self, name: str) -> int:
         """How many values a block has."""
-        return self.functions.size if name == WEIGHT else block_size(name, self.nominal.joint_count)
+        if name == WEIGHT:
+            return 0 if self.functions is None else self.functions.size
+        return block_size(name, self.nominal.joint_count)
+
+    @cached_property
+    def values_by_stop(self) -> FloatArray:
+        """(p,) the values of what goes by the loads of a stop; zero for what its `robot` has."""
+        values = np.zeros(len(self.values))
+        for name in (COMPLIANCE, BACKLASH, WEIGHT):
+            values[self.place_of(name)] = self.values[self.place_of(name)]
+        return values
 
     def place_of(self, name: str) -> slice:
         """Where a block's values stand among all; empty where it is not there."""
@@ -176,8 +184,9 @@ class ArmModel:
         if name == BACKLASH:
             sides = np.zeros(len(q)) if loads is None else loads.side
             return np.asarray(-0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
-        if name == WEIGHT:
-            return np.asarray(self.robot.axis_jacobian(bent) @ self.functions.bends(bent))
+        if name == WEIGHT and self.functions is not None:
+            shares = self.functions.bends(self.robot, bent)
+            return np.asarray(self.robot.axis_jacobian(bent) @ shares)
         if name == COMPLIANCE:
             torques = self.robot.load_torques(bent, loads) / self.torque_nm
             if self.yielding is not None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.estimator.arm import misfit_slopes
+from visioncal.estimator.armmodel import ArmModel
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
 from visioncal.types import FloatArray
@@ -59,7 +60,23 @@ def _arm(known: Known) -> dict[str, Any] | None:
         "values": values.tolist(),
         "weights": dict(model.weights),
         "flange_from_reported": model.flange_from_reported.tolist(),
+        **_by_stop(model),
     }
+
+
+def _by_stop(model: ArmModel) -> dict[str, Any]:
+    """What of the arm's errors is not in its geometry, as it goes by the loads of a stop."""
+    if not model.values_by_stop.any():
+        return {}
+    document: dict[str, Any] = {
+        "by_stop": model.values_by_stop.tolist(),
+        "torque_nm": model.torque_nm,
+    }
+    if model.yielding is not None:
+        document["yielding"] = model.yielding.tolist()
+    if model.functions is not None:
+        document["weight_functions"] = [it.tolist() for it in model.functions.parts]
+    return document
 
 
 def _covariance(known: Known) -> FloatArray:

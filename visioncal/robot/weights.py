@@ -21,30 +21,27 @@ class WeightFunctions:
     """The functions of the posture that the weight of links can be, joint by joint.
 
     Attributes:
-        robot: The arm.
         parts: One (4 n, r) matrix a joint: which masses and first moments make up each of its r
             functions, whose root mean square over postures is 1.
     """
 
-    robot: Robot
     parts: tuple[FloatArray, ...]
 
     @classmethod
     def of(cls, robot: Robot) -> "WeightFunctions":
         """Finds the functions of an arm, by postures all around."""
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, robot.joint_count))
-        return cls(
-            robot, tuple(_independent(it) for it in np.moveaxis(robot.weight_slopes(q), 1, 0))
-        )
+        slopes = np.moveaxis(robot.weight_slopes(q), 1, 0)
+        return cls(tuple(_independent(it) for it in slopes))
 
     @property
     def size(self) -> int:
         """How many functions there are in all."""
         return sum(it.shape[1] for it in self.parts)
 
-    def bends(self, q: FloatArray) -> FloatArray:
+    def bends(self, robot: Robot, q: FloatArray) -> FloatArray:
         """The functions' values at (m, n) joint angles: (m, n, size), each for its joint alone."""
-        slopes = self.robot.weight_slopes(q)
+        slopes = robot.weight_slopes(q)
         values, at = np.zeros((*q.shape, self.size)), 0
         for joint, part in enumerate(self.parts):
             values[:, joint, at : at + part.shape[1]] = slopes[:, joint] @ part

@@ -13,7 +13,7 @@ from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Edges, Noise
 from visioncal.estimator.observability import edge_names
 from visioncal.frames.chain import noise_freedom
-from visioncal.robot import Robot
+from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import corner_positions, numbered_positions, target_from_document
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray, Target
@@ -165,14 +165,29 @@ def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
 
 
 def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:
-    """The arm's model at what was found, so that no errors are left to be added."""
+    """The arm's model at what was found, so that no errors are left to be added.
+
+    Its geometry is in the arm; what goes by the loads of a stop is in the values.
+    """
     if document["of"] != "model" or arm is None:
         return None
     reported = np.array(document["flange_from_reported"], dtype=float)
     mounted = np.zeros((arm.joint_count + 1, 6))
     mounted[-1] = log(invert(reported))
-    nothing = np.zeros(len(document["values"]))
-    return ArmModel(arm.corrected(mounted), reported, document["weights"], nothing)
+    count = len(document["values"])
+    yielding, parts = document.get("yielding"), document.get("weight_functions")
+    shape = (4 * arm.joint_count, -1)
+    return ArmModel(
+        arm.corrected(mounted),
+        reported,
+        document["weights"],
+        np.array(document.get("by_stop", np.zeros(count)), dtype=float),
+        float(document.get("torque_nm", 1.0)),
+        None if yielding is None else np.array(yielding, dtype=bool),
+        None
+        if parts is None
+        else WeightFunctions(tuple(np.array(it, dtype=float).reshape(shape) for it in parts)),
+    )
 
 
 def _shape(calibration: Calibration, names: tuple[str, ...]) -> FloatArray:
