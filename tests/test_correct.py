@@ -380,6 +380,27 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
     assert "does not exist" in run("correct", stored / "none.csv", "-c", stored).err
 
 
+def test_a_payload_is_counted_where_joints_bend(stored, result):
+    springs = [{"compliance_rad_per_nm": 1e-4} for _ in range(6)]
+    bending = replace(result, stages={**result.stages, "elastic": {"joints": springs}})
+    poses = targets_near(2, result)
+    table = write_poses(stored / "t.csv", poses)
+    load = ("--payload-kg", "3", "--payload-m", "0,0,0.1", "--seed-joints", SEED)
+    done = run("correct", table, "-c", stored, *load)
+    assert done.status == 0, done.err
+    assert "--payload-kg 3 changes nothing" in " ".join(done.err.split())
+    bending.save(stored / "calibration.json")
+    done = run("correct", table, "-c", stored, *load)
+    assert "changes nothing" not in done.err
+    q = np.array([numbers(row, JOINTS) for row in rows_of(done.out)])
+    stands = bending.base_from_flange(q, payload_kg=3.0, payload_m=(0.0, 0.0, 0.1)).as_matrix()
+    # The table's digits, and what three looks at a bent arm leave.
+    assert stands == pytest.approx(poses, abs=1e-5)
+    refused = run("correct", table, "-c", stored, "--payload-kg", "-1", "--seed-joints", SEED)
+    assert refused.status == 2
+    assert "payload of -1 kg" in refused.err
+
+
 def test_a_calibration_without_an_arm_says_what_to_do(stored, result, by_poses):
     by_poses.save(stored / "calibration.json")
     table = write_poses(stored / "t.csv", targets_near(1, result))
