@@ -49,6 +49,9 @@ def test_an_arm_that_is_right_but_for_its_play():
     q = known.joints(known.used)
     away = known.arm_model.base_from_flange(q) - known.robot.base_from_flange(q)
     assert np.abs(away).max() < 1e-9
+    result = result_of(known)
+    assert result.arm_is_calibrated
+    assert result.standing(q) == pytest.approx(known.robot.base_from_flange(q), abs=1e-9)
 
 
 def test_stops_from_one_side_tell_no_play():

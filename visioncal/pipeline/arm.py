@@ -54,10 +54,12 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
         "levels": [_level(it) for it in found.levels],
         **_backlash(known),
     }
-    if model is None or telling is None:
+    if model is None:
+        return document
+    document["robot"] = dict(model.robot.document)
+    if telling is None:
         return document
     return document | {
-        "robot": dict(model.robot.document),
         "convention": telling.convention,
         "parameters": [_number(it, model.nominal, known.lost_zero) for it in telling.estimates],
         **unseen_views(known, found),
