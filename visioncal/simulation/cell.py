@@ -103,11 +103,7 @@ class Cell:
 
         With k loads, or none but its own weight; from the middle of its play.
         """
-        options = self.options
-        giving = giving_of(
-            self.true_arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad
-        )
-        return forward(self.true_arm, sagging(self.true_arm, giving, q, payloads))
+        return _stands(self.options, self.true_arm, q, payloads)
 
 
 def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
@@ -148,11 +144,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
     payloads = _payloads(options)
     approach = _approach(options)
-    giving = giving_of(
-        true_arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad
-    )
-    standing = sagging(true_arm, giving, moved, payloads, approach)
-    true_base_from_flange = forward(true_arm, standing) @ exp(jitter)
+    true_base_from_flange = _stands(options, true_arm, moved, payloads, approach) @ exp(jitter)
     joints, wrong_stops = _misreport(options, arm, moved)
     poses = [before_camera(chain, true_base_from_flange) for chain in chains(transforms)]
     shown = shown_at(options, sheets, poses)
@@ -179,6 +171,18 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         payloads=tuple(payloads[at] for at in shown.stops if payloads),
         approach=approach[shown.stops] if options.backlash_rad else None,
     )
+
+
+def _stands(
+    options: CellOptions,
+    arm: Arm,
+    q: FloatArray,
+    payloads: Sequence[Payload],
+    approach: FloatArray | None = None,
+) -> FloatArray:
+    """Where the flange of an arm that gives way stands, (m, 4, 4), at (m, n) joint angles [rad]."""
+    giving = giving_of(arm, options.compliance_rad_per_nm, options.mass_share, options.backlash_rad)
+    return forward(arm, sagging(arm, giving, q, payloads, approach))
 
 
 def _payloads(options: CellOptions) -> list[Payload]:
