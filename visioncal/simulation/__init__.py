@@ -27,18 +27,23 @@ from visioncal.simulation.records import (
 from visioncal.simulation.render import Scene, prepare_scene, render, render_view
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
+from visioncal.simulation.warmup import Heat, Round, WarmUp, WarmUpOptions, simulate_warm_up
 
 __all__ = [
     "Arm",
     "Cell",
     "CellOptions",
+    "Heat",
     "Motion",
     "Payload",
+    "Round",
     "Scene",
     "Second",
     "Sweep",
     "SweepOptions",
     "Truth",
+    "WarmUp",
+    "WarmUpOptions",
     "arm_named",
     "charuco_target",
     "checkerboard_target",
@@ -55,6 +60,7 @@ __all__ = [
     "render",
     "render_view",
     "simulate",
+    "simulate_warm_up",
     "sweep",
     "sweep_session",
     "truth_path",

@@ -149,7 +149,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
     poses = [before_camera(chain, true_base_from_flange) for chain in chains(transforms)]
     shown = shown_at(options, sheets, poses)
     cam_from_target = np.array(poses)[shown.boards, shown.stops]
-    exact_corners = _see(options, [sheets[board] for board in shown.boards], cam_from_target)
+    exact_corners = seen_by(options, [sheets[board] for board in shown.boards], cam_from_target)
     return Cell(
         options=options,
         arm=arm,
@@ -164,7 +164,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         true_base_from_flange=true_base_from_flange[shown.stops],
         cam_from_target=cam_from_target,
         exact_corners=exact_corners,
-        corners=_detect(options, exact_corners),
+        corners=detected(options, exact_corners),
         wrong_views=tuple(np.flatnonzero(np.isin(shown.stops, wrong_stops)).tolist()),
         sheets=sheets,
         shown=shown,
@@ -345,7 +345,7 @@ def _misreport(
     return joints, tuple(int(view) for view in chosen)
 
 
-def _see(
+def seen_by(
     options: CellOptions, sheets: Sequence[Sheet], cam_from_target: FloatArray
 ) -> tuple[Corners, ...]:
     """Where the corners of each view's sheet are in its image, without the ones outside it."""
@@ -359,7 +359,7 @@ def _see(
     return tuple(seen)
 
 
-def _detect(options: CellOptions, exact_corners: tuple[Corners, ...]) -> tuple[Corners, ...]:
+def detected(options: CellOptions, exact_corners: tuple[Corners, ...]) -> tuple[Corners, ...]:
     """The corners with the noise of their detection."""
     noise = stream(options, Stream.PIXELS)
     return tuple(

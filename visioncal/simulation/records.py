@@ -75,7 +75,9 @@ def write_session(
         DataError: The folder cannot be written, or the target cannot be drawn.
     """
     folder = Path(folder)
-    session = _image_session(cell, folder.name, progress) if images else _pairs(cell, folder.name)
+    session = (
+        _image_session(cell, folder.name, progress) if images else pairs_session(cell, folder.name)
+    )
     session.save(folder)
     write_atomically(truth_path(folder), _truth_text(cell))
     if progress is not None:
@@ -214,7 +216,8 @@ def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | No
     return _session(cell, document, columns, views, MemoryImages(files))
 
 
-def _pairs(cell: Cell, name: str) -> Session:
+def pairs_session(cell: Cell, name: str) -> Session:
+    """The session of a cell with `cam_from_target` as measured, and neither camera nor target."""
     numbers = [
         {**row, **{f"cft_{key}": value for key, value in _pose_row(pose).items()}}
         for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
