@@ -31,6 +31,7 @@ LAYERS = (
     ("estimator",),
     ("session",),
     ("evidence",),
+    ("thermal",),
     ("calibration",),
     ("compensation",),
     ("compare",),

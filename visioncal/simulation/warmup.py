@@ -55,15 +55,15 @@ class Heat:
 
     @classmethod
     def drawn(cls, seed: int) -> "Heat":
-        """Draws an arm whose joints become 8 to 25 K warmer within hours."""
+        """Draws an arm whose joints become 10 to 35 K warmer within hours."""
         rng = np.random.default_rng([99, seed])
         duty = rng.uniform(1.5, 4.0, _JOINTS)
         return cls(
             duty,
-            rng.uniform(8.0, 25.0, _JOINTS) / duty**2,
+            rng.uniform(10.0, 35.0, _JOINTS) / duty**2,
             rng.uniform(1500.0, 3600.0, _JOINTS),
             rng.uniform(STEEL_PER_K, ALUMINIUM_PER_K, _JOINTS),
-            rng.normal(0.0, 3e-6, _JOINTS),
+            rng.normal(0.0, 5e-6, _JOINTS),
         )
 
 
@@ -184,7 +184,7 @@ class Round:
 
     first: int = 24
     references: int = 6
-    every_s: float = 600.0
+    every_s: float = 300.0
     minutes: float = 100.0
     pace_s: float = 5.0
 

@@ -1,0 +1,188 @@
+"""The arm as it is now: fed with temperatures or currents, asked for its model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.robot import Robot
+from visioncal.thermal.model import ThermalModel
+from visioncal.types import FloatArray
+
+_MINUTES = 60.0
+# How far ahead advice looks [s], and how finely.
+_AHEAD_S, _EVERY_S = 10 * 3600.0, 30.0
+# Rates of measured temperatures are taken over so long [s]: sensors are noisy.
+_SPAN_S = 600.0
+# A joint whose rise has not slowed down visibly is expected to settle so slowly [s].
+_SLOWEST_S = 5400.0
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Whether the arm is warm enough.
+
+    Attributes:
+        rate_um_min: How fast the flange drifts now [um/min].
+        limit_um_min: How fast it may [um/min].
+        wait_s: How long until then if work goes on as it does; zero where it is warm, None where it
+            does not come to that within ten hours or too little was told as yet.
+    """
+
+    rate_um_min: float | None
+    limit_um_min: float
+    wait_s: float | None
+
+    @property
+    def words(self) -> str:
+        """The advice in a sentence."""
+        if self.rate_um_min is None:
+            return "Too little was told of the temperatures to say how fast the arm drifts."
+        now = f"The flange drifts by {self.rate_um_min:.2g} um/min"
+        if self.wait_s is None:
+            return f"{now} and does not come under {self.limit_um_min:g} within ten hours."
+        if self.wait_s <= 0.0:
+            return f"{now}, under the limit of {self.limit_um_min:g}: the arm is warm."
+        minutes = self.wait_s / _MINUTES
+        return f"{now}: go on warming up for {minutes:.0f} min to come under {self.limit_um_min:g}."
+
+
+class OnlineCompensator:
+    """Follows an arm's temperatures.
+
+    Feed it what was measured, as often as it is; ask it for the arm as it is now. It begins with
+    links in balance: as warm as their joints at the first sample or, fed with currents, as the air.
+    """
+
+    def __init__(self, model: ThermalModel) -> None:
+        """Begins without a sample.
+
+        Args:
+            model: How the arm drifts.
+        """
+        self._model = model
+        self._stamps_s: list[float] = []
+        self._rests: list[FloatArray] = []
+        self._links: list[FloatArray] = []
+
+    def feed(
+        self,
+        stamp_s: float,
+        *,
+        temperatures_c: FloatArray | None = None,
+        currents_a: FloatArray | None = None,
+        ambient_c: float | None = None,
+    ) -> None:
+        """Takes up a sample.
+
+        Args:
+            stamp_s: When; later than the sample before [s].
+            temperatures_c: (n,) of the joints, where the model was fitted to these.
+            currents_a: (n,) of the motors, where it was fitted to these [A].
+            ambient_c: The air, with currents; that of the reference where it is not told.
+
+        Raises:
+            DataError: The time does not ascend, the wrong kind was given, or numbers are missing.
+        """
+        heating, count = self._model.heating, self._model.joint_count
+        given = temperatures_c if heating.kind == "temperatures" else currents_a
+        told = np.asarray([] if given is None else given, dtype=float)
+        if told.shape != (count,) or not np.isfinite(told).all():
+            raise DataError(
+                f"thermal: the model was fitted to {heating.kind}; {count} of them are needed in a "
+                f"sample, not {told.tolist()}."
+            )
+        if self._stamps_s and stamp_s <= self._stamps_s[-1]:
+            raise DataError(
+                f"thermal: a sample at {stamp_s:g} s does not come after the one before, at "
+                f"{self._stamps_s[-1]:g} s."
+            )
+        told = told if heating.kind == "temperatures" else told**2
+        air = float(self._model.reference_c.mean()) if ambient_c is None else ambient_c
+        rest = heating.rest(told[None], np.array([air]))[0]
+        if self._stamps_s:
+            mean = 0.5 * (rest + self._rests[-1])
+            links = heating.step(self._links[-1], mean, stamp_s - self._stamps_s[-1])
+        else:
+            links = heating.cold(told[None], np.array([air]))
+        self._stamps_s.append(stamp_s)
+        self._rests.append(rest)
+        self._links.append(links)
+        self._forget()
+
+    @property
+    def links_c(self) -> FloatArray:
+        """(n,) temperatures of the links now [deg C].
+
+        Raises:
+            DataError: Nothing was fed yet.
+        """
+        if not self._links:
+            raise DataError("thermal: the compensator was fed with no sample yet.")
+        return self._links[-1]
+
+    @property
+    def robot(self) -> Robot:
+        """The arm as it is now."""
+        return self._model.robot_at(self.links_c)
+
+    def base_from_flange(self, q: FloatArray) -> FloatArray:
+        """Where the flange stands now (m, 4, 4), at (m, n) joint angles [rad]."""
+        return self._model.base_from_flange(q, self.links_c)
+
+    def sigma_m(self, q: FloatArray) -> FloatArray:
+        """(m,) how surely its drift is known; see `ThermalModel.sigma_m`."""
+        return self._model.sigma_m(q, self.links_c)
+
+    def advice(self, q: FloatArray, limit_um_min: float) -> Advice:
+        """Says whether the arm is warm enough to work, and else how long to wait.
+
+        Args:
+            q: (n,) the posture at work [rad].
+            limit_um_min: How fast the flange may drift [um/min].
+
+        Raises:
+            DataError: The limit is not above zero.
+        """
+        if not limit_um_min > 0.0:
+            raise DataError(f"thermal: a limit of {limit_um_min:g} um/min is not above zero.")
+        found = self._settling()
+        if found is None:
+            return Advice(None, limit_um_min, None)
+        speeds, tau_s = found
+        slopes = 1e6 * _MINUTES * self._model.slopes(q[None])[0, 3:]
+        ahead = np.arange(0.0, _AHEAD_S, _EVERY_S)
+        speeds = speeds * np.exp(-ahead[:, None] / tau_s)
+        rates = np.linalg.norm(speeds @ slopes.T, axis=1)
+        over = np.flatnonzero(rates >= limit_um_min)
+        if not len(over):
+            wait = 0.0
+        elif over[-1] + 1 < len(ahead):
+            wait = float(ahead[over[-1] + 1])
+        else:
+            wait = None
+        return Advice(float(rates[0]), limit_um_min, wait)
+
+    def _settling(self) -> tuple[FloatArray, FloatArray] | None:
+        """How fast links warm up (n,) [K/s], and how that fades (n,) [s]; None for too little."""
+        heating = self._model.heating
+        if heating.kind == "currents":
+            if not self._links:
+                return None
+            return (self._rests[-1] - self._links[-1]) / heating.tau_s, heating.tau_s
+        stamps = np.array(self._stamps_s)
+        if not len(stamps) or stamps[-1] - stamps[0] < 2.0 * _SPAN_S:
+            return None
+        then = stamps[-1] - _SPAN_S * np.arange(3)
+        links = [np.interp(then, stamps, it) for it in np.array(self._links).T]
+        late, early = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
+        slowed = np.clip(late / np.where(early == 0.0, 1.0, early), 1e-3, None)
+        fading = slowed < np.exp(-_SPAN_S / _SLOWEST_S)
+        tau_s = np.where(fading, -_SPAN_S / np.log(np.where(fading, slowed, 0.5)), _SLOWEST_S)
+        return late, np.maximum(tau_s, heating.tau_s)
+
+    def _forget(self) -> None:
+        """Drops samples older than rates need."""
+        while len(self._stamps_s) > 2 and self._stamps_s[1] < self._stamps_s[-1] - 2.1 * _SPAN_S:
+            for it in (self._stamps_s, self._rests, self._links):
+                it.pop(0)

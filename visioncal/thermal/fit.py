@@ -1,0 +1,290 @@
+"""How an arm grows and drifts, estimated jointly with the chain that its views close.
+
+The coefficients are more unknowns that all views share, beside both edges and the arm's errors: one
+closure, one fit. What is known of steel and aluminium, and of how fast arms warm up, is a prior;
+what the views do not tell stays there.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from visioncal.errors import DegenerateError
+from visioncal.estimator.closure import (
+    Closure,
+    Edges,
+    Noise,
+    closure_information,
+    estimate_noise,
+    fit_closure,
+    knowledge_of,
+    noise_likelihood,
+    normal_equations,
+    residual_blocks,
+)
+from visioncal.estimator.descend import Linearised, descend
+from visioncal.estimator.linalg import covariance, damped_step, one_blas_thread
+from visioncal.estimator.shared import Shared
+from visioncal.robot import Robot
+from visioncal.thermal.heating import Heating, Inputs
+from visioncal.thermal.model import ThermalModel
+from visioncal.transforms import invert
+from visioncal.types import FloatArray
+
+# Steel grows by 12e-6 of its length for a kelvin, aluminium by 23e-6.
+_GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
+# A zero drifts by about a hundredth of a millimetre at a metre for a kelvin, either way.
+_DRIFT_SIGMA_RAD_PER_K = 1e-5
+# Gearboxes warm up in half an hour to an hour and a half; links follow a sensor in minutes.
+_TAU_S, _TAU_SIGMA = (
+    {"currents": 2400.0, "temperatures": 120.0},
+    {
+        "currents": 0.6,
+        "temperatures": 1.0,
+    },
+)
+# Joints at work get warmer than the air by so much, give or take a factor [K].
+_RISE_K, _GAIN_SIGMA = 20.0, 0.8
+# Rises of all joints below these tell nothing: temperatures [K], and shares of the rise at rest.
+LEAST_RISE_K, LEAST_SHARE = 3.0, 0.15
+# A parameter counts as told where its sigma is at most this share of its prior's.
+_TOLD = 0.8
+_ROUNDS, _SETTLED = 5, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Stops:
+    """The stops whose views are fitted.
+
+    Attributes:
+        q: (m, n) joint angles [rad].
+        stamps_s: (m,) when they were looked at [s].
+    """
+
+    q: FloatArray
+    stamps_s: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalFit:
+    """What views say of an arm's drift.
+
+    Attributes:
+        model: The arm with its coefficients and their covariance.
+        edges: The edges, and what else was fitted with them.
+        told: (p,) sigma of each parameter as a share of its prior's.
+        gain: Twice the gain in log-likelihood over an arm that does not drift.
+        before_m: Residual of the views without drift, as a root mean square [m].
+        after_m: The same with it [m].
+        rises_k: (n,) range of each link's temperature over the views [K].
+    """
+
+    model: ThermalModel
+    edges: Edges
+    told: FloatArray
+    gain: float
+    before_m: float
+    after_m: float
+    rises_k: FloatArray
+
+    @property
+    def not_told(self) -> tuple[str, ...]:
+        """The parameters that stay at what was known before, by joint."""
+        names = parameter_names(self.model)
+        return tuple(it for it, share in zip(names, self.told, strict=True) if share > _TOLD)
+
+
+def parameter_names(model: ThermalModel) -> tuple[str, ...]:
+    """The parameters' names, in the order of their covariance."""
+    kinds = ["growth", "drift", "tau"] + ["gain"] * (model.heating.kind == "currents")
+    return tuple(f"{kind} of {joint}" for kind in kinds for joint in model.robot.joint_names)
+
+
+def check_informative(inputs: Inputs, stamps_s: FloatArray) -> None:
+    """Refuses views all of which were taken about equally warm.
+
+    Raises:
+        DegenerateError: No link's temperature changed enough.
+    """
+    heating = _expected(inputs)
+    links = heating.links_c(inputs, stamps_s)
+    rise = float(np.ptp(links, axis=0).max())
+    hours = float(np.ptp(stamps_s)) / 3600.0
+    if inputs.kind == "temperatures":
+        if rise >= LEAST_RISE_K:
+            return
+        seen = f"the joints' temperatures change by at most {rise:.2g} K"
+        needed = f"{LEAST_RISE_K:g} K are needed"
+    else:
+        if rise >= LEAST_SHARE * _RISE_K:
+            return
+        seen = (
+            f"by their currents the joints warm up by at most {100.0 * rise / _RISE_K:.2g} % of "
+            "the way"
+        )
+        needed = f"{100.0 * LEAST_SHARE:g} % are needed"
+    raise DegenerateError(
+        f"thermal: {seen} in the {hours:.2g} h of the {len(stamps_s)} used views, and {needed}: "
+        "they do not tell how the arm drifts.",
+        culprits=["temperatures"],
+        next_step="Begin with a cold robot, let it work for an hour or more, and look at the same "
+        "few reference views every ten minutes.",
+    )
+
+
+def fit_thermal(
+    data: Closure, edges: Edges, robot: Robot, stops: Stops, inputs: Inputs, nominal: Robot
+) -> ThermalFit:
+    """Estimates how an arm drifts, with edges and arm free.
+
+    Args:
+        data: The stops' chain, with the arm as it is without drift.
+        edges: Where to start.
+        robot: That arm, up to the frame of its poses.
+        stops: Joint angles and times.
+        inputs: What heats the arm.
+        nominal: The arm without what is mounted on its flange: its lengths are what grows.
+
+    Raises:
+        DegenerateError: Temperatures hardly change.
+    """
+    check_informative(inputs, stops.stamps_s)
+    start = _start(robot, nominal, inputs)
+    with one_blas_thread():
+        cold = fit_closure(data, edges)
+        before = noise_likelihood(data, cold.edges)[1]
+        problem = _Problem(data, stops, inputs, start)
+        state, noise = _State(cold.edges, np.zeros(problem.size)), cold.noise
+        for _ in range(_ROUNDS):
+            state, _ = descend(state, partial(problem.linearised, noise=noise), _SETTLED)
+            last, noise = noise, estimate_noise(problem.seen(state.values), problem.at(state))
+            if np.allclose(last.sigmas, noise.sigmas, rtol=1e-3):
+                break
+        values, count = state.values, problem.size
+        seen, at = problem.seen(values), problem.at(state)
+        after = noise_likelihood(seen, at)[1]
+        spread = covariance(closure_information(seen, at, noise))[-count:, -count:]
+        residuals = [
+            residual_blocks(it, found, noise)[0] for it, found in ((data, cold.edges), (seen, at))
+        ]
+    model = problem.model(values)
+    sigmas = problem.sigmas
+    links = model.heating.links_c(inputs, stops.stamps_s)
+    rms = [float(np.sqrt(np.mean(np.sum(it[:, 3:] ** 2, axis=1)))) for it in residuals]
+    return ThermalFit(
+        replace(model, covariance=spread * np.outer(sigmas, sigmas)),
+        state.edges,
+        np.sqrt(np.diag(spread)),
+        2.0 * (before - after),
+        rms[0],
+        rms[1],
+        np.ptp(links, axis=0),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Edges with what the chain shares, and the (p,) values of the drift."""
+
+    edges: Edges
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The fit's unknowns beside those of the chain, in units of their priors' sigmas."""
+
+    data: Closure
+    stops: Stops
+    inputs: Inputs
+    start: ThermalModel
+
+    @property
+    def sigmas(self) -> FloatArray:
+        count = self.start.joint_count
+        kind = self.inputs.kind
+        sizes = [_GROWTH_SIGMA_PER_K, _DRIFT_SIGMA_RAD_PER_K, _TAU_SIGMA[kind]]
+        sizes += [_GAIN_SIGMA] * (kind == "currents")
+        return np.repeat(sizes, count)
+
+    @property
+    def size(self) -> int:
+        return len(self.sigmas)
+
+    def model(self, values: FloatArray) -> ThermalModel:
+        steps, count = self.sigmas * values, self.start.joint_count
+        return replace(
+            self.start,
+            growth_per_k=self.start.growth_per_k + steps[:count],
+            drift_rad_per_k=self.start.drift_rad_per_k + steps[count : 2 * count],
+            heating=self.start.heating.changed(steps[2 * count :]),
+        )
+
+    def at(self, state: _State) -> Edges:
+        """The unknowns where the drift is linearised."""
+        shared = np.concatenate([state.edges.shared, np.zeros(self.size)])
+        return replace(state.edges, shared=shared)
+
+    def linearised(self, state: _State, noise: Noise) -> Linearised[_State]:
+        """The whitened squared error with that of the priors, and the way on."""
+        seen, at = self.seen(state.values), self.at(state)
+        residuals, _, spread = residual_blocks(seen, at, noise)
+        information, gradient = normal_equations(seen, at, noise)
+        whitened = np.linalg.solve(spread, residuals[:, :, None])[:, :, 0]
+        cost = float(np.sum(residuals * whitened) + state.values @ state.values)
+        cost += sum(it.cost(at.x, at.z) for it in seen.measured)
+        if self.data.shared is not None:
+            known = knowledge_of(self.data, state.edges).pull[12:]
+            cost += float(state.edges.shared @ (self.data.shared.pull + known))
+
+        def step(damping: float) -> _State:
+            by = damped_step(information, gradient, damping)
+            edges = state.edges.moved(by[: -self.size])
+            return _State(edges, state.values + by[-self.size :])
+
+        return Linearised(state, cost, step)
+
+    def seen(self, values: FloatArray) -> Closure:
+        """The chain with the arm as warm as it was, and how it moves with the unknowns."""
+        model, stops = self.model(values), self.stops
+        links = model.heating.links_c(self.inputs, stops.stamps_s)
+        moved = moved_robot(self.data, model.motion(stops.q, links))
+        grown, turned = model.columns(stops.q)
+        rises = model.rises(links)[:, None, :]
+        by_link, slopes = model.slopes(stops.q), model.heating.slopes(self.inputs, stops.stamps_s)
+        heated = [by_link * slopes[:, None, :, at] for at in range(slopes.shape[2])]
+        basis = np.concatenate([grown * rises, turned * rises, *heated], axis=2) * self.sigmas
+        known = np.eye(self.size)
+        more = Shared(known, values, np.zeros(self.size), np.zeros_like(basis), basis)
+        return replace(self.data, robot=moved).with_more(more)
+
+
+def moved_robot(data: Closure, motion: FloatArray) -> FloatArray:
+    """The robot's part (m, 4, 4) of a chain after (m, 4, 4) motions of its flange."""
+    if data.mount == "eye-in-hand":
+        return data.robot @ motion
+    return invert(invert(data.robot) @ motion)
+
+
+def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:
+    """The arm as it is expected to drift before anything was seen."""
+    count, heating = robot.joint_count, _expected(inputs)
+    return ThermalModel(
+        robot,
+        heating,
+        heating.cold(inputs.told, inputs.ambient_c),
+        np.full(count, _GROWTH_PER_K),
+        np.zeros(count),
+        np.zeros((0, 0)),
+        nominal.chain.placements[:, :3, 3],
+    )
+
+
+def _expected(inputs: Inputs) -> Heating:
+    """How links are expected to follow what heats them."""
+    count = inputs.told.shape[1]
+    gain = np.ones(count)
+    if inputs.kind == "currents":
+        gain = _RISE_K / np.maximum(inputs.told.mean(axis=0), 1e-9)
+    return Heating(inputs.kind, np.full(count, _TAU_S[inputs.kind]), gain)
