@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -24,6 +24,7 @@ from visioncal.calibration.parts import (
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
 from visioncal.robot import Loads, Robot, bent_joints
+from visioncal.thermal import ThermalModel
 from visioncal.types import FloatArray, Mount
 
 
@@ -101,6 +102,7 @@ class Calibration:
         payload_kg: float | FloatArray = 0.0,
         payload_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
         force_n: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
+        temperatures_c: FloatArray | None = None,
     ) -> RigidTransform:
         """Forward kinematics of the calibrated robot, which bends where that was calibrated.
 
@@ -109,17 +111,22 @@ class Calibration:
             payload_kg: Mass on the flange beside the arm's own weight; one for all, or (m,) [kg].
             payload_m: (3,) or (m, 3) its centre in the flange's frame [m].
             force_n: (3,) or (m, 3) external force on the flange's origin, in the base's frame [N].
+            temperatures_c: (m, n) of the links behind the joints, or (n,) for all [deg C]; None for
+                those at which the views began. `OnlineCompensator` tells them.
 
         Returns:
             m transforms, as one batched RigidTransform.
 
         Raises:
-            DataError: The session named no known robot, q has another number of joints, or a load
-                is none.
+            DataError: The session named no known robot, q has another number of joints, a load is
+                none, or temperatures are given and none were calibrated.
         """
         q = np.atleast_2d(q)
         loads = Loads.alike(len(q), payload_kg, payload_m, force_n)
-        return RigidTransform.from_matrix(self.standing(q, loads))
+        standing = self.standing(q, loads)
+        if temperatures_c is not None:
+            standing = standing @ self.drift.motion(q, np.asarray(temperatures_c, dtype=float))
+        return RigidTransform.from_matrix(standing)
 
     def standing(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """What `base_from_flange` gives, as (m, 4, 4).
@@ -148,6 +155,34 @@ class Calibration:
         if not rows:
             return np.zeros(0 if self.robot is None else self.robot.joint_count)
         return np.array([float(row["compliance_rad_per_nm"]) for row in rows])
+
+    @cached_property
+    def drift(self) -> ThermalModel:
+        """How the arm drifts with its temperature.
+
+        Raises:
+            DataError: That was not calibrated.
+        """
+        arm, found = self.calibrated_robot, self.stages.get("thermal")
+        if arm is None or found is None:
+            raise DataError(
+                f"calibration {self.session_name!r} does not tell how its arm drifts with "
+                "temperature.",
+                culprits=["temperatures"],
+                next_step="Record reference views while the arm warms up, with temp1_c ... or "
+                "current1_a ..., and calibrate with --level thermal.",
+            )
+        return ThermalModel.from_document(found, arm)
+
+    def at_temperatures(self, temperatures_c: FloatArray) -> Self:
+        """Returns the calibration of the arm as it is with its links at (n,) temperatures [deg C].
+
+        Raises:
+            DataError: It does not tell how the arm drifts, or has another number of joints.
+        """
+        warm = dict(self.drift.robot_at(np.asarray(temperatures_c, dtype=float)).document)
+        kinematics = {**self.stages.get("kinematics", {}), "robot": warm}
+        return replace(self, stages={**self.stages, "kinematics": kinematics})
 
     @property
     def arm_is_calibrated(self) -> bool:

@@ -20,6 +20,7 @@ from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.files import check_free, did_you_mean, some_of, write_atomically
 from visioncal.robot import Loads
+from visioncal.session.columns import no_celsius
 from visioncal.stored import load_calibration
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray
@@ -85,6 +86,14 @@ def correct_command(
             help="Warn where a joint turns farther than this from one target to the next.",
         ),
     ] = float(np.rad2deg(WIDEST_RAD)),
+    temperatures: Annotated[
+        str | None,
+        typer.Option(
+            metavar="T1,T2,...",
+            help="Temperatures of the links behind the joints, in degrees Celsius, for an arm "
+            "whose drift was calibrated; else as warm as it was when its session began.",
+        ),
+    ] = None,
     skip: Annotated[
         bool,
         typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
@@ -96,7 +105,7 @@ def correct_command(
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
-    known = load_calibration(calibration)
+    known = _warm(load_calibration(calibration), temperatures)
     arm = CalibratedArm.of(known)
     written_to = None if out is None or out == Path("-") else out
     if written_to is not None:
@@ -137,6 +146,19 @@ def correct_command(
         messages().print(escape(_posture(arm, corrected.q[rows[0]])))
     if written_to is not None:
         messages().print(escape(f"wrote {written_to}"))
+
+
+def _warm(calibration: Calibration, words: str | None) -> Calibration:
+    """The calibration of the arm as warm as is told."""
+    if words is None:
+        return calibration
+    count = calibration.drift.joint_count
+    form = ",".join(f"T{it}" for it in range(1, count + 1))
+    told = np.array(numbers_in(words, "--temperatures", form))
+    wrong = no_celsius(told)
+    if wrong:
+        raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
+    return calibration.at_temperatures(told)
 
 
 def _widest(degrees: float) -> float:

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -34,11 +35,14 @@ from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
+from visioncal.thermal import Inputs, ThermalFit
 from visioncal.transforms import invert
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
 
 # So many views of one reason are named.
 _LISTED = 40
+# Views of one pose that were taken farther apart than this are of different stops [s].
+_VISIT_S = 120.0
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
 
@@ -74,6 +78,8 @@ class Known:
         level: How far to go: `auto`, `hand-eye`, `offsets` or `kinematics`.
         convention: Of the joint table in which the arm is told; None for the stated one.
         arm: Errors that follow the arm's posture, where they are likely.
+        thermal: How the arm drifts with its temperature; None where that is not told.
+        heated_by: What heats it.
         kinematics: Which of them the views tell; None where that was not asked or cannot be.
         arm_model: The arm with these errors; None where it stays nominal.
         hand_eye: Both unknown edges.
@@ -114,6 +120,8 @@ class Known:
     level: str = "auto"
     convention: Convention | None = None
     arm: ArmErrors | None = None
+    thermal: ThermalFit | None = None
+    heated_by: Inputs | None = None
     kinematics: Kinematics | None = None
     arm_model: ArmModel | None = None
     hand_eye: HandEyeResult | None = None
@@ -294,8 +302,19 @@ class Known:
     def flange_poses(self, views: Sequence[int]) -> FloatArray:
         """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""
         if self.arm_model is None or self.joints_rad is None:
-            return np.array([self.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
-        return self.arm_model.base_from_flange(self.joints(views), self.loads(views))
+            poses = np.array([self.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
+        else:
+            poses = self.arm_model.base_from_flange(self.joints(views), self.loads(views))
+        return np.asarray(poses @ self.drift(views))
+
+    def drift(self, views: Sequence[int]) -> FloatArray:
+        """(m, 4, 4) how far the flange of some views had moved by its arm's temperature."""
+        if self.thermal is None or self.heated_by is None or not views:
+            return np.broadcast_to(np.eye(4), (len(views), 4, 4))
+        stamps = {view.number: view.stamp_s or 0.0 for view in self.session.views}
+        model = self.thermal.model
+        links = model.heating.links_c(self.heated_by, np.array([stamps[it] for it in views]))
+        return model.motion(self.joints(views), links)
 
     def joints(self, views: Sequence[int]) -> FloatArray:
         """(m, n) joint angles of some views, where all have them [rad]."""
@@ -370,7 +389,7 @@ class Known:
         views with the same reported pose and load are of one. Poses that were measured by others
         are not told apart from the robot's: of several boards, each has stops of its own then.
         """
-        declared = {view.number: view.stop for view in self.session.views}
+        declared = self._told_apart
         loads = self.loads(views).rows
         keys: dict[object, int] = {}
         stops = np.array(
@@ -388,6 +407,27 @@ class Known:
         if len(self.boards) < 2 or all(self.poses[view].corners is not None for view in views):
             return stops
         return self.shown(views).units(stops)
+
+    @cached_property
+    def _told_apart(self) -> Mapping[int, object]:
+        """What tells the stops of views apart beside their poses; None for nothing.
+
+        That is the number of their stop; or, of a pose to which the robot came back later, the
+        first view of that visit.
+        """
+        told: dict[int, object] = {}
+        last: dict[bytes, tuple[float, object]] = {}
+        for view in self.session.views:
+            pose = self.base_from_flange.get(view.number)
+            told[view.number] = view.stop
+            if view.stop is not None or pose is None or view.stamp_s is None:
+                continue
+            before, visit = last.get(key := pose.tobytes(), (view.stamp_s, None))
+            if abs(view.stamp_s - before) > _VISIT_S:
+                visit = f"back at view {view.number}"
+            last[key] = (view.stamp_s, visit)
+            told[view.number] = visit
+        return told
 
     def seen(self, views: Sequence[int]) -> list[Corners | None]:
         """The corners of some views that their poses were made from."""

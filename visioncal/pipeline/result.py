@@ -20,6 +20,7 @@ from visioncal.pipeline.fit import conditions_document, fit_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
+from visioncal.pipeline.thermal import thermal_document
 from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
@@ -61,7 +62,8 @@ def calibrate(
         session: A session, or the path of its folder or recording.
         solver: `joint` for the fit of both edges, or the name of a closed form.
         level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
-            arm, `offsets` of its joints, its `kinematics`, or `elastic` for joints that bend, too.
+            arm, `offsets` of its joints, its `kinematics`, `elastic` for joints that bend, too, or
+            `thermal` for its drift with temperature, too.
         convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         progress: Told of long work.
@@ -224,12 +226,12 @@ def _arm(known: Known) -> dict[str, Any]:
             "likelihood_ratio": known.arm.gain,
             "estimated": known.arm.is_estimated,
         }
-    kinematics = kinematics_document(known)
-    if kinematics is not None:
-        documents["kinematics"] = kinematics
-    springs = elastic_document(known)
-    if springs is not None:
-        documents["elastic"] = springs
+    arm = {
+        "kinematics": kinematics_document(known),
+        "elastic": elastic_document(known),
+        "thermal": thermal_document(known),
+    }
+    documents |= {name: it for name, it in arm.items() if it is not None}
     return documents
 
 

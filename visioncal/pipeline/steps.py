@@ -19,6 +19,7 @@ from visioncal.pipeline.choosing import arm_told, with_views_back
 from visioncal.pipeline.elastic import check_loads, with_springs
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
+from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
@@ -299,6 +300,17 @@ def _arm(known: Known) -> Arm:
     )
 
 
+def _thermal(known: Known) -> Known:
+    """Takes up the arm's drift, and refines again without it."""
+    drifting = with_drift(known)
+    if drifting.thermal is None:
+        return drifting
+    refined = _refine(drifting)
+    warnings = tuple(dict.fromkeys(refined.warnings))
+    notes = tuple(dict.fromkeys((*drifting.notes, *refined.notes)))
+    return replace(refined, warnings=warnings, notes=notes)
+
+
 def _kinematics(known: Known) -> Known:
     """Takes up the arm's errors, again with views that disagree with the arm as stated alone."""
     found = arm_told(known)
@@ -427,6 +439,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("look", _look),
     Stage("agree", _agree),
     Stage("refine", _refine),
+    Stage("thermal", _thermal),
     Stage("kinematics", _kinematics),
     Stage("hand-eye", _hand_eye),
     Stage("diagnose", _diagnose),

@@ -3,8 +3,11 @@
 import re
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean
+from visioncal.types import FloatArray
 
 POSITION = ("x_m", "y_m", "z_m")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -36,6 +39,9 @@ _TEXTS = frozenset(
     {"view", "stop", "role", "image", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
 )
+# No robot works below the one, and motors are switched off below the other [deg C]; every
+# temperature of a robot in kelvin is above them.
+_COLDEST_C, _HOTTEST_C, _ZERO_K = -60.0, 200.0, 273.15
 # Columns that name one of several cameras, robots or instruments, of which there is one as yet.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -43,6 +49,19 @@ SELECTORS = ("camera", "robot", "instrument")
 def is_number(column: str) -> bool:
     """Tells whether a column is known and holds numbers."""
     return column in _PLAIN_NUMBERS or _NUMBERED.fullmatch(column) is not None
+
+
+def no_celsius(values: FloatArray) -> str:
+    """Says what is wrong with temperatures [deg C]; empty where nothing is."""
+    beyond = values[(values < _COLDEST_C) | (values > _HOTTEST_C)]
+    if not len(beyond):
+        return ""
+    worst = float(beyond[np.argmax(np.abs(beyond))])
+    kelvin = f": it looks like kelvin, {worst - _ZERO_K:.1f} deg C" if worst > _HOTTEST_C else ""
+    return (
+        f"{worst:g} deg C is no temperature of a robot or its air{kelvin}; write degrees Celsius "
+        f"from {_COLDEST_C:g} to {_HOTTEST_C:g}"
+    )
 
 
 def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:

@@ -195,6 +195,10 @@ def check_stream(name: str, stream: Stream) -> None:
     _check_times(stream, label)
     for group in (*known.WHOLE_GROUPS, known.joint_columns(stream.columns)):
         _check_whole(stream, group, label)
+    for column in (it for it in stream.columns if it.endswith("_c") and known.is_number(it)):
+        wrong = known.no_celsius(stream[column])
+        if wrong:
+            raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
     for group in known.QUATERNION_GROUPS:
         rows = np.flatnonzero(_are_no_quaternions(stream, group))
         if len(rows):

@@ -287,6 +287,9 @@ class _RowReader:
                 )
             if column.endswith("_rad") and abs(value) > _WIDEST_RAD:
                 self.report(column, f"{value:g} rad is no angle of a joint; write radians")
+            wrong = known.no_celsius(np.array([value])) if column.endswith("_c") else ""
+            if wrong:
+                self.report(column, wrong)
 
         for column, words in load_problems(numbers):
             self.report(column, words)

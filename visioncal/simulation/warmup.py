@@ -167,7 +167,9 @@ class WarmUp:
             for view, stamp_s in zip(plain.views, self.stamps_s, strict=True)
         )
         told = self.warming.recorded(temperatures=temperatures, until_s=self.stamps_s[-1])
-        return replace(plain, views=views).with_streams({"heat": told})
+        cells = [[view.cell(it) for it in plain.columns] for view in views]
+        session = Session.assemble(plain.document, plain.columns, cells, plain.images)
+        return session.with_streams({"heat": told})
 
 
 @dataclass(frozen=True, eq=False)

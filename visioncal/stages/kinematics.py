@@ -24,6 +24,7 @@ ASKED: Mapping[str, tuple[str, ...]] = {
     "offsets": ("offsets",),
     "kinematics": ("geometry", "eccentricity"),
     "elastic": ("elastic",),
+    "thermal": tuple(LEVELS),
     "auto": tuple(LEVELS),
 }
 

@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.errors import DegenerateError
 from visioncal.estimator.closure import (
     Closure,
     Edges,
@@ -45,7 +44,7 @@ _TAU_S, _TAU_SIGMA = (
     },
 )
 # Joints at work get warmer than the air by so much, give or take a factor [K].
-_RISE_K, _GAIN_SIGMA = 20.0, 0.8
+RISE_K, _GAIN_SIGMA = 20.0, 0.8
 # Rises of all joints below these tell nothing: temperatures [K], and shares of the rise at rest.
 LEAST_RISE_K, LEAST_SHARE = 3.0, 0.15
 # A parameter counts as told where its sigma is at most this share of its prior's.
@@ -101,36 +100,23 @@ def parameter_names(model: ThermalModel) -> tuple[str, ...]:
     return tuple(f"{kind} of {joint}" for kind in kinds for joint in model.robot.joint_names)
 
 
-def check_informative(inputs: Inputs, stamps_s: FloatArray) -> None:
-    """Refuses views all of which were taken about equally warm.
-
-    Raises:
-        DegenerateError: No link's temperature changed enough.
-    """
-    heating = _expected(inputs)
-    links = heating.links_c(inputs, stamps_s)
+def uninformative(inputs: Inputs, stamps_s: FloatArray) -> str:
+    """Says why views were all taken about equally warm; empty where they were not."""
+    links = _expected(inputs).links_c(inputs, stamps_s)
     rise = float(np.ptp(links, axis=0).max())
     hours = float(np.ptp(stamps_s)) / 3600.0
-    if inputs.kind == "temperatures":
-        if rise >= LEAST_RISE_K:
-            return
-        seen = f"the joints' temperatures change by at most {rise:.2g} K"
-        needed = f"{LEAST_RISE_K:g} K are needed"
-    else:
-        if rise >= LEAST_SHARE * _RISE_K:
-            return
-        seen = (
-            f"by their currents the joints warm up by at most {100.0 * rise / _RISE_K:.2g} % of "
-            "the way"
+    during = f"in the {hours:.2g} h of the {len(stamps_s)} used stops"
+    if inputs.kind == "temperatures" and rise < LEAST_RISE_K:
+        return (
+            f"the joints' temperatures change by at most {rise:.2g} K {during}, and "
+            f"{LEAST_RISE_K:g} K are needed"
         )
-        needed = f"{100.0 * LEAST_SHARE:g} % are needed"
-    raise DegenerateError(
-        f"thermal: {seen} in the {hours:.2g} h of the {len(stamps_s)} used views, and {needed}: "
-        "they do not tell how the arm drifts.",
-        culprits=["temperatures"],
-        next_step="Begin with a cold robot, let it work for an hour or more, and look at the same "
-        "few reference views every ten minutes.",
-    )
+    if inputs.kind == "currents" and rise < LEAST_SHARE * RISE_K:
+        return (
+            f"by their currents the joints warm up by at most {100.0 * rise / RISE_K:.2g} % of the "
+            f"way {during}, and {100.0 * LEAST_SHARE:g} % are needed"
+        )
+    return ""
 
 
 def fit_thermal(
@@ -145,11 +131,7 @@ def fit_thermal(
         stops: Joint angles and times.
         inputs: What heats the arm.
         nominal: The arm without what is mounted on its flange: its lengths are what grows.
-
-    Raises:
-        DegenerateError: Temperatures hardly change.
     """
-    check_informative(inputs, stops.stamps_s)
     start = _start(robot, nominal, inputs)
     with one_blas_thread():
         cold = fit_closure(data, edges)
@@ -250,11 +232,8 @@ class _Problem:
         model, stops = self.model(values), self.stops
         links = model.heating.links_c(self.inputs, stops.stamps_s)
         moved = moved_robot(self.data, model.motion(stops.q, links))
-        grown, turned = model.columns(stops.q)
-        rises = model.rises(links)[:, None, :]
-        by_link, slopes = model.slopes(stops.q), model.heating.slopes(self.inputs, stops.stamps_s)
-        heated = [by_link * slopes[:, None, :, at] for at in range(slopes.shape[2])]
-        basis = np.concatenate([grown * rises, turned * rises, *heated], axis=2) * self.sigmas
+        heated = model.heating.slopes(self.inputs, stops.stamps_s)
+        basis = model.basis(stops.q, links, heated) * self.sigmas
         known = np.eye(self.size)
         more = Shared(known, values, np.zeros(self.size), np.zeros_like(basis), basis)
         return replace(self.data, robot=moved).with_more(more)
@@ -286,5 +265,5 @@ def _expected(inputs: Inputs) -> Heating:
     count = inputs.told.shape[1]
     gain = np.ones(count)
     if inputs.kind == "currents":
-        gain = _RISE_K / np.maximum(inputs.told.mean(axis=0), 1e-9)
+        gain = RISE_K / np.maximum(inputs.told.mean(axis=0), 1e-9)
     return Heating(inputs.kind, np.full(count, _TAU_S[inputs.kind]), gain)

@@ -1,13 +1,15 @@
 """An arm that grows and drifts with the temperatures of its links."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.robot import Robot
-from visioncal.thermal.heating import Heating
+from visioncal.thermal.heating import Heating, Kind
 from visioncal.transforms import exp
 from visioncal.types import FloatArray
 
@@ -36,6 +38,55 @@ class ThermalModel:
     drift_rad_per_k: FloatArray
     covariance: FloatArray
     lengths: FloatArray
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], robot: Robot) -> Self:
+        """Reads what `document` wrote, for the arm at the reference.
+
+        Raises:
+            LookupError, ValueError: It is none.
+        """
+        kind: Kind = "currents" if document["heated_by"] == "currents" else "temperatures"
+        rows = document["joints"]
+
+        def column(name: str) -> FloatArray:
+            return np.array([float(row[name]) for row in rows])
+
+        warm = kind == "temperatures"
+        gain = np.ones(len(rows)) if warm else column("gain_k_per_a2")
+        return cls(
+            robot,
+            Heating(kind, column("tau_s"), gain),
+            column("reference_c"),
+            column("growth_per_k"),
+            column("drift_rad_per_k"),
+            np.array(document["covariance"], dtype=float),
+            np.array(document["lengths_m"], dtype=float),
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Writes all but the arm; sigmas of tau and gain are relative."""
+        columns = {
+            "reference_c": self.reference_c,
+            "growth_per_k": self.growth_per_k,
+            "drift_rad_per_k": self.drift_rad_per_k,
+            "tau_s": self.heating.tau_s,
+        }
+        sigmas = np.sqrt(np.diag(self.covariance)).reshape(-1, self.joint_count)
+        names = ["growth_sigma_per_k", "drift_sigma_rad_per_k", "tau_sigma"]
+        if self.heating.kind == "currents":
+            columns["gain_k_per_a2"] = self.heating.gain_k_per_a2
+            names.append("gain_sigma")
+        columns |= dict(zip(names, sigmas, strict=True))
+        return {
+            "heated_by": self.heating.kind,
+            "joints": [
+                {"joint": joint} | {name: float(it[at]) for name, it in columns.items()}
+                for at, joint in enumerate(self.robot.joint_names)
+            ],
+            "covariance": self.covariance.tolist(),
+            "lengths_m": self.lengths.tolist(),
+        }
 
     @property
     def joint_count(self) -> int:
@@ -91,14 +142,41 @@ class ThermalModel:
         functions[:, 0] = self.drift_rad_per_k * rises
         return self.robot.corrected(placements, functions)
 
-    def sigma_m(self, q: FloatArray, links_c: FloatArray) -> FloatArray:
-        """(m,) how surely the drift from the reference is predicted at these temperatures [m].
+    def basis(self, q: FloatArray, links_c: FloatArray, heated: FloatArray) -> FloatArray:
+        """How the flange moves with all parameters, in the order of their covariance.
 
-        What is open about the heating counts where temperatures are computed, and not here.
+        Args:
+            q: (m, n) joint angles [rad].
+            links_c: (m, n) temperatures of the links [deg C].
+            heated: (m, n, k) how these move with the k kinds of the heating's parameters
+                (`Heating.slopes`).
+
+        Returns:
+            (m, 6, p) right perturbations.
         """
-        rises = np.broadcast_to(self.rises(links_c), q.shape)[:, None, :]
-        grown, turned = (it[:, 3:] * rises for it in self.columns(q))
-        moved, size = np.concatenate([grown, turned], axis=2), 2 * self.joint_count
+        grown, turned = self.columns(q)
+        rises, by_link = self.rises(links_c)[:, None, :], self.slopes(q)
+        parts = [by_link * heated[:, None, :, at] for at in range(heated.shape[2])]
+        return np.concatenate([grown * rises, turned * rises, *parts], axis=2)
+
+    def sigma_m(
+        self, q: FloatArray, links_c: FloatArray, heated: FloatArray | None = None
+    ) -> FloatArray:
+        """How surely the drift from the reference is predicted.
+
+        Args:
+            q: (m, n) joint angles [rad].
+            links_c: (m, n) temperatures of the links, or (n,) for all [deg C].
+            heated: (m, n, k) how these move with the heating's parameters; None leaves out what is
+                open about these.
+
+        Returns:
+            (m,) roots of the trace of the places' covariances [m].
+        """
+        links_c = np.broadcast_to(links_c, q.shape)
+        none = np.zeros((*q.shape, 0))
+        moved = self.basis(q, links_c, none if heated is None else heated)[:, 3:]
+        size = moved.shape[2]
         spread = moved @ self.covariance[:size, :size] @ np.swapaxes(moved, 1, 2)
         return np.asarray(np.sqrt(np.trace(spread, axis1=1, axis2=2)))
 

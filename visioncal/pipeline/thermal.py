@@ -1,0 +1,130 @@
+"""The arm's drift with temperature, on the way and as calibration.json has it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.estimator.arm import find_arm_errors
+from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimator.closure import Edges
+from visioncal.pipeline.known import Known
+from visioncal.robot import Robot
+from visioncal.stages.thermal import (
+    LEVEL,
+    findings,
+    is_found,
+    refuse_missing,
+    refuse_uninformative,
+)
+from visioncal.thermal import Inputs, ThermalFit, fit_thermal, inputs_of
+from visioncal.thermal.fit import Stops, uninformative
+from visioncal.types import FloatArray
+
+# The course that is told is drawn by so many points.
+_DRAWN = 200
+
+
+def with_drift(known: Known) -> Known:
+    """Takes up how the arm drifts with its temperature, where the session tells.
+
+    Raises:
+        DataError: The level asks for it, and the session lacks what it takes.
+        DegenerateError: The level asks for it, and all views were taken about equally warm.
+    """
+    if known.level not in ("auto", LEVEL):
+        return known
+    inputs, missing = _told(known)
+    if inputs is None:
+        if known.level == LEVEL:
+            raise refuse_missing(missing)
+        return known
+    why = uninformative(inputs, _stamps(known))
+    if why:
+        if known.level == LEVEL:
+            raise refuse_uninformative(why)
+        return replace(known, notes=(*known.notes, f"No drift with temperature was sought: {why}."))
+    fit = _fit(known, inputs)
+    if fit is None:
+        return known
+    known = replace(known, notes=(*known.notes, *findings(fit)))
+    return replace(known, thermal=fit, heated_by=inputs) if is_found(fit) else known
+
+
+def thermal_document(known: Known) -> dict[str, Any] | None:
+    """Writes the drift's coefficients and its course; None where none was found."""
+    fit, inputs = known.thermal, known.heated_by
+    if fit is None or inputs is None:
+        return None
+    return fit.model.document() | {
+        "not_told": list(fit.not_told),
+        "residual_mm": {"without": 1e3 * fit.before_m, "with": 1e3 * fit.after_m},
+        "likelihood_ratio": fit.gain,
+        "rises_k": fit.rises_k.tolist(),
+        "trained_s": float(np.ptp(_stamps(known))),
+        "course": _course(known, fit, inputs),
+    }
+
+
+def _told(known: Known) -> tuple[Inputs | None, str]:
+    """What heats the arm; or None, and what is missing."""
+    robot = known.zeroed_robot
+    if robot is None or known.joints_rad is None or known.solver != "joint":
+        return None, "the joint angles of every view, a known model of the robot and the joint fit"
+    used = set(known.used)
+    timeless = [it.number for it in known.session.views if it.number in used and it.stamp_s is None]
+    inputs, missing = inputs_of(known.session, robot.joint_count)
+    if inputs is not None and timeless:
+        return None, f"view {timeless[0]} has no stamp_s"
+    return inputs, missing
+
+
+def _stamps(known: Known) -> FloatArray:
+    """(s,) when the used stops were looked at [s]."""
+    stamps = {it.number: it.stamp_s for it in known.session.views}
+    first = np.unique(known.stops, return_index=True)[1]
+    return np.array([stamps[known.used[at]] or 0.0 for at in first])
+
+
+def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
+    """Fits the drift with the edges and, where they are off, the arm's links."""
+    robot, agreed = known.zeroed_robot, known.agreed
+    if robot is None or agreed is None:
+        return None
+    first = np.unique(known.stops, return_index=True)[1]
+    q = known.joints(known.used)
+    model = ArmModel.of(robot, q, known.flange_poses(known.used))
+    known = replace(known, arm=None)
+    data = known.closure(known.used).merged(known.stops)
+    edges = Edges(agreed.edges.x, agreed.edges.z, data.unchanged)
+    links = find_arm_errors(data, edges, model.columns("links", q[first]), of_links=True)
+    if links is not None:
+        data = data.with_more(links.shared())
+        edges = replace(edges, shared=data.unchanged)
+    stops = Stops(q[first], _stamps(known))
+    return fit_thermal(data, edges, model.robot, stops, inputs, robot)
+
+
+def _course(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float]]:
+    """How far the flange has drifted at the stops' mean posture, and how surely that is known."""
+    model, robot = fit.model, known.zeroed_robot
+    q = _typical(known, model.robot if robot is None else robot)
+    at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _DRAWN)
+    links = model.heating.links_c(inputs, at_s)
+    rows = np.tile(q, (len(at_s), 1))
+    moved = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
+    sigma = model.sigma_m(rows, links, model.heating.slopes(inputs, at_s))
+    rises = model.rises(links).max(axis=1)
+    return [
+        {"stamp_s": at, "drift_mm": 1e3 * drift, "sigma_mm": 1e3 * spread, "rise_k": rise}
+        for at, drift, spread, rise in zip(
+            at_s.tolist(), moved.tolist(), sigma.tolist(), rises.tolist(), strict=True
+        )
+    ]
+
+
+def _typical(known: Known, robot: Robot) -> FloatArray:
+    """(n,) the posture that most stops are near to."""
+    q = known.joints(known.used).reshape(-1, robot.joint_count)
+    away = np.abs(q - np.median(q, axis=0)).sum(axis=1)
+    return np.asarray(q[int(np.argmin(away))])
