@@ -1,76 +1,99 @@
-"""Arms that warm up, fitted as the stages do, and what is left of their drift hours later."""
+"""Arms that warm up: their sessions calibrated, and what is left of their drift hours later."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.closure import Closure, Edges
+from visioncal.calibration import Calibration
 from visioncal.estimator.workspace import postures
-from visioncal.robot import Robot, load_robot
-from visioncal.simulation import CellOptions, Heat, WarmUp, WarmUpOptions, simulate_warm_up
+from visioncal.pipeline import calibrate
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, WarmUp, WarmUpOptions, simulate_warm_up
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.warmup import heated_poses
-from visioncal.thermal import Inputs, ThermalFit, ThermalModel, fit_thermal, inputs_of
-from visioncal.thermal.fit import Stops
+from visioncal.thermal import Inputs, inputs_of
 from visioncal.types import FloatArray
 
 # What 100 minutes are to predict: the rest of five hours [s].
 TRAINED_S, END_S = 6000.0, 18000.0
-CELL = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+# Postures all over the workspace at which drift is judged.
+PLACES = 60
+CELL = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, branches=True, roll_rad=np.pi)
 
 
 @dataclass(frozen=True, eq=False)
 class Warmed:
-    """A fit of a session's views."""
+    """A calibration from the warm-up of an arm.
+
+    Attributes:
+        truth: What really was.
+        session: What was recorded of it.
+        calibration: What was made of that.
+        whole: What heats the arm, until the end.
+    """
 
     truth: WarmUp
-    inputs: Inputs
-    robot: Robot
-    fit: ThermalFit
+    session: Session
+    calibration: Calibration
+    whole: Inputs
 
 
-def warmed(options: CellOptions = CELL, *, temperatures: bool = True, **changes) -> Warmed:
-    """Simulates a warm-up and fits it, with the arm as stated."""
+def warmed(
+    options: CellOptions = CELL, *, temperatures: bool = True, level: str = "thermal", **changes
+) -> Warmed:
+    """Simulates a warm-up and calibrates with it."""
     truth = simulate_warm_up(replace(WarmUpOptions(options), **changes))
-    session, robot = truth.session("warm", temperatures=temperatures), load_robot(options.robot)
-    inputs, missing = inputs_of(session, robot.joint_count)
+    session = truth.session("warm-up", temperatures=temperatures)
+    whole = session.with_streams({"heat": truth.warming.recorded(temperatures=temperatures)})
+    inputs, missing = inputs_of(whole, truth.cell.joints.shape[1])
     assert inputs is not None, missing
-    return Warmed(truth, inputs, robot, fitted(truth, session, robot, inputs))
+    return Warmed(truth, session, calibrate(session, level=level), inputs)
 
 
-def fitted(truth: WarmUp, session, robot: Robot, inputs: Inputs) -> ThermalFit:
-    q = np.array([it.joints_rad for it in session.views])
-    camera = np.array([it.cam_from_target().as_matrix() for it in session.views])
-    flange = robot.base_from_flange(q)
-    x, z = truth.cell.transforms.values()
-    data = Closure("eye-in-hand", flange, camera)
-    return fit_thermal(
-        data, Edges(x, z, np.zeros(0)), robot, Stops(q, truth.stamps_s), inputs, robot
-    )
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Drift since the cold at k places and times, between the training and the fifth hour [m].
 
-
-def left_over(found: Warmed, *, temperatures: bool) -> tuple[FloatArray, FloatArray]:
-    """What is left of the drift since the cold, and the drift, all over the workspace [m].
-
-    Between the end of the training and the fifth hour: (k,) distances each.
+    Attributes:
+        true: (k,) how far the flange really moved.
+        left: (k,) what is left of it when the prediction is taken off.
+        sigma: (k,) how much that is expected to be.
     """
-    q = postures(found.robot)[:40]
+
+    true: FloatArray
+    left: FloatArray
+    sigma: FloatArray
+
+    @property
+    def share(self) -> float:
+        """What is left, as a share of the drift; of root mean squares."""
+        return float(np.sqrt(np.sum(self.left**2) / np.sum(self.true**2)))
+
+    @property
+    def surprise(self) -> float:
+        """What is left over what was expected; of root mean squares."""
+        return float(np.sqrt(np.mean((self.left / self.sigma) ** 2)))
+
+
+def drift_of(found: Warmed) -> Drift:
+    """Predicts the drift, all over the workspace."""
+    truth, model = found.truth, found.calibration.drift
+    nominal = load_robot(truth.cell.options.robot)
+    q = postures(nominal)[:PLACES]
     at_s = np.linspace(TRAINED_S, END_S, len(q))
-    whole = found.truth.warming.recorded(temperatures=temperatures)
-    session = found.truth.session("whole", temperatures=temperatures)
-    inputs, _ = inputs_of(session.with_streams({"heat": whole}), found.robot.joint_count)
-    predicted = _moved(found.fit.model, inputs, q, at_s)
-    true = _truly_moved(found.truth, found.truth.heat, q, at_s)
-    return np.linalg.norm(predicted - true, axis=1), np.linalg.norm(true, axis=1)
-
-
-def _moved(model: ThermalModel, inputs: Inputs, q: FloatArray, at_s: FloatArray) -> FloatArray:
-    links = model.heating.links_c(inputs, np.append(at_s, inputs.stamps_s[0]))
-    warm, cold = (model.base_from_flange(q, it) for it in (links[:-1], links[-1]))
-    return (warm - cold)[:, :3, 3]
-
-
-def _truly_moved(truth: WarmUp, heat: Heat, q: FloatArray, at_s: FloatArray) -> FloatArray:
-    links, arm = truth.warming.at(at_s), truth.cell.true_arm
-    cold = np.full_like(links, heat.ambient_c)
-    return (heated_poses(arm, heat, q, links) - heated_poses(arm, heat, q, cold))[:, :3, 3]
+    links = model.heating.links_c(found.whole, at_s)
+    cold = model.heating.links_c(found.whole, found.whole.stamps_s[:1])[0]
+    arm, heat = truth.cell.true_arm, truth.heat
+    really = truth.warming.at(at_s)
+    hot, still = (
+        heated_poses(arm, heat, q, it)[:, :3, 3]
+        for it in (really, np.full_like(really, heat.ambient_c))
+    )
+    warm, before = (model.base_from_flange(q, it)[:, :3, 3] for it in (links, cold))
+    slopes = model.heating.slopes(found.whole, at_s)
+    return Drift(
+        np.linalg.norm(hot - still, axis=1),
+        np.linalg.norm(warm - before - (hot - still), axis=1),
+        model.sigma_m(q, links, slopes),
+    )

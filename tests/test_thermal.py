@@ -1,0 +1,293 @@
+"""Drift with temperature: learnt while an arm warms up, predicted, followed, and refused."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from warmed import CELL, drift_of, warmed
+
+from visioncal import Session
+from visioncal.calibration import Calibration
+from visioncal.errors import DataError, DegenerateError
+from visioncal.pipeline import calibrate
+from visioncal.robot import load_robot
+from visioncal.session.streams import Stream
+from visioncal.simulation import Heat, Round, WarmUpOptions, simulate_warm_up
+from visioncal.thermal import Heating, Inputs, OnlineCompensator, ThermalModel, inputs_of
+from visioncal.transforms import invert, log
+
+ROBOT = load_robot("ur5e")
+GROWTH, DRIFT = np.full(6, 2e-5), np.array([3.0, -2.0, 4.0, -1.0, 2.0, 0.0]) * 1e-6
+Q = np.random.default_rng(3).uniform(-2.0, 2.0, (7, 6))
+
+
+def model(kind="currents", tau_s=1800.0, gain=2.0):
+    heating = Heating(kind, np.full(6, tau_s), np.full(6, gain))
+    return ThermalModel(
+        ROBOT,
+        heating,
+        np.full(6, 20.0),
+        GROWTH,
+        DRIFT,
+        1e-12 * np.eye(12 + heating.size),
+        ROBOT.chain.placements[:, :3, 3],
+    )
+
+
+def inputs(kind="currents", hours=2.0, seed=0):
+    stamps = np.arange(0.0, 3600.0 * hours, 40.0)
+    told = np.random.default_rng(seed).uniform(2.0, 9.0, (len(stamps), 6))
+    return Inputs(kind, stamps, told, 21.0 + np.sin(stamps / 3000.0))
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    return {
+        told: warmed(temperatures=told == "temperatures") for told in ("temperatures", "currents")
+    }
+
+
+# Over 8 worlds the median share was 0.10 and 0.18, the worst of each 0.14 and 0.34; this world is
+# not the worst. The limits are those that are promised of the median.
+@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
+def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
+    found = drift_of(learnt[told])
+    assert np.median(found.true) > 2e-4
+    assert found.share < limit
+    # Root mean squares of 60 places that share 18 or 24 parameters.
+    assert 0.4 < found.surprise < 1.8
+
+
+def test_coefficients_are_within_their_sigmas(learnt):
+    found, heat = learnt["temperatures"].calibration.drift, learnt["temperatures"].truth.heat
+    sigmas = np.sqrt(np.diag(found.covariance))
+    off = np.concatenate(
+        [found.growth_per_k - heat.growth_per_k, found.drift_rad_per_k - heat.drift_rad_per_k]
+    )
+    # Chi-square of 12 degrees of freedom is below 32.9 but for one in a thousand; growth was not
+    # drawn from its prior but from a narrower range, which only makes it smaller.
+    assert np.sum((off / sigmas[:12]) ** 2) < 32.9
+
+
+def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
+    thermal = learnt["temperatures"].calibration.stages["thermal"]
+    # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
+    assert "growth of wrist_3_joint" in thermal["not_told"]
+    assert thermal["joints"][5]["growth_per_k"] == pytest.approx(17.5e-6, abs=5.5e-6)
+    assert "drift of shoulder_lift_joint" not in thermal["not_told"]
+    assert thermal["residual_mm"]["with"] < 0.85 * thermal["residual_mm"]["without"]
+
+
+def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
+    found = warmed(replace(CELL, dh_sigma_m=3e-4, dh_sigma_rad=5e-4, seed=2))
+    assert found.calibration.stages["kinematics"]["level"] == "geometry"
+    assert drift_of(found).share < 0.2
+
+
+def test_the_calibration_tells_the_arm_at_any_temperature(learnt, tmp_path):
+    known = learnt["temperatures"].calibration
+    known.save(tmp_path / "calibration.json")
+    again = Calibration.load(tmp_path / "calibration.json")
+    warm = known.drift.reference_c + 15.0
+    at = again.base_from_flange(Q, temperatures_c=warm)
+    cold = again.base_from_flange(Q)
+    assert np.linalg.norm(at.translation - cold.translation, axis=1).min() > 1e-5
+    built = again.at_temperatures(warm).base_from_flange(Q)
+    # The motion is linear in the rise; second order of 0.2 mrad is below 0.1 um at a metre.
+    assert at.translation == pytest.approx(built.translation, abs=2e-7)
+    with pytest.raises(DataError, match=r"shape \(5,\).*6 joints"):
+        known.base_from_flange(Q, temperatures_c=np.zeros(5))
+
+
+def test_motion_is_that_of_the_arm_with_its_links_grown():
+    drifting, links = model(), 20.0 + np.array([12.0, 3.0, 8.0, -4.0, 15.0, 9.0])
+    built = drifting.robot_at(links).base_from_flange(Q)
+    # Second order: growth of 3e-4 times turns of 6e-5 at a metre.
+    assert log(invert(built) @ drifting.base_from_flange(Q, links)) == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["temperatures", "currents"])
+def test_links_follow_the_differential_equation(kind):
+    heating, heat = Heating(kind, np.full(6, 900.0), np.full(6, 2.0)), inputs(kind)
+    rest = heating.rest(heat.told, heat.ambient_c)
+    held = 0.5 * (rest[:-1] + rest[1:])
+
+    def slope(t, s):
+        at = min(int(t // 40.0), len(held) - 1)
+        return (held[at] - s) / 900.0
+
+    start = heating.cold(heat.told, heat.ambient_c)
+    end_s = heat.stamps_s[-1]
+    exact = solve_ivp(slope, (0.0, end_s), start, max_step=10.0, rtol=1e-8).y[:, -1]
+    # The integration steps across the jumps of the input; its own error is about a millikelvin.
+    assert heating.links_c(heat, np.array([end_s]))[0] == pytest.approx(exact, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", ["temperatures", "currents"])
+def test_slopes_are_those_of_small_changes(kind):
+    heating, heat = Heating(kind, np.linspace(300.0, 3000.0, 6), np.linspace(1, 2, 6)), inputs(kind)
+    at_s, step = np.linspace(100.0, 7000.0, 9), 1e-5
+    slopes = heating.slopes(heat, at_s)
+    for which in range(heating.size // 6):
+        change = np.zeros(heating.size)
+        change[6 * which : 6 * which + 6] = step
+        ahead, behind = (heating.changed(it).links_c(heat, at_s) for it in (change, -change))
+        # Central differences of steps of 1e-5 are good to about 1e-9 of the rise.
+        assert slopes[:, :, which] == pytest.approx((ahead - behind) / (2 * step), abs=1e-6)
+
+
+def test_the_flange_moves_with_the_parameters_as_it_is_told():
+    heat, at_s, step = inputs(), np.linspace(100.0, 7000.0, 7), 1e-4
+    before = model()
+    links = before.heating.links_c(heat, at_s)
+    basis = before.basis(Q, links, before.heating.slopes(heat, at_s))
+    scales = np.repeat([1e-5, 1e-6, 1.0, 1.0], 6)
+    for at in range(24):
+        poses = []
+        for sign in (1.0, -1.0):
+            change = sign * step * scales * (np.arange(24) == at)
+            other = replace(
+                before,
+                growth_per_k=GROWTH + change[:6],
+                drift_rad_per_k=DRIFT + change[6:12],
+                heating=before.heating.changed(change[12:]),
+            )
+            poses.append(other.base_from_flange(Q, other.heating.links_c(heat, at_s)))
+        seen = log(invert(poses[1]) @ poses[0]) / (2.0 * step)
+        # Columns are of first order in a motion of half a milliradian.
+        assert scales[at] * basis[:, :, at] == pytest.approx(seen, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["temperatures", "currents"])
+def test_the_compensator_follows_what_the_fit_computes(kind):
+    heat, drifting = inputs(kind), model(kind)
+    following = OnlineCompensator(drifting)
+    given = heat.told if kind == "temperatures" else np.sqrt(heat.told)
+    name = "temperatures_c" if kind == "temperatures" else "currents_a"
+    for stamp_s, row, air in zip(heat.stamps_s, given, heat.ambient_c, strict=True):
+        following.feed(stamp_s, **{name: row}, ambient_c=air)
+    links = drifting.heating.links_c(heat, heat.stamps_s[-1:])[0]
+    assert following.links_c == pytest.approx(links, abs=1e-9)
+    assert following.base_from_flange(Q) == pytest.approx(drifting.base_from_flange(Q, links))
+    assert following.robot.base_from_flange(Q) == pytest.approx(
+        following.base_from_flange(Q), abs=2e-7
+    )
+
+
+def test_advice_says_when_the_arm_is_warm():
+    following, drifting = OnlineCompensator(model()), model()
+    for minute in range(10):
+        following.feed(60.0 * minute, currents_a=np.full(6, 3.0), ambient_c=20.0)
+    advice = following.advice(Q[0], 0.2)
+    assert advice.rate_um_min > 0.2
+    assert "go on warming up" in advice.words
+    stamp_s = 540.0 + advice.wait_s
+    following.feed(stamp_s, currents_a=np.full(6, 3.0), ambient_c=20.0)
+    assert following.advice(Q[0], 0.2).wait_s == 0.0
+    # The rate is really that: the flange a minute apart.
+    places = []
+    for later in (0.0, 60.0):
+        if later:
+            following.feed(stamp_s + later, currents_a=np.full(6, 3.0), ambient_c=20.0)
+        places.append(drifting.base_from_flange(Q[:1], following.links_c)[0, :3, 3])
+    rate = 1e6 * float(np.linalg.norm(places[1] - places[0]))
+    # Over a minute of a time constant of thirty the rate falls by a thirtieth.
+    assert rate == pytest.approx(0.2, rel=0.05)
+
+
+def test_advice_by_temperatures_comes_from_how_they_level_out():
+    following = OnlineCompensator(model("temperatures", tau_s=120.0))
+    assert following.advice(Q[0], 0.5).rate_um_min is None
+    for stamp_s in np.arange(0.0, 3000.0, 20.0):
+        rise = 20.0 * (1.0 - np.exp(-stamp_s / 1800.0))
+        following.feed(stamp_s, temperatures_c=20.0 + rise * np.ones(6))
+    advice = following.advice(Q[0], 0.2)
+    wait_s = 1800.0 * np.log(advice.rate_um_min / 0.2)
+    # The rate is an average over ten minutes, and so is how it falls.
+    assert advice.wait_s == pytest.approx(wait_s, rel=0.1)
+
+
+def test_the_compensator_refuses_what_does_not_fit():
+    following = OnlineCompensator(model())
+    with pytest.raises(DataError, match="no sample"):
+        _ = following.robot
+    with pytest.raises(DataError, match="fitted to currents"):
+        following.feed(0.0, temperatures_c=np.full(6, 30.0))
+    following.feed(0.0, currents_a=np.ones(6))
+    with pytest.raises(DataError, match="does not come after"):
+        following.feed(0.0, currents_a=np.ones(6))
+    with pytest.raises(DataError, match="not above zero"):
+        following.advice(Q[0], 0.0)
+
+
+def still(**changes):
+    """A session at a constant temperature."""
+    heat = replace(Heat.drawn(0), k_per_a2=np.zeros(6), ambient_swing_k=0.0)
+    short = Round(minutes=30.0)
+    return simulate_warm_up(WarmUpOptions(CELL, heat, short, hours=0.6)).session("still", **changes)
+
+
+def test_a_session_at_one_temperature_is_refused():
+    session = still()
+    with pytest.raises(DegenerateError, match=r"change by at most .* K in the 0\.42 h") as refused:
+        calibrate(session, level="thermal")
+    assert "cold robot" in refused.value.next_step
+    known = calibrate(session)
+    assert "thermal" not in known.stages
+    assert any("No drift with temperature was sought" in it for it in known.verdict.reasons)
+
+
+def test_currents_that_warm_nothing_yet_are_refused():
+    with pytest.raises(DegenerateError, match="% of the way"):
+        calibrate(
+            simulate_warm_up(
+                WarmUpOptions(CELL, round=Round(minutes=4.0, every_s=120.0), hours=0.1)
+            ).session("short", temperatures=False),
+            level="thermal",
+        )
+
+
+def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(learnt):
+    session = learnt["temperatures"].session
+    heat = session.streams["heat"]
+    with pytest.raises(DataError, match=r"temp1_c \.\.\. temp6_c or current1_a"):
+        calibrate(replace(session, streams={}), level="thermal")
+    five = [at for at, it in enumerate(heat.columns) if it != "temp6_c"]
+    fewer = Stream(tuple(heat.columns[at] for at in five), heat.values[:, five])
+    with pytest.raises(DataError, match="temp6_c of temp1_c"):
+        calibrate(session.with_streams({"heat": fewer}), level="thermal")
+
+
+def test_kelvin_is_no_celsius(learnt, tmp_path):
+    session = learnt["temperatures"].session
+    session.save(tmp_path / "warm")
+    path = tmp_path / "warm" / "streams" / "heat.csv"
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    kelvin = [",".join([it.split(",")[0], *[repr(float(n) + 273.15) for n in it.split(",")[1:]]])
+              for it in rows]  # fmt: skip
+    path.write_text("\n".join([head, *kelvin]) + "\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"heat\.csv, column temp1_c: .*looks like kelvin"):
+        Session.load(tmp_path / "warm")
+
+
+def test_a_view_in_kelvin_is_named(learnt):
+    session = learnt["temperatures"].session
+    columns = (*session.columns, "ambient_c")
+    cells = [[*(it.cell(name) for name in session.columns), "21.5"] for it in session.views]
+    cells[4][-1] = "294.65"
+    with pytest.raises(DataError, match=re.escape("row 5, column ambient_c: 294.65")):
+        Session.assemble(session.document, columns, cells, session.images)
+
+
+def test_samples_that_are_many_are_averaged():
+    stamps = np.arange(0.0, 2000.0, 0.1)
+    values = np.column_stack([stamps, np.tile([2.0], (len(stamps), 6))])
+    names = ("stamp_s", *(f"current{it}_a" for it in range(1, 7)))
+    session = still().with_streams({"fast": Stream(names, values)})
+    session = replace(session, streams={"fast": session.streams["fast"]})
+    found, _ = inputs_of(session, 6)
+    assert found.kind == "currents"
+    assert len(found.stamps_s) <= 8192
+    assert found.told == pytest.approx(4.0)
