@@ -1,10 +1,14 @@
 """Drift with temperature: learnt while an arm warms up, predicted, followed, and refused."""
 
+import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import visioncal as run
+from drawn import column
+from pages import Page
 from scipy.integrate import solve_ivp
 from warmed import CELL, drift_of, warmed
 
@@ -12,11 +16,14 @@ from visioncal import Session
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError, DegenerateError
 from visioncal.pipeline import calibrate
+from visioncal.recording import paths, write_recording
+from visioncal.report.page import render
 from visioncal.robot import load_robot
 from visioncal.session.streams import Stream
 from visioncal.simulation import Heat, Round, WarmUpOptions, simulate_warm_up
 from visioncal.thermal import Heating, Inputs, OnlineCompensator, ThermalModel, inputs_of
 from visioncal.transforms import invert, log
+from visioncal.viewer import blueprint
 
 ROBOT = load_robot("ur5e")
 GROWTH, DRIFT = np.full(6, 2e-5), np.array([3.0, -2.0, 4.0, -1.0, 2.0, 0.0]) * 1e-6
@@ -291,3 +298,39 @@ def test_samples_that_are_many_are_averaged():
     assert found.kind == "currents"
     assert len(found.stamps_s) <= 8192
     assert found.told == pytest.approx(4.0)
+
+
+def test_report_and_recording_show_the_drift(learnt, tmp_path):
+    found = learnt["temperatures"]
+    page = Page(render(found.calibration, found.session, ()))
+    assert "Drift with temperature" in page.text
+    assert "Steel grows by 12, aluminium by 23" in page.text
+    path = tmp_path / "drift.rrd"
+    layout = blueprint(found.session, found.calibration)
+    write_recording(path, found.session, found.calibration, (), layout)
+    drifts = [it[0] for it in column(path, paths.DRIFT_MM, "Scalars:scalars").values()]
+    views = found.calibration.stages["thermal"]["views"]
+    assert len(views) == len(found.session.views)
+    assert sorted(drifts) == pytest.approx(sorted(it["drift_mm"] for it in views))
+
+
+def test_correct_goes_by_the_temperatures(learnt, tmp_path):
+    known = learnt["temperatures"].calibration
+    known.save(tmp_path / "calibration.json")
+    q = np.array([[0.4, -1.3, 1.5, -1.75, -1.57, 0.3]])
+    warm = known.drift.reference_c + 15.0
+    pose = known.base_from_flange(q, temperatures_c=warm)
+    numbers = [*pose.translation[0], *pose.rotation.as_quat()[0], *q[0]]
+    names = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", *(f"q{it}_rad" for it in range(1, 7))]
+    table = tmp_path / "targets.csv"
+    rows = [",".join(names), ",".join(map(repr, map(float, numbers)))]
+    table.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    told = ",".join(f"{it:.9f}" for it in warm)
+    done = run("correct", table, "--against", tmp_path, "--temperatures", told, "--json")
+    sent = json.loads(done.out)["targets"][0]
+    # The warm arm is at the target with the joints that the target was made of.
+    assert [sent[f"q{it}_rad"] for it in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
+    kelvin = ",".join(["300"] * 6)
+    refused = run("correct", table, "--against", tmp_path, "--temperatures", kelvin)
+    assert refused.status == 2
+    assert "looks like kelvin" in refused.err

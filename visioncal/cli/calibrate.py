@@ -31,7 +31,7 @@ def calibrate_command(
         str,
         typer.Option(
             help="The arm: auto, hand-eye (none comes out), offsets (of its joints), kinematics, "
-            "elastic (joints that bend, too)."
+            "elastic (joints that bend, too), thermal (drift with temperature, too)."
         ),
     ] = "auto",
     convention: Annotated[

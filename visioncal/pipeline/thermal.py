@@ -63,6 +63,7 @@ def thermal_document(known: Known) -> dict[str, Any] | None:
         "rises_k": fit.rises_k.tolist(),
         "trained_s": float(np.ptp(_stamps(known))),
         "course": _course(known, fit, inputs),
+        "views": _by_view(known, fit, inputs),
     }
 
 
@@ -120,6 +121,18 @@ def _course(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, flo
         for at, drift, spread, rise in zip(
             at_s.tolist(), moved.tolist(), sigma.tolist(), rises.tolist(), strict=True
         )
+    ]
+
+
+def _by_view(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float]]:
+    """How far the flange had drifted at each used view, and the largest rise of a link."""
+    stamps = {it.number: it.stamp_s or 0.0 for it in known.session.views}
+    links = fit.model.heating.links_c(inputs, np.array([stamps[it] for it in known.used]))
+    moved = np.linalg.norm(known.drift(known.used)[:, :3, 3], axis=1)
+    rises = fit.model.rises(links).max(axis=1)
+    return [
+        {"view": view, "drift_mm": 1e3 * drift, "rise_k": rise}
+        for view, drift, rise in zip(known.used, moved.tolist(), rises.tolist(), strict=True)
     ]
 
 

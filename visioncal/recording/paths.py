@@ -51,6 +51,10 @@ UNSEEN_MM = "/arm/unseen/position_mm"
 UNSEEN_DEG = "/arm/unseen/orientation_deg"
 ARM_NOTE = "/notes/arm"
 
+# Drift with temperature.
+DRIFT_MM = "/arm/warming/drift_mm"
+RISE_K = "/arm/warming/rise_k"
+
 # A plan: what is in the way, and how far the joints go.
 OBSTACLES = "/obstacles"
 WAY = "/way"

@@ -26,6 +26,7 @@ from visioncal.recording.messages import recording_id
 from visioncal.recording.reader import chunks, read_session
 from visioncal.recording.recorder import Recorder, beside
 from visioncal.recording.scene import Scene
+from visioncal.recording.thermal import Drift
 from visioncal.session import Session
 from visioncal.types import Corners, FloatArray
 
@@ -156,6 +157,7 @@ def _draw(
         armtext.log_static(stream, calibration)
     results = {} if calibration is None else {it.view: it for it in calibration.views}
     ends = {} if calibration is None else notes.scales(calibration)
+    drift = None if calibration is None else Drift.of(calibration)
     for row, view in enumerate(session.views):
         recorder.at(row)
         seen = evidence.get(view.number, ViewEvidence(view.number))
@@ -163,6 +165,8 @@ def _draw(
         overlay.log_view(stream, seen)
         if view.number in results:
             notes.log_view(stream, results[view.number], ends)
+        if drift is not None:
+            drift.log_view(stream, view.number)
     recorder.keep()
 
 

@@ -16,6 +16,7 @@ from visioncal.files import write_atomically
 from visioncal.recording.elastic import Elastic
 from visioncal.recording.findings import Findings
 from visioncal.recording.kinematics import Kinematics
+from visioncal.recording.thermal import Drift
 from visioncal.report import (
     advice,
     arm,
@@ -24,6 +25,7 @@ from visioncal.report import (
     plots,
     sources,
     springs,
+    thermal,
     tools,
     uncertainty,
 )
@@ -156,6 +158,7 @@ def _arm(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> dict[str
         "top_plot": "" if workspace is None else armplots.top_map(workspace, stops_m),
         "has_stops": len(stops_m) > 0,
         **_springs(calibration),
+        **_drift(calibration),
     }
 
 
@@ -168,6 +171,13 @@ def _springs(calibration: Calibration) -> dict[str, object]:
         "spring_facts": springs.spring_facts(found),
         "spring_plot": springs.deflection_against_load(found),
     }
+
+
+def _drift(calibration: Calibration) -> dict[str, object]:
+    found = Drift.of(calibration)
+    if found is None:
+        return {"drift_card": None, "drift_plot": ""}
+    return {"drift_card": thermal.drift_card(found), "drift_plot": thermal.course(found)}
 
 
 def _plots(

@@ -10,6 +10,7 @@ from visioncal.calibration import Calibration
 from visioncal.recording import paths
 from visioncal.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.recording.kinematics import Kinematics
+from visioncal.recording.thermal import Drift
 from visioncal.session import Session
 from visioncal.types import FloatArray
 
@@ -59,6 +60,7 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     tabs = rrb.Tabs(
         _overview(contents, eye),
         *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
+        *([] if calibration is None or Drift.of(calibration) is None else [_warming()]),
         _residuals(contents),
         _coverage(contents),
         rrb.Horizontal(
@@ -101,6 +103,15 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
     )
     right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _warming() -> rrb.Container:
+    """How the arm drifted, view by view, and how much warmer its warmest link was."""
+    return rrb.Vertical(
+        rrb.TimeSeriesView(name="Drift of the flange [mm]", origin=paths.DRIFT_MM),
+        rrb.TimeSeriesView(name="Rise of the warmest link [K]", origin=paths.RISE_K),
+        name="Temperature",
+    )
 
 
 def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
