@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from visioncal.pipeline import calibrate
     from visioncal.robot import Loads
     from visioncal.session import Session
+    from visioncal.thermal import OnlineCompensator
     from visioncal.verification import verify
 
 _HOMES = {
@@ -48,6 +49,7 @@ _HOMES = {
     "DriverError": "visioncal.errors",
     "Loads": "visioncal.robot",
     "Located": "visioncal.frames.located",
+    "OnlineCompensator": "visioncal.thermal",
     "Plane": "visioncal.frames.plane",
     "Session": "visioncal.session",
     "Sight": "visioncal.frames.sight",
@@ -71,6 +73,7 @@ __all__ = [
     "DriverError",
     "Loads",
     "Located",
+    "OnlineCompensator",
     "Plane",
     "Session",
     "Sight",

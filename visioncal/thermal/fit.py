@@ -5,6 +5,7 @@ closure, one fit. What is known of steel and aluminium, and of how fast arms war
 what the views do not tell stays there.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -26,7 +27,7 @@ from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance, damped_step, one_blas_thread
 from visioncal.estimator.shared import Shared
 from visioncal.robot import Robot
-from visioncal.thermal.heating import Heating, Inputs
+from visioncal.thermal.heating import Heating, Inputs, Kind
 from visioncal.thermal.model import ThermalModel
 from visioncal.transforms import invert
 from visioncal.types import FloatArray
@@ -36,13 +37,8 @@ _GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
 # A zero drifts by about a hundredth of a millimetre at a metre for a kelvin, either way.
 _DRIFT_SIGMA_RAD_PER_K = 1e-5
 # Gearboxes warm up in half an hour to an hour and a half; links follow a sensor in minutes.
-_TAU_S, _TAU_SIGMA = (
-    {"currents": 2400.0, "temperatures": 120.0},
-    {
-        "currents": 0.6,
-        "temperatures": 1.0,
-    },
-)
+_TAU_S: Mapping[Kind, float] = {"currents": 2400.0, "temperatures": 120.0}
+_TAU_SIGMA: Mapping[Kind, float] = {"currents": 0.6, "temperatures": 1.0}
 # Joints at work get warmer than the air by so much, give or take a factor [K].
 RISE_K, _GAIN_SIGMA = 20.0, 0.8
 # Rises of all joints below these tell nothing: temperatures [K], and shares of the rise at rest.
