@@ -60,7 +60,7 @@ def course(found: Drift) -> Markup:
     with svg.style():
         figure = svg.new_figure(_WIDE_IN, _HIGH_IN)
         axes = figure.subplots()
-        axes.fill_between(found.hours, low, high, color=svg.LINE, linewidth=0.0)
+        axes.fill_between(found.hours, low, high, color=svg.ACCENT, alpha=0.2, linewidth=0.0)
         axes.plot(found.hours, found.drift_mm, color=svg.ACCENT, linewidth=1.6)
         axes.set_xlim(float(found.hours[0]), float(found.hours[-1]))
         axes.set_ylim(bottom=min(0.0, float(low.min())))

@@ -14,8 +14,9 @@ _MINUTES = 60.0
 _AHEAD_S, _EVERY_S = 10 * 3600.0, 30.0
 # Rates of measured temperatures are taken over so long [s]: sensors are noisy.
 _SPAN_S = 600.0
-# A joint whose rise has not slowed down visibly is expected to settle so slowly [s].
-_SLOWEST_S = 5400.0
+# An arm whose rise has not slowed down visibly is expected to settle so slowly [s]; one whose rise
+# has all but ended keeps this share of its rate from one span to the next.
+_SLOWEST_S, _LEAST_SHARE = 3600.0, 1e-3
 
 
 @dataclass(frozen=True)
@@ -176,9 +177,10 @@ class OnlineCompensator:
         then = stamps[-1] - _SPAN_S * np.arange(3)
         links = [np.interp(then, stamps, it) for it in np.array(self._links).T]
         late, early = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
-        slowed = np.clip(late / np.where(early == 0.0, 1.0, early), 1e-3, None)
-        fading = slowed < np.exp(-_SPAN_S / _SLOWEST_S)
-        tau_s = np.where(fading, -_SPAN_S / np.log(np.where(fading, slowed, 0.5)), _SLOWEST_S)
+        # One share for all joints: those of single ones would follow the work from piece to piece.
+        slowed = float(late @ early) / max(float(early @ early), 1e-12)
+        slowed = min(max(slowed, _LEAST_SHARE), float(np.exp(-_SPAN_S / _SLOWEST_S)))
+        tau_s = np.full_like(late, -_SPAN_S / np.log(slowed))
         return late, np.maximum(tau_s, heating.tau_s)
 
     def _forget(self) -> None:
