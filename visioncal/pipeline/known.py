@@ -18,6 +18,7 @@ from visioncal.estimator.joint import Scene
 from visioncal.estimator.measured import Measured
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
+from visioncal.pipeline.visits import visits
 from visioncal.robot import Convention, Loads, Robot, with_zeros
 from visioncal.session import Session
 from visioncal.session.loads import loads_of
@@ -41,8 +42,6 @@ from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, 
 
 # So many views of one reason are named.
 _LISTED = 40
-# Views of one pose that were taken farther apart than this are of different stops [s].
-_VISIT_S = 120.0
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
 
@@ -389,7 +388,7 @@ class Known:
         views with the same reported pose and load are of one. Poses that were measured by others
         are not told apart from the robot's: of several boards, each has stops of its own then.
         """
-        declared = self._told_apart
+        declared = self._visits
         loads = self.loads(views).rows
         keys: dict[object, int] = {}
         stops = np.array(
@@ -409,25 +408,8 @@ class Known:
         return self.shown(views).units(stops)
 
     @cached_property
-    def _told_apart(self) -> Mapping[int, object]:
-        """What tells the stops of views apart beside their poses; None for nothing.
-
-        That is the number of their stop; or, of a pose to which the robot came back later, the
-        first view of that visit.
-        """
-        told: dict[int, object] = {}
-        last: dict[bytes, tuple[float, object]] = {}
-        for view in self.session.views:
-            pose = self.base_from_flange.get(view.number)
-            told[view.number] = view.stop
-            if view.stop is not None or pose is None or view.stamp_s is None:
-                continue
-            before, visit = last.get(key := pose.tobytes(), (view.stamp_s, None))
-            if abs(view.stamp_s - before) > _VISIT_S:
-                visit = f"back at view {view.number}"
-            last[key] = (view.stamp_s, visit)
-            told[view.number] = visit
-        return told
+    def _visits(self) -> Mapping[int, object]:
+        return visits(self.session.views, self.base_from_flange)
 
     def seen(self, views: Sequence[int]) -> list[Corners | None]:
         """The corners of some views that their poses were made from."""

@@ -21,6 +21,8 @@ from visioncal.thermal import Inputs, ThermalFit, fit_thermal, inputs_of
 from visioncal.thermal.fit import Stops, uninformative
 from visioncal.types import FloatArray
 
+# Views may be so far before the first and behind the last sample [s].
+_BEYOND_S = 300.0
 # The course that is told is drawn by so many points.
 _DRAWN = 200
 
@@ -43,7 +45,7 @@ def with_drift(known: Known) -> Known:
     if why:
         if known.level == LEVEL:
             raise refuse_uninformative(why)
-        return replace(known, notes=(*known.notes, f"No drift with temperature was sought: {why}."))
+        return known
     fit = _fit(known, inputs)
     if fit is None:
         return known
@@ -75,9 +77,18 @@ def _told(known: Known) -> tuple[Inputs | None, str]:
     used = set(known.used)
     timeless = [it.number for it in known.session.views if it.number in used and it.stamp_s is None]
     inputs, missing = inputs_of(known.session, robot.joint_count)
-    if inputs is not None and timeless:
+    if inputs is None:
+        return None, missing
+    if timeless:
         return None, f"view {timeless[0]} has no stamp_s"
-    return inputs, missing
+    first_s, last_s = inputs.stamps_s[0], inputs.stamps_s[-1]
+    stamps = _stamps(known)
+    if stamps.min() < first_s - _BEYOND_S or stamps.max() > last_s + _BEYOND_S:
+        return None, (
+            f"{inputs.kind} are told from {first_s:.10g} to {last_s:.10g} s, and views were taken "
+            f"from {stamps.min():.10g} to {stamps.max():.10g} s"
+        )
+    return inputs, ""
 
 
 def _stamps(known: Known) -> FloatArray:

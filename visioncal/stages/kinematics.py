@@ -27,6 +27,8 @@ ASKED: Mapping[str, tuple[str, ...]] = {
     "thermal": tuple(LEVELS),
     "auto": tuple(LEVELS),
 }
+# Those that ask for no level of the geometry.
+_ALL = ("auto", "thermal")
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def choose_level(
     best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
     with one_blas_thread():
         chosen = resized(data, found[best.name])
-    return Kinematics(best.name, levels, chosen.errors, asked != "auto", (found[NOMINAL], chosen))
+    return Kinematics(best.name, levels, chosen.errors, asked not in _ALL, (found[NOMINAL], chosen))
 
 
 def _with_lost_zero(

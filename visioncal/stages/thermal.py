@@ -52,9 +52,12 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         f"{figure(1e3 * fit.after_m)} mm. Its transforms are those of the arm as it was at the "
         "start; give temperatures to calibration.base_from_flange and to visioncal correct."
     )
-    names = [it for it in fit.not_told if not it.startswith("tau")]
+    # Currents tell a gain and a growth by their product alone.
+    measured = fit.model.heating.kind == "temperatures"
+    counted = ("growth", "drift") if measured else ("drift",)
+    names = [it for it in fit.not_told if it.startswith(counted)]
     if names:
         yield (
-            f"The views do not tell {some_of(names, 6)}: what is known of steel and aluminium "
+            f"The views do not tell {some_of(names, 6)}: what is known of arms, steel and aluminium "
             "stands for these."
         )
