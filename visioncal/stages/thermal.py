@@ -58,6 +58,6 @@ def findings(fit: ThermalFit) -> Iterator[str]:
     names = [it for it in fit.not_told if it.startswith(counted)]
     if names:
         yield (
-            f"The views do not tell {some_of(names, 6)}: what is known of arms, steel and aluminium "
-            "stands for these."
+            f"The views do not tell {some_of(names, 6)}: what is known of arms, steel and "
+            "aluminium stands for these."
         )
