@@ -17,7 +17,7 @@ import numpy as np
 from results import write_section
 from warmed import CELL, drift_of, warmed
 
-WORLDS = 12
+WORLDS = 8
 ARMS = {
     "as stated": CELL,
     "off by 0.3 mm, 0.5 mrad": replace(CELL, dh_sigma_m=3e-4, dh_sigma_rad=5e-4),
