@@ -128,37 +128,40 @@ def fit_thermal(
         inputs: What heats the arm.
         nominal: The arm without what is mounted on its flange: its lengths are what grows.
     """
-    start = _start(robot, nominal, inputs)
+    problem = _Problem(data, stops, inputs, _start(robot, nominal, inputs))
     with one_blas_thread():
         cold = fit_closure(data, edges)
-        before = noise_likelihood(data, cold.edges)[1]
-        problem = _Problem(data, stops, inputs, start)
-        state, noise = _State(cold.edges, np.zeros(problem.size)), cold.noise
-        for _ in range(_ROUNDS):
-            state, _ = descend(state, partial(problem.linearised, noise=noise), _SETTLED)
-            last, noise = noise, estimate_noise(problem.seen(state.values), problem.at(state))
-            if np.allclose(last.sigmas, noise.sigmas, rtol=1e-3):
-                break
-        values, count = state.values, problem.size
-        seen, at = problem.seen(values), problem.at(state)
-        after = noise_likelihood(seen, at)[1]
-        spread = covariance(closure_information(seen, at, noise))[-count:, -count:]
-        residuals = [
-            residual_blocks(it, found, noise)[0] for it, found in ((data, cold.edges), (seen, at))
-        ]
-    model = problem.model(values)
-    sigmas = problem.sigmas
-    links = model.heating.links_c(inputs, stops.stamps_s)
-    rms = [float(np.sqrt(np.mean(np.sum(it[:, 3:] ** 2, axis=1)))) for it in residuals]
+        state, noise = _descended(problem, _State(cold.edges, np.zeros(problem.size)), cold.noise)
+        seen, at = problem.seen(state.values), problem.at(state)
+        gain = noise_likelihood(data, cold.edges)[1] - noise_likelihood(seen, at)[1]
+        spread = covariance(closure_information(seen, at, noise))[-problem.size :, -problem.size :]
+        before_m, after_m = _rms_m(data, cold.edges, noise), _rms_m(seen, at, noise)
+    model, sigmas = problem.model(state.values), problem.sigmas
     return ThermalFit(
         replace(model, covariance=spread * np.outer(sigmas, sigmas)),
         state.edges,
         np.sqrt(np.diag(spread)),
-        2.0 * (before - after),
-        rms[0],
-        rms[1],
-        np.ptp(links, axis=0),
+        2.0 * gain,
+        before_m,
+        after_m,
+        np.ptp(model.heating.links_c(inputs, stops.stamps_s), axis=0),
     )
+
+
+def _descended(problem: "_Problem", state: "_State", noise: Noise) -> tuple["_State", Noise]:
+    """Minimises under the noise that the residuals show, until that stays the same."""
+    for _ in range(_ROUNDS):
+        state, _ = descend(state, partial(problem.linearised, noise=noise), _SETTLED)
+        last, noise = noise, estimate_noise(problem.seen(state.values), problem.at(state))
+        if np.allclose(last.sigmas, noise.sigmas, rtol=1e-3):
+            break
+    return state, noise
+
+
+def _rms_m(data: Closure, edges: Edges, noise: Noise) -> float:
+    """How far the stops place what they see from one another, as a root mean square [m]."""
+    residuals = residual_blocks(data, edges, noise)[0]
+    return float(np.sqrt(np.mean(np.sum(residuals[:, 3:] ** 2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False)
