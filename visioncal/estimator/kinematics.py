@@ -119,6 +119,8 @@ def resized(data: Closure, fit: LevelFit) -> LevelFit:
         data: The views of `fit_level`.
         fit: Its answer.
     """
+    if len(fit.errors) < 2:
+        return fit
     errors, edges = dict(fit.errors), fit.fit.edges
     for name, it in fit.errors.items():
         others = _erring(data, {other: errors[other] for other in errors if other != name})

@@ -5,10 +5,16 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.estimator.armmodel import ArmModel, blocks_of
+from visioncal.estimator.closure import distances
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
+from visioncal.transforms import invert, mean_transform
+from visioncal.types import Mask
+
+# Poses and joints are written with so many digits [m, rad].
+_ROUNDED = 1e-5
 
 
 def with_views_back(stated: Known, calibrated: Known) -> Known | None:
@@ -18,9 +24,26 @@ def with_views_back(stated: Known, calibrated: Known) -> Known | None:
         return None
     boards, stops = calibrated.shown(all_of), calibrated.stops_of(all_of)
     again = agree(calibrated.closure(all_of), all_of, stops, before, boards)
-    if not (again.mask & ~before.mask).any():
+    back = again.mask & (before.mask | _as_reported(stated, before.mask))
+    if not (back & ~before.mask).any():
         return None
-    return without_lost_boards(stated.agreeing(replace(again, edges=before.edges)))
+    return without_lost_boards(stated.agreeing(replace(again, mask=back, edges=before.edges)))
+
+
+def _as_reported(stated: Known, agrees: Mask) -> Mask:
+    """Which candidates' reported poses are those of their joints, as much as the others' are.
+
+    A wrong report says nothing against joints and camera, but would mislead the fit.
+    """
+    robot, views = stated.zeroed_robot, stated.candidates
+    if robot is None:
+        return agrees
+    nominal = robot.base_from_flange(stated.joints(views))
+    tools = invert(nominal) @ stated.flange_poses(views)
+    away = distances(tools, mean_transform(tools[agrees]))
+    limits = (2.0 * it[agrees].max() + _ROUNDED for it in away)
+    near = [it <= limit for it, limit in zip(away, limits, strict=True)]
+    return np.asarray(np.all(near, axis=0))
 
 
 def arm_told(known: Known) -> Known:

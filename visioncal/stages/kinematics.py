@@ -101,6 +101,10 @@ def choose_level(
     best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
     with one_blas_thread():
         chosen = resized(data, found[best.name])
+    levels = tuple(
+        _level(it, chosen, turned=turned) if it == best.name else was
+        for it, was in zip(found, levels, strict=True)
+    )
     return Kinematics(best.name, levels, chosen.errors, asked not in _ALL, (found[NOMINAL], chosen))
 
 
