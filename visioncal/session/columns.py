@@ -57,7 +57,8 @@ def no_celsius(values: FloatArray) -> str:
     if not len(beyond):
         return ""
     worst = float(beyond[np.argmax(np.abs(beyond))])
-    kelvin = f": it looks like kelvin, {worst - _ZERO_K:.1f} deg C" if worst > _HOTTEST_C else ""
+    is_kelvin = _HOTTEST_C < worst < _HOTTEST_C + _ZERO_K
+    kelvin = f": it looks like kelvin, {worst - _ZERO_K:.1f} deg C" if is_kelvin else ""
     return (
         f"{worst:g} deg C is no temperature of a robot or its air{kelvin}; write degrees Celsius "
         f"from {_COLDEST_C:g} to {_HOTTEST_C:g}"
