@@ -2,6 +2,8 @@
 
 import os
 import time
+import tomllib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,6 +30,17 @@ def test_a_missing_extra_tells_the_command_that_installs_it(monkeypatch):
             open_it()
         assert "pip install 'depthai" in caught.value.next_step
     assert os.environ["DEPTHAI_TELEMETRY"] == "0"
+
+
+def test_the_command_installs_what_the_extra_would():
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    declared = project["project"]["optional-dependencies"]
+    for extra in ("ur", "oak"):
+        with pytest.raises(DriverError) as caught:
+            extras.client_library("no_such_module", extra)
+        assert [caught.value.next_step] == [
+            f"Install it: pip install '{it}'" for it in declared[extra]
+        ]
 
 
 def a_folder(path, names=("view1.png", "view2.png", "view10.png"), shape=(48, 64)):
