@@ -4,7 +4,8 @@ Unknown are both edges, the flange's error at every view (with its variance as a
 lens where the session does not state it; the board is as stated. Derivatives are central
 differences of the simulation's projection, which shares nothing with the application's. Where the
 arm is unknown too, its parameters are those of the simulation, with the variances they were drawn
-from (van Trees 1968, section 2.4).
+from (van Trees 1968, section 2.4); then lens and board are unknown as well where they are not as
+stated.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,12 +18,14 @@ from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import project
 from visioncal.simulation.sag import giving_of, load_torques, sagging
 from visioncal.transforms import adjoint, exp, invert, log
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import Camera, FloatArray, IntArray
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
 _STEP = 1e-5
 # Springs count by how far they bend under so much [N m].
 _TORQUE_NM = 100.0
+# Exponents of what a board may be bent by.
+_BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
 
 def edge_bound(cell: Cell, views: Sequence[int] | None = None) -> FloatArray:
@@ -51,6 +54,8 @@ def edge_bound(cell: Cell, views: Sequence[int] | None = None) -> FloatArray:
 
 
 def _slopes(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
+    if not size:
+        return np.zeros((len(function(np.zeros(0))), 0))
     steps = _STEP * np.eye(size)
     return np.stack([(function(it) - function(-it)) / (2 * _STEP) for it in steps], axis=1)
 
@@ -59,10 +64,7 @@ def _pixels(cell: Cell, view: int, change: FloatArray) -> FloatArray:
     """Flat pixels of one view's corners when x, z, lens and slack change by (18 + k,)."""
     camera = cell.options.camera
     if len(change) > 18:
-        values = np.concatenate([camera.matrix, camera.distortion])
-        # Focal length and centre in thousands of pixels, so that one step suits all.
-        values = values + change[12:-6] * np.where(np.arange(len(values)) < 4, 1e3, 1.0)
-        camera = replace(camera, matrix=values[:4], distortion=values[4:])
+        camera = _other_lens(camera, change[12:-6])
     x, z = cell.transforms.values()
     flange = cell.true_base_from_flange[view] @ exp(change[-6:])
     robot = flange if cell.options.mount == "eye-in-hand" else invert(flange)
@@ -77,8 +79,8 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
 
     That is the camera's place seen from the target, or the target's middle seen from the camera.
 
-    Lens and board are as stated; both edges, all parameters of the arm and the flange's error at
-    every view are unknown.
+    Both edges, all parameters of the arm and the flange's error at every view are unknown; with
+    them lens and board, where they are not as stated. Gears that ripple add to the flange's error.
 
     Args:
         cell: The cell.
@@ -103,20 +105,46 @@ def compliance_bound(cell: Cell) -> FloatArray:
 
 def _arm_bound(cell: Cell) -> FloatArray:
     """Least covariance of x, z and the arm's parameters, those of its springs last."""
-    sigmas = _arm_sigmas(cell)
-    size = 12 + len(sigmas)
-    information = np.zeros((size, size))
-    information[12:, 12:] = np.diag(sigmas**-2.0)
-    slack = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3) ** 2
+    arm, look = _arm_sigmas(cell), _look_sigmas(cell)
+    size = 12 + len(arm)
+    information = np.diag(np.concatenate([np.zeros(12), arm**-2.0, look**-2.0]))
     for view, pose in enumerate(cell.cam_from_target):
         seen, held = cell.corners[view].ids, _held(cell, cell.joints[view], view)
         by_pose = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose @ exp(it), seen), 6)
-        camera = np.linalg.inv(by_pose.T @ by_pose) * cell.options.pixel_sigma_px**2
-        slopes, by_flange = np.split(_pose_slopes(cell, held, slack=True), [size], axis=1)
-        spread = camera + by_flange @ np.diag(slack) @ by_flange.T
-        information += slopes.T @ np.linalg.solve(spread, slopes)
+        by_look = _slopes(lambda it, pose=pose, seen=seen: _seen(cell, pose, seen, it), len(look))
+        moved, by_flange = np.split(_pose_slopes(cell, held, slack=True), [size], axis=1)
+        slopes = np.hstack([by_pose @ moved, by_look]) / cell.options.pixel_sigma_px
+        by_slack = by_pose @ by_flange / cell.options.pixel_sigma_px
+        between = by_slack.T @ slopes
+        own = by_slack.T @ by_slack + np.linalg.inv(_slack(cell, held))
+        information += slopes.T @ slopes - between.T @ np.linalg.solve(own, between)
     scale = 1.0 / np.sqrt(np.diag(information))
-    return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    return np.asarray(spread[:size, :size])
+
+
+def _slack(cell: Cell, held: "_Held") -> FloatArray:
+    """Covariance (6, 6) of the flange's error at a stop: what it does not repeat, and ripple."""
+    options, arm, q = cell.options, cell.true_arm, held.standing
+    spread = np.diag(np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2)
+    middle = invert(forward(arm, q[None])[0])
+    turned = _slopes(lambda it: log(middle @ forward(arm, (q + it)[None])[0]), len(q))
+    return np.asarray(spread + options.ripple_sigma_rad**2 * turned @ turned.T)
+
+
+def _look_sigmas(cell: Cell) -> FloatArray:
+    """Standard deviations of lens and board; empty where they are as stated.
+
+    The board is known as any printed one is: its size as stated, its sides to 0.1 %, and its bend
+    to a hundredth of its size. Of the lens nothing is.
+    """
+    options, target = cell.options, cell.options.target
+    if not options.board_bow_m and not options.lens_mismatch_px:
+        return np.zeros(0)
+    lens = np.full(4 + len(options.camera.distortion), np.inf)
+    half = 0.5 * target.square_m * max(target.columns, target.rows)
+    sides = [target.square_sigma_m / target.square_m, 1e-3]
+    return np.concatenate([lens, sides, np.full(len(_BENDS), 1e-2 * half)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,13 +177,15 @@ def _carried(cell: Cell, held: _Held) -> FloatArray:
 
 
 def _arm_sigmas(cell: Cell) -> FloatArray:
-    """Standard deviations of a, d, alpha, beta, the joints' offsets, and springs, (n,) each.
+    """Standard deviations of a, d, alpha, beta, the joints' offsets, waves and springs, (n,) each.
 
-    A spring's is how far it bends under `_TORQUE_NM`.
+    A spring's is how far it bends under `_TORQUE_NM`. Waves are those of eccentric joints.
     """
     options, count = cell.options, cell.arm.a.size
     offset = np.hypot(options.dh_sigma_rad, options.offset_sigma_rad)
     each = [options.dh_sigma_m] * 2 + [options.dh_sigma_rad] * 2 + [offset]
+    if options.eccentricity_sigma_rad:
+        each += [options.eccentricity_sigma_rad] * 2
     if cell.options.compliance_rad_per_nm:
         each.append(_TORQUE_NM * max(cell.options.compliance_rad_per_nm))
     return np.repeat(each, count)
@@ -180,6 +210,9 @@ def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
         offset=arm.offset + offset,
     )
     rest, standing = change[12 + 5 * count :], held.standing
+    if cell.options.eccentricity_sigma_rad:
+        turned, rest = rest[: 2 * count].reshape(2, count), rest[2 * count :]
+        moved = replace(moved, waves=arm.waves + np.vstack([turned, np.zeros((2, count))]))
     if cell.options.compliance_rad_per_nm:
         standing, rest = standing + rest[:count] / _TORQUE_NM * held.torques, rest[count:]
     flange = forward(moved, standing[None])[0] @ exp(rest if len(rest) else np.zeros(6))
@@ -188,6 +221,24 @@ def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
     return invert(robot @ x @ exp(change[:6])) @ z @ exp(change[6:12])
 
 
-def _seen(cell: Cell, pose: FloatArray, ids: IntArray) -> FloatArray:
+def _seen(cell: Cell, pose: FloatArray, ids: IntArray, look: Sequence[float] = ()) -> FloatArray:
+    """Flat pixels of some corners, where lens and board (`_look_sigmas`) change."""
+    camera = cell.options.camera
     points = corners_m(Sheet(cell.options.target, 1.0, 0.0))[ids]
-    return project(cell.options.camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
+    if len(look):
+        own, (scale, aspect, *bends) = np.split(look, [4 + len(camera.distortion)])
+        camera = _other_lens(camera, own)
+        points = points * [1.0 + scale - 0.5 * aspect, 1.0 + scale + 0.5 * aspect, 1.0]
+        u, v = (points - centre_m(cell.sheet))[:, :2].T / np.abs(points[:, :2]).max()
+        points[:, 2] += sum(by * u**a * v**b for by, (a, b) in zip(bends, _BENDS, strict=True))
+    return project(camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
+
+
+def _other_lens(camera: Camera, change: FloatArray) -> Camera:
+    """The camera with other intrinsics: focal length and centre change by thousands of pixels.
+
+    So one step suits all of them.
+    """
+    values = np.concatenate([camera.matrix, camera.distortion])
+    values = values + change * np.where(np.arange(len(values)) < 4, 1e3, 1.0)
+    return replace(camera, matrix=values[:4], distortion=values[4:])
