@@ -290,6 +290,19 @@ def test_noise_of_exact_data_is_nil_and_nothing_divides_by_it():
     assert np.all(np.isfinite(result.covariance))
 
 
+def test_a_covariance_is_found_where_the_eigenvalues_do_not_converge(monkeypatch):
+    slopes = np.random.default_rng(5).standard_normal((3, 20, 6))
+    information = np.swapaxes(slopes, 1, 2) @ slopes
+
+    def give_up(_):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr(np.linalg, "eigh", give_up)
+    np.testing.assert_allclose(covariance(information), np.linalg.inv(information), rtol=1e-8)
+    with pytest.raises(np.linalg.LinAlgError):
+        covariance(np.full((2, 6, 6), np.nan))
+
+
 def test_linear_algebra_says_what_it_sees():
     rng = np.random.default_rng(0)
     tall = rng.normal(size=(30, 4)) * [1.0, 1e3, 1e-3, 1.0]

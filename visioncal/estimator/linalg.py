@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import eigh
 from threadpoolctl import ThreadpoolController
 
 from visioncal.types import FloatArray, IntArray
@@ -54,7 +55,7 @@ class Spectrum:
 def spectrum(information: FloatArray) -> Spectrum:
     """Computes the scaled spectrum of an (n, n) information matrix."""
     scale = _scale(information)
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    values, vectors = _eigen(information * np.outer(scale, scale))
     directions = vectors * scale[:, None]
     return Spectrum(np.maximum(values, 0.0), directions / np.linalg.norm(directions, axis=0))
 
@@ -67,10 +68,30 @@ def covariance(information: FloatArray) -> FloatArray:
     """
     scale = _scale(information)
     outer = scale[..., :, None] * scale[..., None, :]
-    values, vectors = np.linalg.eigh(information * outer)
+    values, vectors = _eigen(information * outer)
     floor = np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
     inverse = (vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.asarray(inverse * outer)
+
+
+def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (..., n), ascending, and eigenvectors (..., n, n) of symmetric matrices.
+
+    The usual way, divide and conquer, gives up on some good matrices with many eigenvalues that are
+    all but equal, as held unknowns make them; the other way is slower and does not.
+
+    Raises:
+        LinAlgError: A matrix has entries that are no finite numbers.
+    """
+    try:
+        return np.linalg.eigh(matrices)
+    except np.linalg.LinAlgError:
+        if not np.isfinite(matrices).all():
+            raise
+    size = matrices.shape[-1]
+    pairs = [eigh(it, driver="evr") for it in matrices.reshape(-1, size, size)]
+    values, vectors = (np.array(it) for it in zip(*pairs, strict=True))
+    return values.reshape(matrices.shape[:-1]), vectors.reshape(matrices.shape)
 
 
 def gram(left: _Floats, right: _Floats) -> FloatArray:

@@ -60,8 +60,10 @@ def arm_told(known: Known) -> Known:
     loads = loads.chosen(first)
     bases = {name: model.columns(name, q[first], loads) for name in blocks_of(robot, loads)}
     data = stated.closure(known.used).merged(known.stops)
+    # What is open about the drift comes last, and is held at any level.
+    data = data.with_first(len(data.unchanged) - known.drift_size)
     lost = stated.stated_closure(known.used)
-    told = None if lost is None else lost.merged(known.stops)
+    told = None if lost is None else lost.merged(known.stops).with_first(len(data.unchanged))
     found = choose_level(data, agreed.edges, bases, known.level, told)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
     known = replace(known, compared_from_first=known.from_first)

@@ -9,7 +9,7 @@ from visioncal.estimator.arm import misfit_slopes
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
 
 # Columns of views.csv that say under which conditions a view was taken.
 CONDITIONS = ("ambient_c", "payload_kg")
@@ -19,7 +19,8 @@ def fit_document(known: Known) -> dict[str, Any] | None:
     """Writes all unknowns of the fit with their covariance; None where an instrument read them.
 
     The unknowns are, in this order: both edges of the chain, lens and board as far as something is
-    open about them, where further boards lie from the first, and the arm's errors.
+    open about them, where further boards lie from the first, and the arm's errors. What is open
+    about clocks and about drift with temperature counts in their covariance.
     """
     if known.readings is not None:
         return None
@@ -82,13 +83,24 @@ def _by_stop(model: ArmModel) -> dict[str, Any]:
 def _covariance(known: Known) -> FloatArray:
     """The fit's own, and beside it what it has in common with errors that only count in it."""
     result, errors, diagnosis = known.solved, known.arm, known.diagnosis
+    kept = _written(known)
     if errors is None or errors.is_estimated or diagnosis is None:
-        return result.covariance
+        return result.covariance[np.ix_(kept, kept)]
     data = known.closure(known.used).merged(known.stops)
     first = np.unique(known.stops, return_index=True)[1]
     by_stop = replace(errors, basis=known.arm_basis(known.used)[first])
-    slopes = misfit_slopes(data, result.edges, result.noise, by_stop)
+    slopes = misfit_slopes(data, result.edges, result.noise, by_stop)[kept]
     size, variance = slopes.shape[1], diagnosis.inflation * errors.sigma**2
     # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
     between = -variance * slopes
-    return np.block([[result.covariance, between], [between.T, variance * np.eye(size)]])
+    own = result.covariance[np.ix_(kept, kept)]
+    return np.block([[own, between], [between.T, variance * np.eye(size)]])
+
+
+def _written(known: Known) -> IntArray:
+    """Which of the chain's unknowns are written: those of clocks and of drift are left out."""
+    size, boards = len(known.solved.covariance), known.shown(known.used)
+    before, behind = 12 + boards.begin + boards.unknowns, size
+    if known.arm is not None and known.arm.is_estimated:
+        behind -= known.arm.basis.shape[2]
+    return np.concatenate([np.arange(before), np.arange(behind, size)])

@@ -36,7 +36,7 @@ from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
-from visioncal.thermal import Inputs, ThermalFit
+from visioncal.thermal import Inputs, Stops, ThermalFit
 from visioncal.transforms import invert
 from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
 
@@ -281,6 +281,8 @@ class Known:
         data = self.shown(views).brought(data)
         if self.clock is not None and self.clock.speeds and poses:
             data = data.with_more(self.clock.shared(views))
+        if self.thermal is not None and self.heated_by is not None and poses:
+            data = data.with_more(self.thermal.shared(self._thermal_stops(views), self.heated_by))
         if self.arm is not None and self.arm.is_estimated and poses:
             errors = replace(self.arm, basis=self.arm_basis(views))
             data = data.with_more(errors.shared(self.arm_values))
@@ -310,10 +312,17 @@ class Known:
         """(m, 4, 4) how far the flange of some views had moved by its arm's temperature."""
         if self.thermal is None or self.heated_by is None or not views:
             return np.broadcast_to(np.eye(4), (len(views), 4, 4))
+        stops, model = self._thermal_stops(views), self.thermal.model
+        return model.motion(stops.q, model.heating.links_c(self.heated_by, stops.stamps_s))
+
+    def _thermal_stops(self, views: Sequence[int]) -> Stops:
         stamps = {view.number: view.stamp_s or 0.0 for view in self.session.views}
-        model = self.thermal.model
-        links = model.heating.links_c(self.heated_by, np.array([stamps[it] for it in views]))
-        return model.motion(self.joints(views), links)
+        return Stops(self.joints(views), np.array([stamps[it] for it in views]))
+
+    @property
+    def drift_size(self) -> int:
+        """How many values of the drift are held; they come before the arm's errors."""
+        return 0 if self.thermal is None else len(self.thermal.values)
 
     def joints(self, views: Sequence[int]) -> FloatArray:
         """(m, n) joint angles of some views, where all have them [rad]."""

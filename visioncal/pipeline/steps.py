@@ -274,7 +274,8 @@ def _refine(known: Known) -> Known:
         return known
     if scene is None or free is None or not len(free.columns):
         data = known.closure(known.used).merged(known.stops)
-        return replace(known, arm=arm_errors(_arm(known), data, agreed.edges))
+        edges = replace(agreed.edges, shared=data.unchanged)
+        return replace(known, arm=arm_errors(_arm(known), data, edges))
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
         result = refine(scene, views, _arm(known), agreed.edges)
@@ -375,6 +376,7 @@ def _diagnose(known: Known) -> Known:
         _arm_by_stop(known),
         middles(known)[first],
         boards,
+        drifting=known.drift_size,
         calibrated=known.arm_model is not None,
     )
     spread = diagnosis.inflation * result.covariance

@@ -17,8 +17,8 @@ from visioncal.stages.thermal import (
     refuse_missing,
     refuse_uninformative,
 )
-from visioncal.thermal import Inputs, ThermalFit, fit_thermal, inputs_of
-from visioncal.thermal.fit import Stops, uninformative
+from visioncal.thermal import Inputs, Stops, ThermalFit, fit_thermal, inputs_of
+from visioncal.thermal.fit import uninformative
 from visioncal.types import FloatArray
 
 # Views may be so far before the first and behind the last sample [s].

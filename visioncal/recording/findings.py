@@ -24,6 +24,7 @@ SOURCES = {
     "intrinsics": "what is open about the lens",
     "board": "what is open about the board",
     "arm": "errors of the arm's links",
+    "temperature": "what is open about the arm's drift with temperature",
     "held_values": "values that are held",
     "misfit": "neighbouring stops that err alike",
 }

@@ -17,6 +17,7 @@ _REMEDIES = {
     "board": "squares measured over the whole board would lower it",
     "arm": "what of it looks the same in all views stays, and a calibrated arm's poses make up "
     "for it",
+    "temperature": "more views while the arm warms up would lower it",
     "held_values": "stating lens and board better, or letting them move, would lower it",
     "misfit": "a cell that has warmed up and settled would lower it",
 }

@@ -57,6 +57,7 @@ def diagnose(
     middle: FloatArray,
     boards: Boards,
     *,
+    drifting: int = 0,
     calibrated: bool = False,
 ) -> Diagnosis:
     """Looks for what noise does not explain, and splits the uncertainty by its sources.
@@ -69,6 +70,7 @@ def diagnose(
         middle: (3,) of the target, in its frame [m]; or (m, 3) of the one that each stop shows, in
             the frame of the first.
         boards: What the views show, where there are several boards.
+        drifting: How many of the unknowns are of the arm's drift with temperature.
         calibrated: Whether the arm's errors are part of the answer, and no reason for doubt.
     """
     edges, noise = result.edges, result.noise
@@ -80,7 +82,7 @@ def diagnose(
             alike = neighbours(data, rest.edges, rest.noise)
             moved = drift(data, rest.edges, rest.noise)
         source = "instrument" if data.mount == "instrument" else "pixels"
-        owners = _owners(data, free, arm, boards)
+        owners = _owners(data, free, arm, boards, drifting)
         parts = covariance_by_source(data, edges, noise, owners, source)
         if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
@@ -108,15 +110,18 @@ def diagnose(
 
 
 def _owners(
-    data: Closure, free: Free | None, arm: ArmErrors | None, boards: Boards
+    data: Closure, free: Free | None, arm: ArmErrors | None, boards: Boards, drifting: int
 ) -> dict[str, IntArray]:
-    """Which of the unknowns that all views share are whose; the arm's come last."""
+    """Which of the unknowns that all views share are whose.
+
+    The arm's errors come last, and before them its drift.
+    """
     owners: dict[str, IntArray] = {}
     shared = len(data.unchanged)
     errors = 0 if arm is None or not arm.is_estimated else arm.basis.shape[2]
-    if data.mount == "instrument" and shared > errors:
+    if data.mount == "instrument" and shared > errors + drifting:
         # Places of points, of which an instrument's readings of one stop tell by themselves.
-        owners["instrument"] = np.arange(shared - errors)
+        owners["instrument"] = np.arange(shared - errors - drifting)
     if boards.unknowns and data.camera_covariance is not None:
         # All that is known of where boards are beside the chain is from images that show several.
         owners["pixels"] = np.arange(boards.begin, boards.begin + boards.unknowns)
@@ -125,9 +130,11 @@ def _owners(
         for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
             if mask.any():
                 owners[name] = np.flatnonzero(mask)
-    behind = boards.begin + boards.unknowns
-    if data.mount != "instrument" and shared - errors > behind:
-        owners["clock"] = np.arange(behind, shared - errors)
+    behind, before = boards.begin + boards.unknowns, shared - errors - drifting
+    if data.mount != "instrument" and before > behind:
+        owners["clock"] = np.arange(behind, before)
+    if drifting:
+        owners["temperature"] = np.arange(before, before + drifting)
     if arm is not None and arm.is_estimated:
         owners["arm"] = np.arange(shared - errors, shared)
     return owners

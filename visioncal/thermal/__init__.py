@@ -1,7 +1,7 @@
 """How an arm drifts as it warms up: what heats it, how it moves with that, and when it is warm."""
 
 from visioncal.thermal.compensator import Advice, OnlineCompensator
-from visioncal.thermal.fit import ThermalFit, fit_thermal
+from visioncal.thermal.fit import Stops, ThermalFit, fit_thermal
 from visioncal.thermal.heating import Heating, Inputs, Kind
 from visioncal.thermal.model import ThermalModel
 from visioncal.thermal.sources import inputs_of
@@ -12,6 +12,7 @@ __all__ = [
     "Inputs",
     "Kind",
     "OnlineCompensator",
+    "Stops",
     "ThermalFit",
     "ThermalModel",
     "fit_thermal",

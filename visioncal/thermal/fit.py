@@ -46,6 +46,8 @@ LEAST_RISE_K, LEAST_SHARE = 3.0, 0.15
 # A parameter counts as told where its sigma is at most this share of its prior's.
 _TOLD = 0.8
 _ROUNDS, _SETTLED = 5, 1e-6
+# Information that holds a parameter against any residuals; what is known beforehand is one.
+_HELD = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,9 @@ class ThermalFit:
 
     Attributes:
         model: The arm with its coefficients and their covariance.
+        values: (p,) how far its parameters are from what was known beforehand, in units of (p,)
+            `sigmas`.
+        sigmas: To what they were known beforehand.
         edges: The edges, and what else was fitted with them.
         told: (p,) sigma of each parameter as a share of its prior's.
         gain: Twice the gain in log-likelihood over an arm that does not drift.
@@ -76,6 +81,8 @@ class ThermalFit:
     """
 
     model: ThermalModel
+    values: FloatArray
+    sigmas: FloatArray
     edges: Edges
     told: FloatArray
     gain: float
@@ -88,6 +95,15 @@ class ThermalFit:
         """The parameters that stay at what was known before, by joint."""
         names = parameter_names(self.model)
         return tuple(it for it, share in zip(names, self.told, strict=True) if share > _TOLD)
+
+    def shared(self, stops: Stops, inputs: Inputs) -> Shared:
+        """What is open about the parameters, as unknowns of the chain of some stops.
+
+        They stay where they were found, and count in the covariance with what was known of them
+        beforehand: what the stops tell of them the chain says itself.
+        """
+        free = _shared(self.model, self.values, self.sigmas, stops, inputs)
+        return replace(free, anchor=np.full(len(self.values), _HELD))
 
 
 def parameter_names(model: ThermalModel) -> tuple[str, ...]:
@@ -139,6 +155,8 @@ def fit_thermal(
     model, sigmas = problem.model(state.values), problem.sigmas
     return ThermalFit(
         replace(model, covariance=spread * np.outer(sigmas, sigmas)),
+        state.values,
+        sigmas,
         state.edges,
         np.sqrt(np.diag(spread)),
         2.0 * gain,
@@ -231,11 +249,19 @@ class _Problem:
         model, stops = self.model(values), self.stops
         links = model.heating.links_c(self.inputs, stops.stamps_s)
         moved = moved_robot(self.data, model.motion(stops.q, links))
-        heated = model.heating.slopes(self.inputs, stops.stamps_s)
-        basis = model.basis(stops.q, links, heated) * self.sigmas
-        known = np.eye(self.size)
-        more = Shared(known, values, np.zeros(self.size), np.zeros_like(basis), basis)
+        more = _shared(model, values, self.sigmas, stops, self.inputs)
         return replace(self.data, robot=moved).with_more(more)
+
+
+def _shared(
+    model: ThermalModel, values: FloatArray, sigmas: FloatArray, stops: Stops, inputs: Inputs
+) -> Shared:
+    """The parameters as unknowns of a chain, in units of (p,) sigmas, at their (p,) values."""
+    links = model.heating.links_c(inputs, stops.stamps_s)
+    heated = model.heating.slopes(inputs, stops.stamps_s)
+    basis = model.basis(stops.q, links, heated) * sigmas
+    size = len(values)
+    return Shared(np.eye(size), values, np.zeros(size), np.zeros_like(basis), basis)
 
 
 def moved_robot(data: Closure, motion: FloatArray) -> FloatArray:
