@@ -198,6 +198,11 @@ def test_the_compensator_follows_what_the_fit_computes(kind):
     assert following.robot.base_from_flange(Q) == pytest.approx(
         following.base_from_flange(Q), abs=2e-7
     )
+    # What is open about time constants and gains is followed along.
+    heated = np.tile(drifting.heating.slopes(heat, heat.stamps_s[-1:]), (len(Q), 1, 1))
+    sigma_m = drifting.sigma_m(Q, links, heated)
+    assert following.sigma_m(Q) == pytest.approx(sigma_m, rel=1e-9)
+    assert (sigma_m > drifting.sigma_m(Q, links)).all()
 
 
 def test_advice_says_when_the_arm_is_warm():

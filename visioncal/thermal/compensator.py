@@ -48,6 +48,23 @@ class Advice:
         return f"{now}: go on warming up for {minutes:.0f} min to come under {self.limit_um_min:g}."
 
 
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """The links at a sample.
+
+    Attributes:
+        rest: (n,) where they would come to rest [deg C].
+        driven: (n,) what of that is by motor currents [K].
+        links: (n,) what they have [deg C].
+        slopes: (n, s) how that moves with the heating's parameters; see `Heating.slopes`.
+    """
+
+    rest: FloatArray
+    driven: FloatArray
+    links: FloatArray
+    slopes: FloatArray
+
+
 class OnlineCompensator:
     """Follows an arm's temperatures.
 
@@ -63,8 +80,8 @@ class OnlineCompensator:
         """
         self._model = model
         self._stamps_s: list[float] = []
-        self._rests: list[FloatArray] = []
         self._links: list[FloatArray] = []
+        self._last: _Sample | None = None
 
     def feed(
         self,
@@ -100,16 +117,26 @@ class OnlineCompensator:
             )
         told = told if heating.kind == "temperatures" else told**2
         air = float(self._model.reference_c.mean()) if ambient_c is None else ambient_c
-        rest = heating.rest(told[None], np.array([air]))[0]
-        if self._stamps_s:
-            mean = 0.5 * (rest + self._rests[-1])
-            links = heating.step(self._links[-1], mean, stamp_s - self._stamps_s[-1])
-        else:
-            links = heating.cold(told[None], np.array([air]))
+        self._last = self._after(told, air, stamp_s)
         self._stamps_s.append(stamp_s)
-        self._rests.append(rest)
-        self._links.append(links)
+        self._links.append(self._last.links)
         self._forget()
+
+    def _after(self, told: FloatArray, air: float, stamp_s: float) -> _Sample:
+        """The links at a new sample of what heats them (n,) and of the air [deg C]."""
+        heating, last = self._model.heating, self._last
+        ambient = np.array([air])
+        rest = heating.rest(told[None], ambient)[0]
+        driven = rest - air if heating.kind == "currents" else np.zeros_like(rest)
+        if last is None:
+            still = np.zeros((len(rest), heating.size // len(rest)))
+            return _Sample(rest, driven, heating.cold(told[None], ambient), still)
+        seconds = stamp_s - self._stamps_s[-1]
+        mean = 0.5 * (rest + last.rest)
+        by = 0.5 * (driven + last.driven)
+        links = heating.step(last.links, mean, seconds)
+        slopes = heating.step_slopes(last.slopes, last.links, mean, by, seconds)
+        return _Sample(rest, driven, links, slopes)
 
     @property
     def links_c(self) -> FloatArray:
@@ -118,9 +145,13 @@ class OnlineCompensator:
         Raises:
             DataError: Nothing was fed yet.
         """
-        if not self._links:
+        return self._now.links
+
+    @property
+    def _now(self) -> _Sample:
+        if self._last is None:
             raise DataError("thermal: the compensator was fed with no sample yet.")
-        return self._links[-1]
+        return self._last
 
     @property
     def robot(self) -> Robot:
@@ -132,8 +163,14 @@ class OnlineCompensator:
         return self._model.base_from_flange(q, self.links_c)
 
     def sigma_m(self, q: FloatArray) -> FloatArray:
-        """(m,) how surely its drift is known; see `ThermalModel.sigma_m`."""
-        return self._model.sigma_m(q, self.links_c)
+        """(m,) how surely its drift is known at (m, n) joint angles [m]; see `ThermalModel`.
+
+        Raises:
+            DataError: Nothing was fed yet.
+        """
+        now = self._now
+        slopes = np.broadcast_to(now.slopes, (len(q), *now.slopes.shape))
+        return self._model.sigma_m(q, now.links, slopes)
 
     def advice(self, q: FloatArray, limit_um_min: float) -> Advice:
         """Says whether the arm is warm enough to work, and else how long to wait.
@@ -168,9 +205,9 @@ class OnlineCompensator:
         """How fast links warm up (n,) [K/s], and how that fades (n,) [s]; None for too little."""
         heating = self._model.heating
         if heating.kind == "currents":
-            if not self._links:
+            if self._last is None:
                 return None
-            return (self._rests[-1] - self._links[-1]) / heating.tau_s, heating.tau_s
+            return (self._last.rest - self._last.links) / heating.tau_s, heating.tau_s
         stamps = np.array(self._stamps_s)
         if not len(stamps) or stamps[-1] - stamps[0] < 2.0 * _SPAN_S:
             return None
@@ -186,5 +223,5 @@ class OnlineCompensator:
     def _forget(self) -> None:
         """Drops samples older than rates need."""
         while len(self._stamps_s) > 2 and self._stamps_s[1] < self._stamps_s[-1] - 2.1 * _SPAN_S:
-            for it in (self._stamps_s, self._rests, self._links):
-                it.pop(0)
+            self._stamps_s.pop(0)
+            self._links.pop(0)

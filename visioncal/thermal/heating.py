@@ -85,6 +85,34 @@ class Heating:
         """(n,) temperatures some time after others, under a constant rest [deg C]."""
         return np.asarray(rest + np.exp(-seconds / self.tau_s) * (before - rest))
 
+    def step_slopes(
+        self,
+        slopes: FloatArray,
+        before: FloatArray,
+        rest: FloatArray,
+        driven: FloatArray,
+        seconds: float,
+    ) -> FloatArray:
+        """How temperatures some time after others move with the parameters.
+
+        Args:
+            slopes: (n, s) how they moved with them before, as `slopes` has them.
+            before: (n,) what they were [deg C].
+            rest: (n,) where they would come to rest [deg C].
+            driven: (n,) what of that is by motor currents [K].
+            seconds: The time [s].
+
+        Returns:
+            (n, s).
+        """
+        share = seconds / self.tau_s
+        kept = np.exp(-share)
+        after = kept[:, None] * slopes
+        after[:, 0] += kept * share * (before - rest)
+        if self.kind == "currents":
+            after[:, 1] += (1.0 - kept) * driven
+        return np.asarray(after)
+
     def links_c(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
         """(m, n) temperatures of the links at some times [deg C]."""
         return self._at(inputs, at_s, self._course(inputs)[0])
