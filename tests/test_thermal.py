@@ -15,6 +15,7 @@ from warmed import CELL, drift_of, warmed
 from visioncal import Session
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError, DegenerateError
+from visioncal.exports import document
 from visioncal.pipeline import calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -108,6 +109,11 @@ def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
     found = warmed(replace(CELL, mount="eye-to-hand", dh_sigma_m=3e-4, dh_sigma_rad=5e-4, seed=2))
     assert found.calibration.stages["kinematics"]["level"] == "geometry"
     assert drift_of(found).share < 0.2
+    # A file of the arm has no place for the drift, and says so to whoever reads it.
+    for form in ("robot-dh", "robot-urdf", "robot-json"):
+        written = document(found.calibration, form)
+        assert any("drifts with its temperature" in it for it in written.warnings)
+        assert "the arm with links at 21 deg C" in written.text
 
 
 def test_the_calibration_tells_the_arm_at_any_temperature(learnt, tmp_path):
@@ -331,6 +337,20 @@ def test_report_and_recording_show_the_drift(learnt, tmp_path):
     page = Page(render(found.calibration, found.session, ()))
     assert "Drift with temperature" in page.text
     assert "Steel grows by 12, aluminium by 23" in page.text
+    assert "seen by the stops" in page.text
+    seen = found.calibration.stages["thermal"]["seen"]
+    # Of the six views that are looked at again every five minutes, one is in the posture drawn.
+    assert [it["stamp_s"] // 300.0 for it in seen] == list(range(20))
+    course = found.calibration.stages["thermal"]["course"]
+    told = np.interp(
+        [it["stamp_s"] for it in seen],
+        [it["stamp_s"] for it in course],
+        [it["drift_mm"] for it in course],
+    )
+    off = np.array([it["drift_mm"] for it in seen]) - told
+    # Poses that are measured to about 0.05 mm along one direction, of twenty stops.
+    assert abs(off.mean()) < 0.04
+    assert 0.01 < off.std() < 0.1
     path = tmp_path / "drift.rrd"
     layout = blueprint(found.session, found.calibration)
     write_recording(path, found.session, found.calibration, (), layout)

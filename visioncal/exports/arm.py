@@ -44,6 +44,8 @@ class ArmContent:
         calibration_hash: What marks the arm for its driver, where that was said.
         sag_mm: How far the flange of an arm whose joints bend stands off at the most under its own
             weight [mm]; zero for a rigid one.
+        cold_c: Least and greatest temperature of its links [deg C], for one that drifts with it.
+        drift_mm: How far that moved its flange at the most, in one posture of the session [mm].
     """
 
     nominal: Robot
@@ -54,6 +56,13 @@ class ArmContent:
     convention: Convention | None = None
     calibration_hash: str | None = None
     sag_mm: float = 0.0
+    cold_c: tuple[float, float] | None = None
+    drift_mm: float = 0.0
+
+    @property
+    def omitted(self) -> tuple[str, ...]:
+        """What no file holds of the arm, and what that costs."""
+        return tuple(it for it in (self.sagging, self.drifting) if it)
 
     @property
     def sagging(self) -> str:
@@ -64,6 +73,19 @@ class ArmContent:
             "its joints bend under load, which has no place in it: this is the arm without weight. "
             f"Under its own it stands off by up to {self.sag_mm:.2g} mm (visioncal correct counts "
             "that)"
+        )
+
+    @property
+    def drifting(self) -> str:
+        """What no file holds of an arm that drifts with its temperature; else empty."""
+        if self.cold_c is None:
+            return ""
+        low, high = (f"{it:.0f}" for it in self.cold_c)
+        links = f"links at {low} deg C" if low == high else f"links at {low} to {high} deg C"
+        return (
+            "it drifts with its temperature, which has no place in it: this is the arm with "
+            f"{links}. In one posture of the session its flange moved by up to {self.drift_mm:.2g} "
+            "mm as it warmed up (visioncal correct --temperatures counts that)"
         )
 
     @property
@@ -78,7 +100,7 @@ class ArmContent:
             worth,
             f"{self.robot.name}, calibrated: base_from_flange, the pose of {self.robot.tip} in the "
             "base; the calibration's transforms go with this arm, not with the nominal one",
-            *([self.sagging] if self.sagging else []),
+            *self.omitted,
         ]
 
     @property
@@ -154,6 +176,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         None if selection.convention is None else _convention(selection.convention),
         selection.calibration_hash,
         _sag_mm(source),
+        *_drift(source),
     )
 
 
@@ -165,6 +188,16 @@ def _sag_mm(calibration: Calibration) -> float:
     q = postures(arm)
     away = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
     return 1e3 * float(np.linalg.norm(away, axis=1).max())
+
+
+def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]:
+    """Temperatures of the links to which the arm belongs, and how far it drifted from that [mm]."""
+    if "thermal" not in calibration.stages:
+        return None, 0.0
+    model = calibration.drift
+    course = calibration.stages["thermal"]["course"]
+    cold_c = float(model.reference_c.min()), float(model.reference_c.max())
+    return cold_c, max(float(it["drift_mm"]) for it in course)
 
 
 def omission_mm(robot: Robot) -> float:

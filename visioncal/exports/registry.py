@@ -82,8 +82,8 @@ def document(source: Source, to: str, selection: Selection = _EVERYTHING) -> Doc
     form = _find(to)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
-        sagging = (f"{arm.sagging}.",) if arm.sagging else ()
-        return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm), *sagging))
+        omitted = tuple(f"{it}." for it in arm.omitted)
+        return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm), *omitted))
     content = select(source, selection, form)
     warning = form.warn(content)
     return Document(

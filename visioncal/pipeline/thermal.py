@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.estimator.arm import find_arm_errors
 from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import Edges
+from visioncal.estimator.closure import Edges, flange_to_residual, residual_blocks
 from visioncal.pipeline.known import Known
 from visioncal.robot import Robot
 from visioncal.stages.thermal import (
@@ -23,6 +23,8 @@ from visioncal.types import FloatArray
 
 # Views may be so far before the first and behind the last sample [s].
 _BEYOND_S = 300.0
+# Joints that are within this of a posture are in it [rad].
+_SAME_RAD = 1e-3
 # The course that is told is drawn by so many points.
 _DRAWN = 200
 
@@ -65,6 +67,7 @@ def thermal_document(known: Known) -> dict[str, Any] | None:
         "rises_k": fit.rises_k.tolist(),
         "trained_s": float(np.ptp(_stamps(known))),
         "course": _course(known, fit, inputs),
+        "seen": _seen(known, fit, inputs),
         "views": _by_view(known, fit, inputs),
     }
 
@@ -135,6 +138,33 @@ def _course(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, flo
     ]
 
 
+def _seen(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float]]:
+    """How far the stops in that posture see the flange to have moved, by their first view.
+
+    What is left of a stop is taken for its flange's, and counted along the drift's direction: its
+    length alone would grow with noise.
+    """
+    first = np.unique(known.stops, return_index=True)[1]
+    views = [known.used[at] for at in first]
+    q, stamps_s, model = known.joints(views), _stamps(known), fit.model
+    robot = known.zeroed_robot
+    there = np.abs(q - _typical(known, model.robot if robot is None else robot)).max(axis=1)
+    chosen = np.flatnonzero(there < _SAME_RAD)
+    data, result = known.closure(known.used).merged(known.stops), known.solved
+    residuals = residual_blocks(data, result.edges, result.noise)[0]
+    by_flange = flange_to_residual(data.under(result.edges.shared), result.edges)
+    left = -np.linalg.solve(by_flange, residuals[:, :, None])[chosen, 3:, 0]
+    moved = model.motion(q[chosen], model.heating.links_c(inputs, stamps_s[chosen]))[:, :3, 3]
+    # Where it has hardly moved it has no direction: that of the farthest stop serves them all.
+    lengths = np.linalg.norm(moved, axis=1)
+    far = moved[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
+    seen = lengths + left @ far
+    return [
+        {"view": views[at], "stamp_s": float(stamps_s[at]), "drift_mm": 1e3 * drift}
+        for at, drift in zip(chosen.tolist(), seen.tolist(), strict=True)
+    ]
+
+
 def _by_view(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float]]:
     """How far the flange had drifted at each used view, and the largest rise of a link."""
     stamps = {it.number: it.stamp_s or 0.0 for it in known.session.views}
@@ -148,7 +178,9 @@ def _by_view(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, fl
 
 
 def _typical(known: Known, robot: Robot) -> FloatArray:
-    """(n,) the posture that most stops are near to."""
-    q = known.joints(known.used).reshape(-1, robot.joint_count)
+    """(n,) the posture that most stops are in; of several, the one that most are near to."""
+    first = np.unique(known.stops, return_index=True)[1]
+    q = known.joints(known.used).reshape(-1, robot.joint_count)[first]
+    alike = [int((np.abs(q - it).max(axis=1) < _SAME_RAD).sum()) for it in q]
     away = np.abs(q - np.median(q, axis=0)).sum(axis=1)
-    return np.asarray(q[int(np.argmin(away))])
+    return np.asarray(q[np.lexsort((away, -np.array(alike)))[0]])

@@ -44,6 +44,8 @@ class Drift:
         hours: (k,) times since the first sample [h].
         drift_mm: (k,) how far the flange had moved then, at a posture of the views [mm].
         sigma_mm: (k,) how surely that is known [mm].
+        seen: (s, 2) when stops in that posture were looked at [h], and how far the flange was seen
+            to have moved [mm].
         by_view: Drift [mm] and the largest rise [K] by view.
     """
 
@@ -54,6 +56,7 @@ class Drift:
     hours: FloatArray
     drift_mm: FloatArray
     sigma_mm: FloatArray
+    seen: FloatArray
     by_view: Mapping[int, tuple[float, float]]
 
     @classmethod
@@ -80,6 +83,8 @@ def _drift(document: Mapping[str, Any]) -> Drift:
         return np.array([float(row[name]) for row in course])
 
     stamps_s = column("stamp_s")
+    # Results of earlier versions tell of no stops.
+    seen = [(float(it["stamp_s"]), float(it["drift_mm"])) for it in document.get("seen", ())]
     return Drift(
         str(document["heated_by"]),
         tuple(_joint(row, document["not_told"]) for row in document["joints"]),
@@ -88,6 +93,7 @@ def _drift(document: Mapping[str, Any]) -> Drift:
         (stamps_s - stamps_s[0]) / 3600.0,
         column("drift_mm"),
         column("sigma_mm"),
+        (np.reshape(seen, (-1, 2)) - [stamps_s[0], 0.0]) / [3600.0, 1.0],
         {int(it["view"]): (float(it["drift_mm"]), float(it["rise_k"])) for it in document["views"]},
     )
 
