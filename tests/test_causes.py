@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.estimator.causes import Belief, Cause, _at, _undone, explain
+from visioncal.estimator.causes import Belief, Cause, _at, explain, undone
 from visioncal.estimator.closure import Closure, Edges, Noise
 from visioncal.transforms import adjoint, exp, invert, log
 
@@ -72,11 +72,11 @@ def test_a_board_that_was_turned_over_is_told_exactly(mount):
     assert exp(found.values) == pytest.approx(exp(change), abs=1e-6)
     # Exact stops leave nothing but rounding.
     assert found.misfit == pytest.approx(0.0, abs=1e-3)
-    undone = _undone(turned, cause, found.values)
-    assert undone.camera == pytest.approx(data.camera, abs=1e-6)
+    before = undone(turned, cause, found.values)
+    assert before.camera == pytest.approx(data.camera, abs=1e-6)
     # What was noise of the turned board's pose is noise of it where it was.
     carried = adjoint(invert(exp(-change)))
-    assert undone.camera_covariance[0] == pytest.approx(1e-10 * carried @ carried.T, rel=1e-4)
+    assert before.camera_covariance[0] == pytest.approx(1e-10 * carried @ carried.T, rel=1e-4)
 
 
 def test_misfit_and_evidence_follow_their_distributions():

@@ -9,10 +9,12 @@ import pytest
 from cells import calibrated, known_of, session_of
 from commands import visioncal
 from later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
+from pages import Page
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.pipeline.result import result_of
+from visioncal.report.check import render_check
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Payload, simulate, write_session
@@ -22,6 +24,7 @@ from visioncal.transforms import adjoint, compose, exp, invert, log
 from visioncal.verification import facts_of, load_policy, outcomes, sentences, to_document
 from visioncal.verification.check import check
 from visioncal.verification.footing import Footing
+from visioncal.verification.page import page_of
 from visioncal.verification.seeing import known_before, seen_by
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -129,6 +132,29 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     assert "View 2 alone contradicts" in sentences(found)[0]
 
 
+def test_the_page_shows_what_is_left_with_the_change_undone(place):
+    found = checked(
+        place, np.random.default_rng(9), Change(camera=knock(np.random.default_rng(9), 2.0, 0.2))
+    )
+    before, after = (np.linalg.norm(it[:, 3:], axis=1) for it in (found.away, found.left))
+    # Two millimetres and 0.2 deg at half a metre become the noise of stops, some tenths of that.
+    assert np.sqrt(np.mean(after**2)) < 0.3 * np.sqrt(np.mean(before**2))
+    policy = outcomes(
+        load_policy(),
+        facts_of(found.seen.known.session, place.calibration, failed=True, collision=True),
+    )
+    page = Page(render_check(page_of(found, policy)))
+    assert "does not hold any more" in page.words
+    assert "with the likeliest change undone: the camera moved by" in page.words
+    assert [f"{1e3 * it:.3f}" in page.words for it in (*before, *after)] == [True] * 10
+    assert "now a collision" in page.words
+    passed = checked(place, np.random.default_rng(0))
+    assert (passed.left == passed.away).all()
+    assert "undone" not in Page(render_check(page_of(passed, ()))).words
+    more = checked(place, np.random.default_rng(6), Change(noise_factor=8.0))
+    assert "undone" not in Page(render_check(page_of(more, ()))).words
+
+
 def test_two_slips_are_more_than_one_change_explains():
     place = usual("eye-in-hand")
     change = Change(joints_rad=np.deg2rad([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]))
@@ -184,6 +210,9 @@ def test_one_of_two_boards_that_moved_is_named():
     camera = np.where(mine[:, None, None], moved.data.camera @ exp(carry), moved.data.camera)
     found = check(replace(moved, data=replace(moved.data, camera=camera)), footing)
     assert names(found)[0] == f"board {tuple(footing.targets)[1]}"
+    with pytest.raises(DataError, match="several boards") as refused:
+        check(moved, footing, board_placed_anew=True)
+    assert "the one that moved is named" in refused.value.next_step
 
 
 def test_other_cells_are_refused_by_what_differs():
@@ -272,6 +301,13 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     written = json.loads((tmp_path / "check/verify.json").read_text())
     assert written["passed"]
     assert not written["recalibrate"]
+    page = Page((tmp_path / "check/report.html").read_text(encoding="utf-8"))
+    assert "The calibration still holds" in page.words
+    assert not [it for it in page.references if not it.startswith(("#", "data:"))]
+    # A check has no business with the files of a calibration.
+    refused = visioncal("verify", pairs / "later", "--against", out, "-o", out)
+    assert refused.status == 2
+    assert "holds a calibration" in refused.err
     session = Session.load(pairs / "later")
     # The camera's poses as if it had been knocked by 20 mm along its own x.
     pushed = tuple(

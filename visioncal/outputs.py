@@ -1,4 +1,4 @@
-"""What `visioncal calibrate` and `visioncal plan` write into a folder."""
+"""What `visioncal calibrate`, `visioncal verify` and `visioncal plan` write into a folder."""
 
 import json
 import tempfile
@@ -12,8 +12,10 @@ from visioncal.pipeline import Run
 from visioncal.planning.plan import Plan
 from visioncal.planning.written import program_of, stops_table
 from visioncal.session import Session
+from visioncal.verification import Check, Outcome
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
+VERIFY = "verify.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 
 
@@ -52,6 +54,42 @@ def write_outputs(
     # The result last: it is what the others are beside.
     files = (*([] if session is None else [RECORDING]), REPORT, CALIBRATION)
     return _write_together(folder, files, write)
+
+
+def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], document: str) -> None:
+    """Writes a check's page and JSON into a folder, together or not at all.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        check: The check.
+        triggers: What became of the policy's triggers.
+        document: The content of verify.json.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.report.check import write_check as write_page
+    from visioncal.verification.page import page_of
+
+    def write(aside: Path) -> None:
+        write_page(aside / REPORT, page_of(check, triggers))
+        write_atomically(aside / VERIFY, document)
+
+    _write_together(folder, (REPORT, VERIFY), write)
+
+
+def refuse_calibration(folder: Path) -> None:
+    """Refuses a folder whose report is a calibration's.
+
+    Raises:
+        DataError: It is one.
+    """
+    if (folder / CALIBRATION).exists():
+        raise DataError(
+            f"{folder} holds a calibration, whose {REPORT} the check's would replace.",
+            culprits=[str(folder)],
+            next_step="Name another folder with -o.",
+        )
 
 
 def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[Path, ...]:

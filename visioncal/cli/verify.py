@@ -11,7 +11,7 @@ from rich.markup import escape
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
-from visioncal.files import named_errors, write_atomically
+from visioncal.outputs import REPORT, VERIFY, refuse_calibration, write_check
 from visioncal.session import Session
 from visioncal.stored import load_calibration
 from visioncal.verification import (
@@ -25,7 +25,6 @@ from visioncal.verification import (
     verify,
 )
 
-FILE = "verify.json"
 # A check said no.
 _EXIT_FAILED = 3
 # What comes of the triggers of the policy.
@@ -55,9 +54,9 @@ def verify_command(
         typer.Option(help="A table of one's own of when to calibrate again (.toml)."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help=f"A folder for {FILE}.")
+        Path | None, typer.Option("-o", "--output", help=f"A folder for {REPORT} and {VERIFY}.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help=f"Print {FILE}.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help=f"Print {VERIFY}.")] = False,
 ) -> None:
     """Tell whether a calibration still holds, and what has changed if it does not.
 
@@ -69,6 +68,8 @@ def verify_command(
             culprits=["--against"],
             next_step="Name the output folder of visioncal calibrate.",
         )
+    if output is not None:
+        refuse_calibration(output)
     triggers = load_policy(policy)
     calibration, loaded = load_calibration(against), Session.load(session)
     with shown_progress(quiet=as_json) as progress:
@@ -77,9 +78,7 @@ def verify_command(
     fired = outcomes(triggers, facts)
     document = json.dumps(to_document(check, fired), indent=2, allow_nan=False) + "\n"
     if output is not None:
-        with named_errors(output):
-            output.mkdir(parents=True, exist_ok=True)
-        write_atomically(output / FILE, document)
+        write_check(output, check, fired, document)
     if as_json:
         write_stdout(document)
     else:

@@ -162,11 +162,11 @@ def _rested(
 
 def _at(data: Closure, belief: Belief, cause: Cause, values: FloatArray, factor: float) -> _Stops:
     """Linearises at some values (p,) of a cause."""
-    undone, known = _undone(data, cause, values), len(belief.covariance)
+    without, known = undone(data, cause, values), len(belief.covariance)
     shared = np.concatenate([belief.edges.shared, np.zeros(len(values))])
     noise = Noise(factor * belief.noise.sigma_rad, factor * belief.noise.sigma_m)
     residuals, jacobian, spreads = residual_blocks(
-        undone, replace(belief.edges, shared=shared), noise
+        without, replace(belief.edges, shared=shared), noise
     )
     slopes = jacobian.reshape(-1, known + len(values))
     before, own = slopes[:, :known], slopes[:, known:]
@@ -175,10 +175,18 @@ def _at(data: Closure, belief: Belief, cause: Cause, values: FloatArray, factor:
     return _Stops(values, residuals.reshape(-1) - own @ values, own, spread)
 
 
-def _undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
+def undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
     """The stops as they would be without a change of some size, and how they go on moving with it.
 
     A change may be large: a board that was put elsewhere has turned by any angle.
+
+    Args:
+        data: The stops.
+        cause: What has changed.
+        values: (p,) its unknowns, by how much.
+
+    Returns:
+        The stops, with the p unknowns behind those that they share.
     """
     by_camera, by_flange = (
         _stepped(slopes, values) for slopes in (cause.by_camera, cause.by_flange)

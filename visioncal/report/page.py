@@ -7,7 +7,6 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from visioncal.calibration import Calibration, ViewResult
 from visioncal.errors import DataError
@@ -29,6 +28,7 @@ from visioncal.report import (
     tools,
     uncertainty,
 )
+from visioncal.report.templating import template
 from visioncal.report.thumbnails import Thumbnail, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
@@ -67,14 +67,7 @@ def render(
     note: str = "",
 ) -> str:
     """Renders the report as HTML text; see `write_report`."""
-    environment = Environment(
-        loader=PackageLoader("visioncal", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2").render(
+    return template("report.html.j2").render(
         calibration=calibration,
         note=note,
         version=__version__,

@@ -9,7 +9,7 @@ from scipy.special import fdtrc
 from visioncal.calibration import Calibration
 from visioncal.chance import f_limit
 from visioncal.errors import DataError
-from visioncal.estimator.causes import Belief, Cause, Explained, explain
+from visioncal.estimator.causes import Belief, Cause, Explained, explain, undone
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.session import Session
 from visioncal.transforms import invert, log, mean_transform
@@ -57,6 +57,7 @@ class Check:
         footing: What the calibration rests on.
         away: (m, 6) where each stop places its board (of several, the first), from where it was
             (rotation [rad], translation [m]), in its frame.
+        left: (m, 6) the same with the likeliest change undone, where one was found.
         log_evidence: Logarithm of how many times as likely the stops are with a change as without.
         misfit: Squared distance of the stops from the prediction, in units of sigma.
         freedom: What that is on average where nothing has changed.
@@ -73,6 +74,7 @@ class Check:
     seen: Seen
     footing: Footing
     away: FloatArray
+    left: FloatArray
     log_evidence: float
     misfit: float
     freedom: int
@@ -120,7 +122,8 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
             raise DataError(
                 "verify: the calibration has several boards; where one was placed anew it is not "
                 "known which of them still stand where they were.",
-                next_step="Verify with views of the boards that stayed, or calibrate again.",
+                next_step="Leave --board-moved out: each board is compared by itself, and the one "
+                "that moved is named. Or verify with views of the boards that stayed.",
             )
         footing = footing.placed_anew(mean_transform(placed_by(seen, footing)), _ANYWHERE)
     belief = Belief(
@@ -141,11 +144,14 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     log_evidence = evidence - nothing.likelihood
     named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
     camera = next(it for it in suspects if it.name == CAMERA)
+    away = log(invert(footing.edges.z) @ placed_by(seen, footing))
+    left = _left(seen, footing, causes[order[0]], suspects[0].explained) if named else away
     return Check(
         footing.calibration,
         seen,
         footing,
-        log(invert(footing.edges.z) @ placed_by(seen, footing)),
+        away,
+        left,
         log_evidence,
         nothing.misfit,
         nothing.freedom,
@@ -155,6 +161,14 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
         _is_explained(suspects[0], footing.freedom),
         np.sqrt(np.diag(camera.explained.covariance)),
     )
+
+
+def _left(seen: Seen, footing: Footing, cause: Cause, explained: Explained) -> FloatArray:
+    """(m, 6) where each stop places its board with a change undone, from where it was."""
+    edges, values = footing.edges, explained.values
+    before = undone(seen.data, cause, values)
+    shared = np.concatenate([edges.shared, np.zeros(len(values))])
+    return log(invert(edges.z) @ before.under(shared).placed(edges.x))
 
 
 def _shares(causes: Sequence[Cause]) -> FloatArray:

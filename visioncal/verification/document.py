@@ -28,11 +28,7 @@ def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
         "session": {"name": known.session.name, "sha256": known.session.digest()},
         "sentences": list(sentences(check)),
         "changes": [_change(check, it) for it in check.named],
-        "others": [
-            _change(check, it)
-            for it in check.suspects
-            if it not in check.named and it.probability > _LISTED_SHARE
-        ],
+        "others": [_change(check, it) for it in listed_suspects(check) if it not in check.named],
         "explained": check.explained,
         "log10_evidence": check.log_evidence / float(np.log(10.0)),
         "misfit": check.misfit,
@@ -47,8 +43,10 @@ def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
                 "views": list(views),
                 "off_mm": 1e3 * float(np.linalg.norm(away[3:])),
                 "off_deg": float(np.rad2deg(np.linalg.norm(away[:3]))),
+                "left_mm": 1e3 * float(np.linalg.norm(left[3:])),
+                "left_deg": float(np.rad2deg(np.linalg.norm(left[:3]))),
             }
-            for views, away in zip(check.seen.stops, check.away, strict=True)
+            for views, away, left in zip(check.seen.stops, check.away, check.left, strict=True)
         ],
         "not_used": [
             {"view": view, "reason": reason} for view, reason in sorted(known.reasons.items())
@@ -57,6 +55,12 @@ def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
         "recalibrate": any(it.state == "fired" for it in triggers),
         "triggers": [_trigger(it) for it in triggers],
     }
+
+
+def listed_suspects(check: Check) -> tuple[Suspect, ...]:
+    """The changes that are worth a line: those that are named, and others that are not unlikely."""
+    others = (it for it in check.suspects if it not in check.named)
+    return (*check.named, *(it for it in others if it.probability > _LISTED_SHARE))
 
 
 def _change(check: Check, suspect: Suspect) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def sentences(check: Check) -> tuple[str, ...]:
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> str:
     """What the likeliest change cannot be told from."""
-    named = listed([_thing(check, it) for it in others])
+    named = listed([thing(check, it) for it in others])
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
@@ -191,7 +191,7 @@ def _signed_axis(vector: FloatArray) -> str:
 def _changed(check: Check, suspect: Suspect) -> str:
     kind = kind_of(suspect.name)
     if kind in (JOINT, LENGTH, NOISE):
-        return f"{_capital(_thing(check, suspect))}."
+        return f"{_capital(thing(check, suspect))}."
     moved = motions(check, suspect)
     if kind in (CAMERA, BOARD, BOTH):
         return f"{_capital('; '.join(f'the {name} {it.words}' for name, it in moved.items()))}."
@@ -201,8 +201,8 @@ def _changed(check: Check, suspect: Suspect) -> str:
     )
 
 
-def _thing(check: Check, suspect: Suspect) -> str:
-    """A change as the part of a sentence."""
+def thing(check: Check, suspect: Suspect) -> str:
+    """A change with its figures, as the part of a sentence."""
     kind, explained = kind_of(suspect.name), suspect.explained
     if kind == JOINT:
         value, sigma, unit = _joint_figures(check, suspect)
