@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
 
 
@@ -109,6 +110,24 @@ def test_a_folder_that_cannot_be_written_is_named(rendered, tmp_path):
     assert done.returncode == 2
     assert "taken" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
+    warm = visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12)
+    assert warm.returncode == 0, warm.stderr
+    session = Session.load(tmp_path / "warm")
+    # Twelve views of a cold arm, and then six of them again every five minutes for 100 minutes.
+    assert len(session.views) == 12 + 19 * 6
+    assert {"current6_a", "ambient_c"} < set(session.streams["heat"].columns)
+    heat = json.loads((tmp_path / "warm.truth.json").read_text())["heat"]
+    assert len(heat["growth_per_k"]) == 6
+    loads = ("--payload-kg", 0, "--payload-kg", 5)
+    bending = ("--stiffness-knm", 10, "--no-images", "--views", 4)
+    assert visioncal("simulate", tmp_path / "bent", *bending, *loads).returncode == 0
+    carried = [it.numbers["payload_kg"] for it in Session.load(tmp_path / "bent").views]
+    assert carried == [0.0, 5.0, 0.0, 5.0]
+    truth = read_truth(tmp_path / "bent")
+    assert truth.options["compliance_rad_per_nm"] == [1e-4] * 6
 
 
 def test_simulate_writes_a_session_and_its_truth_beside_it(tmp_path):

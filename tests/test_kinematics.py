@@ -16,7 +16,7 @@ from visioncal.frames.touches import TouchRows
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, fine_camera, forward, simulate
 from visioncal.simulation.arms import inverse
-from visioncal.simulation.boards import centre_m
+from visioncal.simulation.boards import centre_m, corners_m
 from visioncal.transforms import compose, exp, invert, log
 
 GOOD = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=30)
@@ -29,6 +29,13 @@ def target_in_camera(mount, x, z, flange):
     return invert(flange @ x) @ z if mount == "eye-in-hand" else invert(x) @ flange @ z
 
 
+def told_frame(sheet):
+    """(4, 4) the frame of a bent sheet as it is told: of the plane that fits its corners best."""
+    x, y, z = corners_m(sheet).T
+    (depth, by_x, by_y), *_ = np.linalg.lstsq(np.column_stack([np.ones_like(x), x, y]), z)
+    return exp(np.array([by_y, -by_x, 0.0, 0.0, 0.0, depth]))
+
+
 def error_m(cell, known, robot):
     """Root mean square error of what the arm carries, all over the workspace [m].
 
@@ -38,6 +45,7 @@ def error_m(cell, known, robot):
     q = postures(getattr(robot, "nominal", robot))
     mount, edges = cell.options.mount, known.solved.edges
     true = target_in_camera(mount, *cell.transforms.values(), cell.flange_at(q))
+    true = true @ told_frame(cell.sheet)
     ours = target_in_camera(mount, edges.x, edges.z, robot.base_from_flange(q))
     if mount == "eye-in-hand":
         away = (invert(true) - invert(ours))[:, :3, 3]

@@ -8,21 +8,29 @@ import typer
 from visioncal.cli.console import messages, shown_progress
 from visioncal.simulation import (
     CellOptions,
+    Payload,
+    Round,
     SweepOptions,
+    WarmUpOptions,
+    arm_named,
     charuco_target,
     checkerboard_target,
     fine_camera,
     fisheye_camera,
     simulate,
+    simulate_warm_up,
     truth_path,
     wide_camera,
     write_session,
     write_sweep,
+    write_warm_up,
 )
 from visioncal.simulation import sweep as swept
 from visioncal.types import CameraMount
 
 _CAMERAS = {"wide": wide_camera, "fine": fine_camera, "fisheye": fisheye_camera}
+# Where the centre of a simulated load is, in the flange's frame [m].
+_CENTRE_M = (0.0, 0.0, 0.1)
 _BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
 
 
@@ -69,6 +77,23 @@ def simulate_command(
     clock_offset_ms: Annotated[
         float, typer.Option(help="With --sweep: what the camera's clock is ahead [ms].")
     ] = 37.0,
+    warm_up: Annotated[
+        bool,
+        typer.Option(
+            help="A cold arm that works for 100 minutes: pose pairs, and its joints' temperatures."
+        ),
+    ] = False,
+    currents: Annotated[
+        bool, typer.Option(help="With --warm-up: motor currents instead of temperatures.")
+    ] = False,
+    stiffness_knm: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Stiffness of every joint [kN m/rad]; rigid if left out."),
+    ] = None,
+    payload_kg: Annotated[
+        list[float] | None,
+        typer.Option(min=0.0, help="What the arm carries; several times for stops in turn."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
     """Write a simulated session, and its truth in a file beside it."""
@@ -85,11 +110,16 @@ def simulate_command(
         dh_sigma_rad=1e-3 * arm_sigma_mrad,
         wrong_views=wrong_views,
         board_scale=board_scale,
+        compliance_rad_per_nm=_compliance(robot, stiffness_knm),
+        payloads=tuple(Payload(it, _CENTRE_M) for it in payload_kg or ()),
         seed=seed,
     )
-    if sweep:
-        how = SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms)
-        write_sweep(swept(options, how), folder)
+    if warm_up:
+        how = WarmUpOptions(options, round=Round(first=views))
+        write_warm_up(simulate_warm_up(how), folder, temperatures=not currents)
+    elif sweep:
+        clocks = SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms)
+        write_sweep(swept(options, clocks), folder)
     else:
         with shown_progress(quiet=False) as told:
             write_session(
@@ -99,3 +129,10 @@ def simulate_command(
                 images=images,
             )
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
+
+
+def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
+    """What each joint yields to a torque [rad/(N m)]; empty for a rigid arm."""
+    if stiffness_knm is None:
+        return ()
+    return (1e-3 / stiffness_knm,) * len(arm_named(robot).offset)

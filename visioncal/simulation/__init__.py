@@ -27,7 +27,14 @@ from visioncal.simulation.records import (
 from visioncal.simulation.render import Scene, prepare_scene, render, render_view
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
-from visioncal.simulation.warmup import Heat, Round, WarmUp, WarmUpOptions, simulate_warm_up
+from visioncal.simulation.warmup import (
+    Heat,
+    Round,
+    WarmUp,
+    WarmUpOptions,
+    simulate_warm_up,
+    write_warm_up,
+)
 
 __all__ = [
     "Arm",
@@ -68,4 +75,5 @@ __all__ = [
     "wide_camera",
     "write_session",
     "write_sweep",
+    "write_warm_up",
 ]

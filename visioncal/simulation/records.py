@@ -79,7 +79,7 @@ def write_session(
         _image_session(cell, folder.name, progress) if images else pairs_session(cell, folder.name)
     )
     session.save(folder)
-    write_atomically(truth_path(folder), _truth_text(cell))
+    write_atomically(truth_path(folder), truth_text(cell))
     if progress is not None:
         progress(1.0)
     return folder
@@ -100,7 +100,7 @@ def write_sweep(moved: Sweep, folder: Path | str) -> Path:
     folder = Path(folder)
     sweep_session(moved, folder.name).save(folder)
     clock = {"camera_minus_robot_s": moved.options.camera_minus_robot_s}
-    write_atomically(truth_path(folder), _truth_text(moved.cell, clock))
+    write_atomically(truth_path(folder), truth_text(moved.cell, clock))
     return folder
 
 
@@ -338,7 +338,8 @@ def _pose_row(pose: FloatArray) -> dict[str, float]:
     return dict(zip(_POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
 
-def _truth_text(cell: Cell, more: Mapping[str, Any] | None = None) -> str:
+def truth_text(cell: Cell, more: Mapping[str, Any] | None = None) -> str:
+    """The content of a truth's file, with more than a cell has."""
     options = asdict(cell.options)
     camera = options.pop("camera")
     arm = asdict(cell.true_arm)

@@ -7,17 +7,19 @@ drifts.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
 from visioncal.errors import DataError
+from visioncal.files import write_atomically
 from visioncal.session import Session
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import Arm, forward
 from visioncal.simulation.cell import Cell, before_camera, detected, seen_by, simulate
 from visioncal.simulation.options import CellOptions
-from visioncal.simulation.records import pairs_session
+from visioncal.simulation.records import pairs_session, truth_path, truth_text
 from visioncal.simulation.second import chains
 from visioncal.transforms import invert
 from visioncal.types import FloatArray
@@ -231,6 +233,26 @@ def simulate_warm_up(options: WarmUpOptions) -> WarmUp:
     cold = simulate(options.cell, postures[list(shown)])
     warming = warm_up(heat, options.hours, seed=seed)
     return WarmUp(_warm(cold, heat, warming.at(stamps_s)), stamps_s, warming, heat)
+
+
+def write_warm_up(moved: WarmUp, folder: Path | str, *, temperatures: bool = True) -> Path:
+    """Writes a warm-up as a session's folder, and its truth beside it.
+
+    Args:
+        moved: What was seen meanwhile.
+        folder: The session's folder; it must not hold anything yet.
+        temperatures: Whether the controller tells temperatures; else currents.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    folder = Path(folder)
+    moved.session(folder.name, temperatures=temperatures).save(folder)
+    write_atomically(truth_path(folder), truth_text(moved.cell, {"heat": asdict(moved.heat)}))
+    return folder
 
 
 def _warm(cell: Cell, heat: Heat, links_c: FloatArray) -> Cell:
