@@ -41,6 +41,7 @@ class Level:
         inside: Residuals of the target's pose in the fit.
         left_out: Residuals of stops that are left out in turn.
         likelihood_ratio: Twice the gain in log-likelihood over the nominal arm.
+        sizes: How many sizes of errors were estimated for it, one a block.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Level:
     inside: Rms
     left_out: Rms
     likelihood_ratio: float
+    sizes: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +134,17 @@ def _with_lost_zero(
 
 
 def _best(levels: Sequence[Level]) -> Level:
-    """The likeliest level that predicts better than the first one, by more than chance each."""
+    """The likeliest level that predicts better than the first one, by more than chance each.
+
+    The price of all its columns is in a level's likelihood, but for that of their size. Of two
+    levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
+    offsets would leave links that are off by as little out of the covariance.
+    """
     best = levels[0]
     for level in levels[1:]:
         better = level.left_out.mm < levels[0].left_out.mm
-        if better and level.likelihood_ratio - best.likelihood_ratio > SIGNIFICANT:
+        margin = SIGNIFICANT if level.sizes > best.sizes else 0.0
+        if better and level.likelihood_ratio - best.likelihood_ratio > margin:
             best = level
     return best
 
@@ -144,7 +152,8 @@ def _best(levels: Sequence[Level]) -> Level:
 def _level(name: str, fit: LevelFit, *, turned: bool) -> Level:
     """Writes a fit as figures; `turned` says whether the views tell rotations."""
     rms = partial(_rms, turned=turned)
-    return Level(name, fit.size, rms(fit.inside), rms(fit.left_out), fit.gain)
+    sizes = len(fit.errors)
+    return Level(name, fit.size, rms(fit.inside), rms(fit.left_out), fit.gain, sizes)
 
 
 def _rms(residuals: FloatArray, *, turned: bool) -> Rms:
@@ -177,7 +186,7 @@ def doubts(kinematics: Kinematics) -> Iterator[str]:
     """Says where another level explains the views far better than the one that was asked for."""
     best = _best(kinematics.levels)
     chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
-    if best.name != chosen.name:
+    if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
         yield (
             f"The views speak for more than the arm's {chosen.name}: with its {best.name} stops "
             f"left out are predicted to {figure(best.left_out.mm)} mm instead of "
