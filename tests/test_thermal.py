@@ -26,6 +26,7 @@ from visioncal.session.streams import Stream
 from visioncal.simulation import Heat, Round, WarmUpOptions, simulate_warm_up
 from visioncal.thermal import Heating, Inputs, OnlineCompensator, ThermalModel, inputs_of
 from visioncal.transforms import invert, log
+from visioncal.verification import verify
 from visioncal.verification.footing import Footing
 from visioncal.viewer import blueprint
 
@@ -103,6 +104,17 @@ def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
     # A check has no use for what the drift's parameters are: the edges' covariance has them.
     footing = Footing.of(known)
     assert footing.covariance[:12, :12] == pytest.approx(known.joint_covariance, rel=1e-9)
+
+
+def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
+    found = learnt["temperatures"]
+    cold, warm = found.session.views[:24:4], found.session.views[-6:]
+    passed = verify(replace(found.session, views=cold), found.calibration)
+    assert passed.passed
+    assert "as warm as it was at the start (about 21 deg C)" in passed.seen.warnings[-1]
+    # Half a millimetre is no noise, and the reason for it may be what the warning says.
+    failed = verify(replace(found.session, views=warm), found.calibration)
+    assert not failed.passed
 
 
 def test_an_arm_that_is_off_is_calibrated_beside_its_drift():

@@ -248,6 +248,13 @@ def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
 def _warnings(known: Known, footing: Footing) -> Iterator[str]:
     """What is odd about the session."""
     yield from dict.fromkeys(known.warnings)
+    if "thermal" in footing.calibration.stages:
+        cold_c = float(footing.calibration.drift.reference_c.mean())
+        yield (
+            "The calibrated arm drifts with its temperature, and a check takes it for as warm as "
+            f"it was at the start (about {cold_c:.0f} deg C): one at work looks longer, or as if "
+            "its joints had slipped. Verify with the arm as warm as then."
+        )
     before, now = footing.calibration.noise.get("pixel_px"), known.pixel_px
     if before is not None and now is not None and now > _WORTH_A_WORD * max(before, 1e-3):
         yield (
