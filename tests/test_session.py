@@ -288,7 +288,6 @@ TOML_REFUSALS = [
     ('name = "oak"', "matrix_sigma_px = 1e-300", r"is 1e-300, but .* of at least 0\.001"),
     ('name = "oak"', "matrix_sigma_px = 1e300", r"is 1e\+300, but .* of at most 10000"),
     ("resolution", "size", "camera.resolution is missing: camera.matrix holds for one"),
-    ("[robot]", "[robots.a]", r"\[robots\.\*\] declares several robots; .* as \[robot\]"),
     ('target = "board.toml"\n', "", r"target is missing, but view 7 has an image\. Add target"),
     ("board.toml", "boad.toml", r"target file .*boad\.toml does not exist"),
     ("board.toml", "charuco", "There is no target named 'charuco'"),

@@ -218,7 +218,7 @@ class Known:
         session, camera = self.session, self.camera
         if camera is None or not session.boards or self.pixel_px is None:
             return None
-        table = session.declaration.camera
+        table = session.declaration.only_camera
         sigma_px = None if table is None else table.matrix_sigma_px
         return Scene(
             session.mount,

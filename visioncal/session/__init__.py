@@ -1,9 +1,21 @@
 """Sessions: what was recorded of a cell, as a folder of session.toml, views.csv and images."""
 
 from visioncal.session.document import Declaration
+from visioncal.session.frames import frame_name
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
+from visioncal.session.observations import Observation
 from visioncal.session.session import Session
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
-__all__ = ["Declaration", "FolderImages", "ImageStore", "MemoryImages", "Session", "Stream", "View"]
+__all__ = [
+    "Declaration",
+    "FolderImages",
+    "ImageStore",
+    "MemoryImages",
+    "Observation",
+    "Session",
+    "Stream",
+    "View",
+    "frame_name",
+]

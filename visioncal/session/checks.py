@@ -22,7 +22,7 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
             declaration.target or declaration.targets or None,
             'target = "charuco_9x6_30mm"',
         ),
-        ("camera", declaration.camera, "[camera]"),
+        ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
     ):
         if with_image and value is None:
             raise DataError(

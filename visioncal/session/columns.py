@@ -42,7 +42,7 @@ _TEXTS = frozenset(
 # No robot works below the one, and motors are switched off below the other [deg C]; every
 # temperature of a robot in kelvin is above them.
 _COLDEST_C, _HOTTEST_C, _ZERO_K = -60.0, 200.0, 273.15
-# Columns that name one of several cameras, robots or instruments, of which there is one as yet.
+# Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
 

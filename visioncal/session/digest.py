@@ -30,7 +30,7 @@ def digest_facts(
     facts: dict[str, object] = {
         "document": _without_paths(document),
         "target": target_document,
-        "robot": None if robot_document is None else _without_bodies(robot_document),
+        "robot": None if robot_document is None else _robots(document, robot_document),
         "columns": columns,
         "rows": [[_fact(view, column) for column in columns] for view in views],
         "images": {path: sha256(images.read(path)) for path in paths},
@@ -52,11 +52,25 @@ def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
         del kept["target"]
     targets = kept.get("targets")
     if isinstance(targets, Mapping):
-        kept["targets"] = {name: _target_without_path(entry) for name, entry in targets.items()}
+        kept["targets"] = {name: _pathless(entry, "target") for name, entry in targets.items()}
     robot = kept.get("robot")
     if isinstance(robot, Mapping) and is_file(robot.get("model")):
         kept["robot"] = {key: value for key, value in robot.items() if key != "model"}
+    robots = kept.get("robots")
+    if isinstance(robots, Mapping):
+        kept["robots"] = {name: _pathless(entry, "model") for name, entry in robots.items()}
     return kept
+
+
+def _robots(
+    document: Mapping[str, object], robot_document: Mapping[str, object]
+) -> dict[str, object]:
+    """The robot's model, or those of several by name."""
+    several = document.get("robots")
+    if not isinstance(several, Mapping) or len(several) < 2:
+        return _without_bodies(robot_document)
+    models = robot_document.items()
+    return {name: _without_bodies(it) for name, it in models if isinstance(it, Mapping)}
 
 
 def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
@@ -73,11 +87,11 @@ def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
     return {**document, "joint": kept}
 
 
-def _target_without_path(entry: object) -> object:
-    """One of several targets, in its short form or as a table."""
-    table = {"target": entry} if isinstance(entry, str) else entry
-    if isinstance(table, Mapping) and is_file(table.get("target")):
-        return {key: value for key, value in table.items() if key != "target"}
+def _pathless(entry: object, field: str) -> object:
+    """One of several targets or robots, in its short form or as a table, without its file."""
+    table = {field: entry} if isinstance(entry, str) else entry
+    if isinstance(table, Mapping) and is_file(table.get(field)):
+        return {key: value for key, value in table.items() if key != field}
     return table
 
 

@@ -2,105 +2,90 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean
-from visioncal.types import CameraKind, CameraMount
+from visioncal.session.tables import (
+    CameraTable,
+    ClockTable,
+    InstrumentTable,
+    PriorTable,
+    RobotTable,
+    TableModel,
+    TargetTable,
+)
+from visioncal.types import CameraMount
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-# Nobody knows a focal length better than the least of these, or worse than the largest [px].
-PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
-NotNegative = Annotated[FiniteFloat, Field(ge=0)]
-PositiveInt = Annotated[int, Field(gt=0)]
+Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
+KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
-_SEVERAL = ("cameras", "robots", "instruments")
 # Names become parts of the names of frames: base_from_target_NAME.
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _EDGES = ("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target")
 
 
-class _TableModel(BaseModel):
-    # Unknown keys are kept: a newer version, or the user, may have put them there.
-    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+def _short(field: str) -> BeforeValidator:
+    """Takes the short form `floor = "..."` for the table `[targets.floor]` with one field."""
+    return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
 
 
-class CameraTable(_TableModel):
-    """`[camera]`. matrix: fx, fy, cx, cy [px]; resolution: width, height [px]."""
+class Declaration(TableModel):
+    """session.toml, typed. Unknown keys stay in `model_extra`.
 
-    name: str = "camera"
-    resolution: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)] | None = None
-    model: CameraKind = "brown"
-    matrix: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
-    distortion: list[FiniteFloat] | None = None
-    intrinsics: Literal["auto", "hold", "refine"] = "auto"
-    matrix_sigma_px: PixelSigma | None = None
-
-
-class RobotTable(_TableModel):
-    """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
-
-    gravity_m_s2: its acceleration in the robot's base, for a base that does not stand upright.
+    Of each kind there is one, in the table of the singular, or there are several by name, in those
+    of the plural. frames: what each frame hangs on, as far as that is said; see `frames`.
     """
-
-    model: str
-    tip: str | None = None
-    gravity_m_s2: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None
-
-
-class InstrumentTable(_TableModel):
-    """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]; see `instruments`."""
-
-    name: str = "instrument"
-    sigma_m: NotNegative | None = None
-    sigma_per_m: NotNegative | None = None
-    sigma_rad: NotNegative | None = None
-
-
-class ClockTable(_TableModel):
-    """`[clock]`. What the camera's stamps are ahead of the robot's [s]."""
-
-    camera_minus_robot_s: FiniteFloat = 0.0
-
-
-class PriorTable(_TableModel):
-    """`[prior.EDGE]`. Measured components of an unknown edge and their standard deviation [m]."""
-
-    x_m: FiniteFloat | None = None
-    y_m: FiniteFloat | None = None
-    z_m: FiniteFloat | None = None
-    sigma_m: Positive
-
-
-class TargetTable(_TableModel):
-    """`[targets.NAME]`, one of several. target: a name in targets/, or the path of a .toml."""
-
-    target: str
-
-
-def _as_table(value: object) -> object:
-    """Takes the short form `floor = "..."` for the table `[targets.floor]`."""
-    return {"target": value} if isinstance(value, str) else value
-
-
-class Declaration(_TableModel):
-    """session.toml, typed. Unknown keys stay in `model_extra`."""
 
     schema_version: Literal[1] = Field(alias="schema")
     name: str
     mount: CameraMount | None = None
     target: str | None = None
-    targets: dict[str, Annotated[TargetTable, BeforeValidator(_as_table)]] = Field(
-        default_factory=dict
-    )
+    targets: dict[str, Annotated[TargetTable, _short("target")]] = Field(default_factory=dict)
     camera: CameraTable | None = None
+    cameras: dict[str, CameraTable] = Field(default_factory=dict)
     robot: RobotTable | None = None
+    robots: dict[str, Annotated[RobotTable, _short("model")]] = Field(default_factory=dict)
     instrument: InstrumentTable | None = None
+    instruments: dict[str, Annotated[InstrumentTable, _short("name")]] = Field(default_factory=dict)
+    frames: dict[str, Any] = Field(default_factory=dict)
     clock: ClockTable = ClockTable()
     prior: dict[str, PriorTable] = Field(default_factory=dict)
+
+    def named(self, kind: Kind) -> dict[str, TableModel]:
+        """The tables of a kind by the names that rows give them; that of a singular is empty."""
+        several: Mapping[str, TableModel] = getattr(self, f"{kind}s")
+        if several:
+            return dict(several)
+        if kind == "target":
+            return {} if self.target is None else {"": TargetTable(target=self.target)}
+        only: TableModel | None = getattr(self, kind)
+        return {} if only is None else {"": only}
+
+    @property
+    def is_network(self) -> bool:
+        """Whether frames have to be told apart: several cameras, robots or instruments, or said."""
+        several = (self.cameras, self.robots, self.instruments)
+        return bool(self.frames) or any(len(it) > 1 for it in several)
+
+    @property
+    def only_camera(self) -> CameraTable | None:
+        """The camera where there is one; None without, or with several."""
+        return self.camera if len(self.cameras) != 1 else next(iter(self.cameras.values()))
+
+    @property
+    def only_robot(self) -> RobotTable | None:
+        """The robot where there is one; None without, or with several."""
+        return self.robot if len(self.robots) != 1 else next(iter(self.robots.values()))
+
+    @property
+    def only_instrument(self) -> InstrumentTable | None:
+        """The instrument where there is one; None without, or with several."""
+        several = self.instruments
+        return self.instrument if len(several) != 1 else next(iter(several.values()))
 
 
 def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
@@ -114,14 +99,6 @@ def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
         DataError: A field is missing, of another type, out of range, or contradicts another; the
             message names all of them by their dotted paths.
     """
-    for plural in _SEVERAL:
-        if plural in document:
-            raise DataError(
-                f"{label}: [{plural}.*] declares several {plural}; this version reads one of a "
-                f"kind, as [{plural[:-1]}].",
-                culprits=[f"{label}: {plural}"],
-                next_step=f"Split the session into one for each of the {plural}.",
-            )
     # Before the fields: those of another schema would be reported one by one, and wrongly.
     schema = document.get("schema")
     if schema is not None and schema != 1:
@@ -186,61 +163,77 @@ _MISSING = {
 def _contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
     """Finds fields that are well typed but do not fit together: (dotted path, words)."""
     camera = declaration.camera
-    if declaration.mount is None and (declaration.instrument is None or camera is not None):
+    reads = declaration.instrument is not None or bool(declaration.instruments)
+    told = declaration.is_network or (reads and not declaration.named("camera"))
+    if declaration.mount is None and not told:
         yield "mount", "is missing" + _MISSING["mount"]
     if camera is not None:
-        yield from _camera_contradictions(camera)
-    if declaration.targets and declaration.target is not None:
-        yield (
-            "targets",
-            "is there beside target: give target = ... for one, [targets.NAME] for several",
-        )
-    for name in declaration.targets:
-        if not _NAME.fullmatch(name):
-            yield f"targets.{name}", "is a name of other than letters, digits and _ after a letter"
+        yield from _camera_contradictions(camera, "camera")
+    for name, one in declaration.cameras.items():
+        yield from _camera_contradictions(one, f"cameras.{name}")
+    if declaration.robot is not None and declaration.robot.model is None:
+        yield "robot.model", "is missing"
+    for kind in KINDS:
+        yield from _several_contradictions(declaration, kind)
     for edge, prior in declaration.prior.items():
         if prior.x_m is None and prior.y_m is None and prior.z_m is None:
             yield f"prior.{edge}", "names no component, but must give x_m, y_m or z_m"
 
 
-def _camera_contradictions(camera: CameraTable) -> Iterator[tuple[str, str]]:
+def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:
+    plural, one = f"{kind}s", "target = ..." if kind == "target" else f"[{kind}]"
+    several: Mapping[str, TableModel] = getattr(declaration, plural)
+    if several and getattr(declaration, kind) is not None:
+        yield plural, f"is there beside {kind}: give {one} for one, [{plural}.NAME] for several"
+    for name in several:
+        if not _NAME.fullmatch(name):
+            yield f"{plural}.{name}", "is a name of other than letters, digits and _ after a letter"
+
+
+def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str, str]]:
     counts = _COEFFICIENTS[camera.model]
     if camera.distortion is not None and len(camera.distortion) not in counts:
         needed = " or ".join(map(str, counts))
         padding = " (write 0 for those that are not used)"
         yield (
-            "camera.distortion",
+            f"{path}.distortion",
             f'has {len(camera.distortion)} coefficients, but the "{camera.model}" model needs '
             f"{needed}{padding if len(camera.distortion) < max(counts) else ''}",
         )
     if camera.matrix is not None:
         if camera.distortion is None:
-            yield "camera.distortion", "is missing beside camera.matrix: give both or neither"
+            yield f"{path}.distortion", f"is missing beside {path}.matrix: give both or neither"
         if camera.resolution is None:
-            yield "camera.resolution", "is missing: camera.matrix holds for one resolution only"
+            yield f"{path}.resolution", f"is missing: {path}.matrix holds for one resolution only"
         for place, letter in enumerate(("fx", "fy")):
             if camera.matrix[place] <= 0:
                 yield (
-                    f"camera.matrix[{place}]",
+                    f"{path}.matrix[{place}]",
                     f"is {camera.matrix[place]!r}, but {letter} must be above 0",
                 )
     elif camera.distortion is not None:
-        yield "camera.matrix", "is missing beside camera.distortion: give both or neither"
+        yield f"{path}.matrix", f"is missing beside {path}.distortion: give both or neither"
 
 
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
     yield from _unknown_keys(declaration, "", label)
-    for edge in declaration.prior:
+    for edge in () if declaration.is_network else declaration.prior:
         if edge not in _EDGES:
             hint = did_you_mean(edge, _EDGES)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
-    camera = declaration.camera
-    if camera is not None and camera.matrix is not None and camera.resolution is not None:
+    if declaration.camera is not None:
+        yield from _camera_warnings(declaration.camera, f"{label}: camera")
+    for name, camera in declaration.cameras.items():
+        yield from _camera_warnings(camera, f"{label}: cameras.{name}")
+
+
+def _camera_warnings(camera: CameraTable, path: str) -> Iterator[str]:
+    if camera.matrix is not None and camera.resolution is not None:
         (width, height), (_, _, cx, cy) = camera.resolution, camera.matrix
         if not (0 < cx < width and 0 < cy < height):
             yield (
-                f"{label}: camera.matrix puts the principal point at ({cx:g}, {cy:g}) px, outside "
+                f"{path}.matrix puts the principal point at ({cx:g}, {cy:g}) px, outside "
                 f"the image of {width} x {height} px. Check the order fx, fy, cx, cy and that the "
                 "matrix belongs to this resolution."
             )
@@ -256,6 +249,6 @@ def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
             yield from _unknown_keys(value, f"{path}{name}.", label)
-        elif name in ("prior", "targets"):
+        elif name in ("prior", *(f"{it}s" for it in KINDS)):
             for key, entry in cast(Mapping[str, BaseModel], value).items():
                 yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)

@@ -1,25 +1,27 @@
 """A session: what was recorded of a cell, read from a folder and written to one."""
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import tomli_w
 
 from visioncal.errors import DataError
-from visioncal.files import parse_toml, read_text, write_atomically
-from visioncal.robot import read_robot_document, robot_file
+from visioncal.files import parse_toml, read_text
 from visioncal.session import columns as known
-from visioncal.session.boards import COLUMN, check_targets_named, read_targets, target_warnings
+from visioncal.session.arms import read_robots
+from visioncal.session.boards import COLUMN, read_targets
 from visioncal.session.checks import check_images_can_be_used, view_warnings
-from visioncal.session.digest import digest_facts, is_file
+from visioncal.session.digest import digest_facts
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
-from visioncal.session.images import FolderImages, ImageStore, inside_path
+from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
+from visioncal.session.images import FolderImages, ImageStore
+from visioncal.session.kinds import check_kinds_named, kind_warnings
+from visioncal.session.observations import Observation, observations_of, stop_warnings
+from visioncal.session.saving import placed_files, write_folder
 from visioncal.session.streams import (
     FOLDER,
     Stream,
@@ -29,6 +31,7 @@ from visioncal.session.streams import (
     write_stream,
 )
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
+from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
 from visioncal.types import Camera, CameraKind, Mount, Target
 
 
@@ -45,7 +48,8 @@ class Session:
         images: Where the images' bytes come from.
         warnings: What is allowed but suspicious, in words for the user.
         robot_document: The robot's model as `Robot.from_document` reads it; None where the session
-            names no robot or one that is unknown, which a warning says.
+            names no robot or one that is unknown, which a warning says. Of several, the models by
+            name.
         targets: Several printed targets by name, in the session's order; empty for one or none.
         streams: What was read many times a second beside the views, by name.
     """
@@ -120,7 +124,7 @@ class Session:
             images: Where the images' bytes come from.
             target_document: The content of the target's `.toml`, of several the contents by name;
                 needed where `document` names a file rather than a target that comes with visioncal.
-            robot_document: The robot's model; needed likewise.
+            robot_document: The robot's model, of several the models by name; needed likewise.
 
         Raises:
             DataError: A field, row or column is wrong.
@@ -155,27 +159,16 @@ class Session:
         Raises:
             DataError: The folder exists and is not empty, or cannot be written.
         """
-        folder = Path(folder).absolute()
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise DataError(
-                f"{folder} exists and is not empty; a session is written to a new folder.",
-                culprits=[str(folder)],
-                next_step="Choose another name, or remove it first.",
-            )
-        aside = folder.parent / f".{uuid4().hex}.tmp"
-        try:
-            aside.mkdir(parents=True)
-            try:
-                self._write_into(aside)
-                if folder.exists():
-                    folder.rmdir()
-                aside.replace(folder)
-            finally:
-                shutil.rmtree(aside, ignore_errors=True)
-        except OSError as error:
-            raise DataError(
-                f"{folder} cannot be written: {error.strerror or error}.", culprits=[str(folder)]
-            ) from error
+        document, texts = placed_files(
+            self.declaration, self.document, self.target_document, self.robot_document
+        )
+        texts |= {
+            "session.toml": tomli_w.dumps(document),
+            "views.csv": write_csv(self.columns, self.views),
+        }
+        texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
+        paths = dict.fromkeys(view.image for view in self.views if view.image)
+        write_folder(Path(folder), texts, self.images, tuple(paths))
 
     def digest(self) -> str:
         """Computes the SHA-256 digest of the session's facts.
@@ -205,9 +198,72 @@ class Session:
 
     @property
     def mount(self) -> Mount:
-        """What observes whom: a camera in the hand or one that looks at it, or an instrument."""
+        """What observes whom: a camera in the hand or one that looks at it, or an instrument.
+
+        Of several cameras that are not declared alike, it is that of none in the hand.
+        """
         declared = self.declaration.mount
-        return "instrument" if declared is None or self.is_read_by_instrument else declared
+        if self.is_read_by_instrument or (declared is None and not self.cameras):
+            return "instrument"
+        if declared is not None:
+            return declared
+        on = [self.frames[frame_name("camera", it)] for it in self.cameras]
+        return "eye-in-hand" if all(it.startswith("flange") for it in on) else "eye-to-hand"
+
+    @property
+    def is_network(self) -> bool:
+        """Whether it has several cameras, robots or instruments, or says what hangs on what."""
+        return self.declaration.is_network
+
+    @cached_property
+    def cameras(self) -> Mapping[str, CameraTable]:
+        """The cameras by the names that rows give them; that of `[camera]` is empty."""
+        found = self.declaration.named("camera").items()
+        return {name: it for name, it in found if isinstance(it, CameraTable)}
+
+    @cached_property
+    def robots(self) -> Mapping[str, RobotTable]:
+        """The robots by name; that of `[robot]`, and of poses without a robot, is empty."""
+        return robots_of(self.declaration, self.views)
+
+    @cached_property
+    def instruments(self) -> Mapping[str, InstrumentTable]:
+        """The instruments by name; that of `[instrument]` is empty."""
+        found = self.declaration.named("instrument").items()
+        return {name: it for name, it in found if isinstance(it, InstrumentTable)}
+
+    @cached_property
+    def plates(self) -> Mapping[str, Target]:
+        """The targets by the names that session.toml gives them, also where there is one."""
+        names = list(self.declaration.named("target"))
+        return dict(zip(names, self.boards.values(), strict=False))
+
+    @property
+    def robot_documents(self) -> Mapping[str, Mapping[str, Any]]:
+        """The robots' models by name, of those whose models are known."""
+        if self.robot_document is None:
+            return {}
+        if len(self.robots) > 1:
+            return self.robot_document
+        return dict.fromkeys(self.robots, self.robot_document)
+
+    @cached_property
+    def frames(self) -> Mapping[str, str]:
+        """What each frame hangs on, by name: bases, flanges, cameras, targets, instruments, points.
+
+        Raises:
+            DataError: What is said contradicts itself, or something is neither said nor follows.
+        """
+        return resolve_frames(self.declaration, self.views)
+
+    @cached_property
+    def observations(self) -> tuple[Observation, ...]:
+        """What saw what while which robots stood how.
+
+        Raises:
+            DataError: See `frames`.
+        """
+        return observations_of(self.declaration, self.views, self.frames)
 
     @cached_property
     def is_read_by_instrument(self) -> bool:
@@ -229,7 +285,7 @@ class Session:
     @property
     def camera(self) -> Camera | None:
         """The camera's intrinsics; None where the session leaves them to be estimated."""
-        table = self.declaration.camera
+        table = self.declaration.only_camera
         if table is None or table.matrix is None or table.distortion is None:
             return None
         if table.resolution is None:
@@ -241,17 +297,21 @@ class Session:
     @property
     def camera_model(self) -> CameraKind:
         """The model of the camera's lens, known or to be estimated."""
-        return "brown" if self.declaration.camera is None else self.declaration.camera.model
+        return (
+            "brown" if self.declaration.only_camera is None else self.declaration.only_camera.model
+        )
 
     @property
     def camera_name(self) -> str:
         """The camera's name; `camera` where the session gives none."""
-        return "camera" if self.declaration.camera is None else self.declaration.camera.name
+        return (
+            "camera" if self.declaration.only_camera is None else self.declaration.only_camera.name
+        )
 
     @property
     def resolution(self) -> tuple[int, int] | None:
         """(width, height) of the images [px], if declared."""
-        table = self.declaration.camera
+        table = self.declaration.only_camera
         if table is None or table.resolution is None:
             return None
         return table.resolution[0], table.resolution[1]
@@ -259,56 +319,21 @@ class Session:
     @property
     def intrinsics_mode(self) -> str:
         """What to do with given intrinsics: `auto`, `hold` or `refine`."""
-        return "auto" if self.declaration.camera is None else self.declaration.camera.intrinsics
+        return (
+            "auto"
+            if self.declaration.only_camera is None
+            else self.declaration.only_camera.intrinsics
+        )
 
     @property
     def robot_name(self) -> str | None:
         """The robot's model as the session names it: a built-in name or a path."""
-        return None if self.declaration.robot is None else self.declaration.robot.model
+        return None if self.declaration.only_robot is None else self.declaration.only_robot.model
 
     @property
     def robot_tip(self) -> str | None:
         """The frame that the reported poses are of, if declared."""
-        return None if self.declaration.robot is None else self.declaration.robot.tip
-
-    def _image_paths(self) -> tuple[str, ...]:
-        """The images' paths, each once, in the order of the views."""
-        return tuple(dict.fromkeys(view.image for view in self.views if view.image))
-
-    def _write_into(self, folder: Path) -> None:
-        document = dict(self.document)
-        texts: dict[str, str] = {}
-        if self.target_document is not None:
-            texts |= self._place_targets(document, self.target_document)
-        if self.robot_document is not None and is_file(self.robot_name):
-            name, content = robot_file(self.robot_document, str(self.robot_name))
-            model = _place_inside(str(self.robot_name), name)
-            document["robot"] = {**document["robot"], "model": model}
-            texts[model] = content
-        texts["session.toml"] = tomli_w.dumps(document)
-        texts["views.csv"] = write_csv(self.columns, self.views)
-        texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
-        for path in self._image_paths():
-            if self.images.exists(path):
-                _write_below(folder, path, self.images.read(path))
-        for path, text in texts.items():
-            _write_below(folder, path, text)
-
-    def _place_targets(
-        self, document: dict[str, Any], contents: Mapping[str, Any]
-    ) -> dict[str, str]:
-        """Names targets that were files by paths in the folder, and returns their texts by path."""
-        if is_file(self.declaration.target):
-            document["target"] = _place_inside(str(self.declaration.target), "target.toml")
-            return {document["target"]: tomli_w.dumps(contents)}
-        texts, several = {}, len(self.declaration.targets) > 1
-        for name, table in self.declaration.targets.items():
-            if is_file(table.target):
-                path = _place_inside(table.target, f"target_{name}.toml")
-                kept = {**table.model_dump(), "target": path}
-                document["targets"] = {**document["targets"], name: kept}
-                texts[path] = tomli_w.dumps(contents[name] if several else contents)
-        return texts
+        return None if self.declaration.only_robot is None else self.declaration.only_robot.tip
 
 
 def _build(
@@ -328,19 +353,16 @@ def _build(
         *declaration_warnings(declaration, "session.toml"),
         *known.column_warnings(columns, "views.csv"),
         *view_warnings(views),
-        *target_warnings(declaration, views),
+        *kind_warnings(declaration, views),
     ]
     targets, target_document = read_targets(declaration, folder, target_document)
     check_images_can_be_used(declaration, views)
-    check_targets_named(declaration, views)
-    robot = declaration.robot
-    if robot is not None and robot_document is None:
-        try:
-            robot_document = read_robot_document(robot.model, tip=robot.tip, folder=folder)
-            if robot.gravity_m_s2 is not None:
-                robot_document |= {"gravity_m_s2": robot.gravity_m_s2}
-        except DataError as error:
-            warnings.append(f"session.toml: robot.model: {error}")
+    check_kinds_named(declaration, views)
+    check_frames(declaration, views)
+    if declaration.is_network:
+        warnings += stop_warnings(declaration, views)
+    robot_document, unknown = read_robots(declaration, folder, robot_document)
+    warnings += unknown
     return Session(
         document,
         columns,
@@ -352,16 +374,3 @@ def _build(
         robot_document,
         targets if len(targets) > 1 else {},
     )
-
-
-def _place_inside(path: str, fallback: str) -> str:
-    """Keeps a path that stays inside the session's folder; others become `fallback`."""
-    try:
-        return inside_path(path)
-    except DataError:
-        return fallback
-
-
-def _write_below(folder: Path, path: str, data: bytes | str) -> None:
-    (folder / path).parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / path, data)

@@ -4,7 +4,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -54,6 +54,11 @@ class View:
     def stamp_s(self) -> float | None:
         """The time of the observation [s], if it was recorded."""
         return self.numbers.get("stamp_s")
+
+    @property
+    def is_of_lens(self) -> bool:
+        """Whether it tells of the camera's lens alone, as the board was anywhere."""
+        return self.text.get("role", "").strip() == "intrinsics"
 
     @property
     def joints_rad(self) -> FloatArray | None:
@@ -188,7 +193,6 @@ def read_views(columns: Sequence[str], rows: Sequence[Row], label: str) -> tuple
             if earlier != row.where:
                 reader.report("view", f"{view.number} is already the view of {earlier}")
         problems += reader.problems
-    problems += _several_of_a_kind(views, label)
     if problems:
         raise _report(problems)
     return tuple(views)
@@ -201,17 +205,6 @@ def _report(problems: Sequence[_Problem]) -> DataError:
     if more:
         lines.append(f"And {more} more of the kind.")
     return DataError("\n".join(lines), culprits=[problem.place for problem in shown])
-
-
-def _several_of_a_kind(views: Sequence[View], label: str) -> Iterator[_Problem]:
-    for column in known.SELECTORS:
-        names = sorted({view.text[column] for view in views if column in view.text})
-        if len(names) > 1:
-            yield _Problem(
-                f"{label}, column {column}",
-                f"it names {', '.join(names)}; this version reads one {column} a session, so "
-                "split the session",
-            )
 
 
 @dataclass(frozen=True)
@@ -250,9 +243,13 @@ class _RowReader:
             )
         self._check_sizes(numbers)
         self._check_groups(numbers)
-        observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text
+        # A row of a stop may tell no more than where one of several robots stood.
+        stands = {"x_m", "q1_rad"} & numbers.keys() and stop is not None and "robot" in text
+        observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text or stands
         if not image and not observed and not self.problems:
             self.report("image", "it is empty, and the row has neither cft_* nor meas_* nor point")
+        if role == "intrinsics" and not self.problems:
+            self._check_lens_alone(image or "", numbers)
         if number is None:
             return None
         return View(number, image or "", role == "holdout", stop, numbers, text)
@@ -294,9 +291,23 @@ class _RowReader:
         for column, words in load_problems(numbers):
             self.report(column, words)
 
+    def _check_lens_alone(self, image: str, numbers: Mapping[str, float]) -> None:
+        poses = [it for it in ("x_m", "q1_rad", "cft_x_m", "meas_x_m") if it in numbers]
+        if not image or poses:
+            self.report(
+                "role",
+                "intrinsics is for an image that tells of the camera's lens alone, but the row has "
+                + (f"{poses[0]}; leave that empty" if poses else "no image"),
+            )
+
     def _check_groups(self, numbers: Mapping[str, float]) -> None:
+        joints = known.joint_columns(self.columns)
+        if "robot" in self.columns:
+            # Of several robots one may have fewer joints than another.
+            filled = [name for name in joints if name in numbers]
+            joints = tuple(dict.fromkeys((*joints[: len(filled)], *filled)))
         # A cell that was refused would be reported again as missing from its group.
-        groups = () if self.problems else (*known.WHOLE_GROUPS, known.joint_columns(self.columns))
+        groups = () if self.problems else (*known.WHOLE_GROUPS, joints)
         for group in groups:
             missing = [name for name in group if name not in numbers]
             if 0 < len(missing) < len(group):
@@ -331,6 +342,6 @@ def _integer(cell: str) -> int:
 
 
 def _role(cell: str) -> str:
-    if cell not in ("fit", "holdout"):
-        raise DataError(f'{cell!r} is no role; "fit", "holdout" or nothing is needed')
+    if cell not in ("fit", "holdout", "intrinsics"):
+        raise DataError(f'{cell!r} is no role; "fit", "holdout", "intrinsics" or nothing is needed')
     return cell

@@ -203,7 +203,7 @@ def _name(view: View) -> str:
 
 
 def _instrument(session: Session, *, are_poses: bool) -> Instrument:
-    table = session.declaration.instrument
+    table = session.declaration.only_instrument
     if table is None:
         raise DataError(
             "session.toml: rows have an instrument's readings (meas_x_m ...), but nothing says "

@@ -1,0 +1,116 @@
+"""Which of several cameras, robots, targets or instruments a row is of: columns that name them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypeAlias
+
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean, some_of
+from visioncal.session.columns import POSITION
+from visioncal.session.document import KINDS, Declaration, Kind
+from visioncal.session.table import View
+
+_Test: TypeAlias = Callable[[View], bool]
+
+
+def is_seen(view: View) -> bool:
+    """Whether a camera saw what a row tells: it has an image, or a measured pose."""
+    return bool(view.image) or "cft_x_m" in view.numbers
+
+
+def tells_robot(view: View) -> bool:
+    """Whether a row tells where a robot stood."""
+    return POSITION[0] in view.numbers or "q1_rad" in view.numbers
+
+
+def is_read(view: View) -> bool:
+    """Whether an instrument read what a row tells."""
+    return view.reading_m is not None
+
+
+# Which rows must name one of several, what the column names, and how to mend a row.
+_NEEDS: Mapping[Kind, tuple[_Test, str, str]] = {
+    "camera": (is_seen, "the one that took a row's image", ""),
+    "robot": (tells_robot, "the one whose pose or joints a row has", ""),
+    "target": (
+        is_seen,
+        "the one that a row shows",
+        "; one image that shows several takes a row for each, with the same stop",
+    ),
+    "instrument": (is_read, "the one that read a row's meas_ columns", ""),
+}
+
+
+def name_of(declaration: Declaration, kind: Kind, view: View) -> str:
+    """The name that a row's camera, robot, target or instrument has in session.toml.
+
+    Empty for that of a singular table, and where a row of several names none.
+    """
+    names = list(declaration.named(kind))
+    if len(names) == 1:
+        return names[0]
+    return view.text.get(kind, "").strip() if names else ""
+
+
+def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
+    """Checks that rows name the cameras, robots, targets and instruments that are declared.
+
+    Raises:
+        DataError: A row names none of several, or one that is not declared.
+    """
+    for kind in KINDS:
+        _check(declaration, kind, views)
+
+
+def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
+    plural = f"{kind}s"
+    named = {view.number: view.text.get(kind, "").strip() for view in views}
+    declared = list(declaration.named(kind))
+    if declared in ([], [""]):
+        _check_one(kind, bool(declared), sorted({it for it in named.values() if it}))
+        return
+    known = ", ".join(declared)
+    unknown = {view: name for view, name in named.items() if name and name not in declared}
+    if unknown:
+        view, name = next(iter(unknown.items()))
+        others = len(unknown) - 1
+        raise DataError(
+            f"views.csv, view {view}, column {kind}: {name!r} is not declared; session.toml "
+            f"declares {known}{f' ({others} more such rows)' if others else ''}.",
+            culprits=[f"views.csv: view {it}" for it in unknown],
+            next_step=did_you_mean(name, declared) or f"Add [{plural}.{name}], or correct the row.",
+        )
+    if len(declared) < 2:
+        return
+    needs, whose, hint = _NEEDS[kind]
+    without = [str(view.number) for view in views if needs(view) and not named[view.number]]
+    if without:
+        raise DataError(
+            f"views.csv: of several {plural} ({known}), the column {kind} must name {whose}; it "
+            f"is empty in view {some_of(without)}.",
+            culprits=[f"views.csv: view {it}" for it in without],
+            next_step=f"Name the {kind} in each of these rows{hint}.",
+        )
+
+
+def _check_one(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
+    """A session with one of a kind, or none, may name it as it likes, but only one."""
+    if len(names) < 2:
+        return
+    tables = ", ".join(f"[{kind}s.{name}]" for name in names)
+    of_target = ", each with target = a name or a path" if kind == "target" else ""
+    raise DataError(
+        f"views.csv, column {kind}: it names {', '.join(names)}, but session.toml "
+        f"{f'has the one {kind} for all' if is_declared else 'declares none'}.",
+        culprits=[f"session.toml: {kind}s"],
+        next_step=f"Declare {tables}{of_target}.",
+    )
+
+
+def kind_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
+    """Words those of several that no row names."""
+    for kind in KINDS:
+        declared = declaration.named(kind)
+        named = {view.text.get(kind, "").strip() for view in views}
+        for name in declared if len(declared) > 1 else ():
+            if name not in named:
+                yield f"session.toml: {kind}s.{name}: no row of views.csv names it."

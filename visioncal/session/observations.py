@@ -1,0 +1,136 @@
+"""The rows of a session as what they are observations of: who saw what, and how robots stood."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.session.document import Declaration
+from visioncal.session.frames import observed, robots_between
+from visioncal.session.kinds import name_of, tells_robot
+from visioncal.session.table import View
+from visioncal.transforms import pose_difference
+
+# Reports of one robot at one stop that are farther apart are of two poses [mm, deg, rad].
+_APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.3, 5e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One thing seen by another while the robots stood still.
+
+    Attributes:
+        view: Its row.
+        station: Which state of the cell it is of; all rows of a stop share one, unless they tell
+            different poses of a robot.
+        seer: The frame of the camera or instrument.
+        seen: The frame of the target or point.
+        robots: Of each robot between the two that is told of at this stop, the row that tells it.
+        lacks: The robots between the two of which no row of the stop tells where they stood.
+    """
+
+    view: View
+    station: int
+    seer: str
+    seen: str
+    robots: Mapping[str, View]
+    lacks: tuple[str, ...] = ()
+
+    @property
+    def is_of_lens(self) -> bool:
+        """Whether it tells of the camera's lens alone."""
+        return self.view.is_of_lens or bool(self.lacks)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stop:
+    """The rows of one stop, and the row that tells each robot's pose for most of them."""
+
+    rows: tuple[View, ...]
+    told: Mapping[str, View]
+
+
+def observations_of(
+    declaration: Declaration, views: Sequence[View], frames: Mapping[str, str]
+) -> tuple[Observation, ...]:
+    """Lists what was observed, in the order of the rows.
+
+    Args:
+        declaration: What the session declares.
+        views: Its rows.
+        frames: What hangs on what, as `resolve_frames` gives it.
+
+    Returns:
+        One observation a row that has one: rows that only tell where a robot stood have none.
+    """
+    place_of = {view.number: at for at, view in enumerate(views)}
+    found, station = [], 0
+    for stop in _stops(declaration, views):
+        # Rows that tell other poses than the rest are of a state of the cell of their own.
+        states: dict[tuple[int, ...], int] = {}
+        for view in stop.rows:
+            own = {name_of(declaration, "robot", view): view} if tells_robot(view) else {}
+            strays = {it: row for it, row in own.items() if _differ(row, stop.told[it])}
+            told = {**stop.told, **strays}
+            key = tuple(told[it].number for it in sorted(told))
+            seer, seen = observed(declaration, view)
+            if not seer:
+                continue
+            if key not in states:
+                states[key], station = station, station + 1
+            needed = () if view.is_of_lens else robots_between(frames, seer, seen)
+            robots = {it: told[it] for it in needed if it in told}
+            lacks = tuple(it for it in needed if it not in told)
+            found.append(Observation(view, states[key], seer, seen, robots, lacks))
+    return tuple(sorted(found, key=lambda it: place_of[it.view.number]))
+
+
+def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
+    """Words rows that tell another pose of a robot than the rest of their stop."""
+    for stop in _stops(declaration, views):
+        for view in stop.rows:
+            robot = name_of(declaration, "robot", view)
+            if tells_robot(view) and _differ(view, stop.told[robot]):
+                of = f" of robot {robot}" if robot else ""
+                yield (
+                    f"views.csv: view {view.number} tells another pose{of} than view "
+                    f"{stop.told[robot].number} of the same stop {view.stop}. One of the two "
+                    "belongs to another stop."
+                )
+
+
+def _stops(declaration: Declaration, views: Sequence[View]) -> list[_Stop]:
+    """Groups rows by their stop; a row without one is a stop of its own."""
+    groups: dict[tuple[int, int], list[View]] = {}
+    for view in views:
+        key = (1, view.number) if view.stop is None or view.is_of_lens else (0, view.stop)
+        groups.setdefault(key, []).append(view)
+    return [_Stop(tuple(rows), _told(declaration, rows)) for rows in groups.values()]
+
+
+def _told(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:
+    """Of each robot, the row with the pose that most rows of a stop agree on."""
+    telling: dict[str, list[View]] = {}
+    for view in rows:
+        if tells_robot(view):
+            telling.setdefault(name_of(declaration, "robot", view), []).append(view)
+    told = {}
+    for robot, mine in telling.items():
+        agreeing = Counter({at: sum(not _differ(a, b) for b in mine) for at, a in enumerate(mine)})
+        told[robot] = mine[max(agreeing, key=lambda at: (agreeing[at], -at))]
+    return told
+
+
+def _differ(first: View, second: View) -> bool:
+    """Whether two rows tell of one robot that it stood in different poses."""
+    if first is second:
+        return False
+    poses = first.base_from_flange(), second.base_from_flange()
+    if poses[0] is not None and poses[1] is not None:
+        mm, deg = pose_difference(poses[0].as_matrix(), poses[1].as_matrix())
+        return mm > _APART_MM or deg > _APART_DEG
+    joints = first.joints_rad, second.joints_rad
+    if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:
+        return False
+    return bool(np.abs(joints[0] - joints[1]).max() > _APART_RAD)

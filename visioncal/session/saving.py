@@ -1,0 +1,126 @@
+"""A session written as a folder that needs no other file; whole or not at all."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import tomli_w
+
+from visioncal.errors import DataError
+from visioncal.files import write_atomically
+from visioncal.robot import robot_file
+from visioncal.session.digest import is_file
+from visioncal.session.document import Declaration
+from visioncal.session.images import ImageStore, inside_path
+
+
+def write_folder(
+    folder: Path, texts: Mapping[str, str], images: ImageStore, paths: Sequence[str]
+) -> None:
+    """Writes texts and images, by their paths inside a new folder.
+
+    Args:
+        folder: The folder; it must not hold anything yet.
+        texts: The texts.
+        images: Where the images' bytes come from; missing ones stay missing.
+        paths: The images.
+
+    Raises:
+        DataError: The folder exists and is not empty, or cannot be written.
+    """
+    folder = folder.absolute()
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(
+            f"{folder} exists and is not empty; a session is written to a new folder.",
+            culprits=[str(folder)],
+            next_step="Choose another name, or remove it first.",
+        )
+    aside = folder.parent / f".{uuid4().hex}.tmp"
+    try:
+        aside.mkdir(parents=True)
+        try:
+            for path in paths:
+                if images.exists(path):
+                    _write_below(aside, path, images.read(path))
+            for path, text in texts.items():
+                _write_below(aside, path, text)
+            if folder.exists():
+                folder.rmdir()
+            aside.replace(folder)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+    except OSError as error:
+        raise DataError(
+            f"{folder} cannot be written: {error.strerror or error}.", culprits=[str(folder)]
+        ) from error
+
+
+def placed_files(
+    declaration: Declaration,
+    document: Mapping[str, Any],
+    target_document: Mapping[str, Any] | None,
+    robot_document: Mapping[str, Any] | None,
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Gives targets and robots that were files a place in the session's folder.
+
+    Returns:
+        The content of session.toml with paths in the folder, and their texts by these paths. What
+        comes with visioncal stays a name.
+    """
+    placed = dict(document)
+    texts = {} if target_document is None else _place_targets(declaration, placed, target_document)
+    if robot_document is not None:
+        texts |= _place_robots(declaration, placed, robot_document)
+    return placed, texts
+
+
+def _place_targets(
+    declaration: Declaration, document: dict[str, Any], contents: Mapping[str, Any]
+) -> dict[str, str]:
+    if is_file(declaration.target):
+        document["target"] = _place_inside(str(declaration.target), "target.toml")
+        return {document["target"]: tomli_w.dumps(contents)}
+    texts, several = {}, len(declaration.targets) > 1
+    for name, table in declaration.targets.items():
+        if is_file(table.target):
+            path = _place_inside(table.target, f"target_{name}.toml")
+            kept = {**table.model_dump(), "target": path}
+            document["targets"] = {**document["targets"], name: kept}
+            texts[path] = tomli_w.dumps(contents[name] if several else contents)
+    return texts
+
+
+def _place_robots(
+    declaration: Declaration, document: dict[str, Any], contents: Mapping[str, Any]
+) -> dict[str, str]:
+    only = declaration.robot
+    if only is not None and only.model is not None and is_file(only.model):
+        name, content = robot_file(contents, only.model)
+        model = _place_inside(only.model, name)
+        document["robot"] = {**document["robot"], "model": model}
+        return {model: content}
+    texts, several = {}, len(declaration.robots) > 1
+    for robot, table in declaration.robots.items():
+        mine = contents.get(robot) if several else contents
+        if table.model is not None and is_file(table.model) and mine is not None:
+            name, content = robot_file(mine, table.model)
+            path = _place_inside(table.model, f"{robot}_{name}")
+            kept = {**table.model_dump(exclude_none=True), "model": path}
+            document["robots"] = {**document["robots"], robot: kept}
+            texts[path] = content
+    return texts
+
+
+def _place_inside(path: str, fallback: str) -> str:
+    """Keeps a path that stays inside the session's folder; others become `fallback`."""
+    try:
+        return inside_path(path)
+    except DataError:
+        return fallback
+
+
+def _write_below(folder: Path, path: str, data: bytes | str) -> None:
+    (folder / path).parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / path, data)

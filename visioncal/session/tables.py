@@ -1,0 +1,74 @@
+"""The tables of session.toml: their fields, types and ranges."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from visioncal.types import CameraKind
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+# Nobody knows a focal length better than the least of these, or worse than the largest [px].
+PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+PositiveInt = Annotated[int, Field(gt=0)]
+
+
+class TableModel(BaseModel):
+    """A table of session.toml. Unknown keys are kept in `model_extra`."""
+
+    # Unknown keys are kept: a newer version, or the user, may have put them there.
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+
+
+class CameraTable(TableModel):
+    """`[camera]`. matrix: fx, fy, cx, cy [px]; resolution: width, height [px]."""
+
+    name: str = "camera"
+    resolution: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)] | None = None
+    model: CameraKind = "brown"
+    matrix: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
+    distortion: list[FiniteFloat] | None = None
+    intrinsics: Literal["auto", "hold", "refine"] = "auto"
+    matrix_sigma_px: PixelSigma | None = None
+
+
+class RobotTable(TableModel):
+    """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
+
+    One of several may go without, where its poses are enough. gravity_m_s2: its acceleration in the
+    robot's base, for a base that does not stand upright.
+    """
+
+    model: str | None = None
+    tip: str | None = None
+    gravity_m_s2: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None
+
+
+class InstrumentTable(TableModel):
+    """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]; see `instruments`."""
+
+    name: str = "instrument"
+    sigma_m: NotNegative | None = None
+    sigma_per_m: NotNegative | None = None
+    sigma_rad: NotNegative | None = None
+
+
+class ClockTable(TableModel):
+    """`[clock]`. What the camera's stamps are ahead of the robot's [s]."""
+
+    camera_minus_robot_s: FiniteFloat = 0.0
+
+
+class PriorTable(TableModel):
+    """`[prior.EDGE]`. Measured components of an unknown edge and their standard deviation [m]."""
+
+    x_m: FiniteFloat | None = None
+    y_m: FiniteFloat | None = None
+    z_m: FiniteFloat | None = None
+    sigma_m: Positive
+
+
+class TargetTable(TableModel):
+    """`[targets.NAME]`, one of several. target: a name in targets/, or the path of a .toml."""
+
+    target: str
