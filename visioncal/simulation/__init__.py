@@ -6,6 +6,17 @@ projection or a wrong chain cannot hide by being wrong in both.
 
 from visioncal.simulation.arms import Arm, arm_named, forward, industrial_arm, ur_arm
 from visioncal.simulation.cell import Cell, simulate
+from visioncal.simulation.layout import (
+    BoardAt,
+    CameraAt,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    PointAt,
+    RobotAt,
+)
+from visioncal.simulation.network import Network, Sight, simulate_network
+from visioncal.simulation.network_records import network_session, write_network
 from visioncal.simulation.optics import fine_camera, fisheye_camera, project, rays, wide_camera
 from visioncal.simulation.options import (
     CellOptions,
@@ -38,14 +49,23 @@ from visioncal.simulation.warmup import (
 
 __all__ = [
     "Arm",
+    "BoardAt",
+    "CameraAt",
     "Cell",
     "CellOptions",
     "Heat",
+    "InstrumentAt",
     "Motion",
+    "Moved",
+    "Network",
+    "NetworkOptions",
     "Payload",
+    "PointAt",
+    "RobotAt",
     "Round",
     "Scene",
     "Second",
+    "Sight",
     "Sweep",
     "SweepOptions",
     "Truth",
@@ -60,6 +80,7 @@ __all__ = [
     "forward",
     "industrial_arm",
     "measured_poses",
+    "network_session",
     "prepare_scene",
     "project",
     "rays",
@@ -67,12 +88,14 @@ __all__ = [
     "render",
     "render_view",
     "simulate",
+    "simulate_network",
     "simulate_warm_up",
     "sweep",
     "sweep_session",
     "truth_path",
     "ur_arm",
     "wide_camera",
+    "write_network",
     "write_session",
     "write_sweep",
     "write_warm_up",

@@ -28,7 +28,7 @@ from visioncal.transforms import compose, exp, invert
 from visioncal.types import Camera, Corners, FloatArray
 
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
-_LEAST_DEXTERITY = 0.04
+LEAST_DEXTERITY = 0.04
 # A corner nearer to the image's edge is not detected [px].
 _EDGE_PX = 2.0
 
@@ -225,11 +225,11 @@ def _mountings(options: CellOptions, arm: Arm, sheet: Sheet) -> dict[str, FloatA
     flange_from_target = compose(board, held - board @ centre_m(sheet))
     work = np.array([radius * np.cos(front), radius * np.sin(front), 0.6 * reach_m(arm)])
     away = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
-    base_from_cam = _looking_at(work, away / np.linalg.norm(away), mean_view(options, sheet))
+    base_from_cam = looking_at(work, away / np.linalg.norm(away), mean_view(options, sheet))
     return {"base_from_cam": base_from_cam, "flange_from_target": flange_from_target}
 
 
-def _looking_at(point: FloatArray, away: FloatArray, view: FloatArray) -> FloatArray:
+def looking_at(point: FloatArray, away: FloatArray, view: FloatArray) -> FloatArray:
     """`base_from_cam` (4, 4) of an upright camera that looks at a point along -`away`."""
     right = np.cross(-away, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -278,7 +278,7 @@ def _reachable_joints(
     """(m, n) postures of the nominal arm that bring the board into the image."""
     # Nothing of the arm may sink into the table under the board, or under the robot.
     floor = min(0.0, transforms.get("base_from_target", np.eye(4))[2, 3]) + 0.05
-    home = _home(options, arm, _flange(transforms, mean_view(options, sheet)[None]), rng)
+    home = home_posture(options, arm, _flange(transforms, mean_view(options, sheet)[None]), rng)
     kept: list[FloatArray] = []
     for _ in range(50):
         views = draw_views(options, sheet, 4 * options.views, rng)
@@ -288,8 +288,8 @@ def _reachable_joints(
         if options.branches:
             starts = rng.uniform(-np.pi, np.pi, starts.shape)
         reach = inverse(arm, _flange(transforms, views), starts)
-        good = reach.solved & (reach.dexterity > _LEAST_DEXTERITY)
-        good &= _lowest_m(arm, reach.joints) > floor
+        good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
+        good &= lowest_m(arm, reach.joints) > floor
         kept.extend(reach.joints[good])
         if len(kept) >= options.views:
             return np.array(kept[: options.views])
@@ -300,7 +300,7 @@ def _reachable_joints(
     )
 
 
-def _home(
+def home_posture(
     options: CellOptions, arm: Arm, base_from_flange: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """(n,) the most dexterous posture at one pose (1, 4, 4); all views start from it."""
@@ -318,7 +318,7 @@ def _home(
     return np.asarray((best + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:
+def lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:
     """(m,) height over the base of the lowest of elbow, wrists and flange [m]."""
     return np.asarray(link_frames(arm, joints)[:, 2:, 2, 3].min(axis=1))
 

@@ -107,7 +107,7 @@ def write_sweep(moved: Sweep, folder: Path | str) -> Path:
 def sweep_session(moved: Sweep, name: str) -> Session:
     """The session of a sweep: frames with measured poses, and the robot's stream."""
     numbers = [
-        {"stamp_s": stamp_s} | {f"cft_{key}": value for key, value in _pose_row(pose).items()}
+        {"stamp_s": stamp_s} | {f"cft_{key}": value for key, value in pose_row(pose).items()}
         for stamp_s, pose in zip(moved.frames_s.tolist(), measured_poses(moved.cell), strict=True)
     ]
     views = tuple(View(at, numbers=row) for at, row in enumerate(numbers))
@@ -176,12 +176,30 @@ def measured_poses(cell: Cell) -> FloatArray:
         ids = cell.exact_corners[view].ids
         if ids.size < 4:
             raise DataError(f"simulation: view {view} shows {ids.size} corners, a pose needs 4.")
-        jacobian = _pose_jacobian(cell.options.camera, pose, points[ids])
-        # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
-        factor = np.linalg.qr(jacobian, mode="r")
-        twist = cell.options.pixel_sigma_px * np.linalg.solve(factor, draws[view])
-        measured[view] = pose @ exp(twist)
+        camera, sigma_px = cell.options.camera, cell.options.pixel_sigma_px
+        measured[view] = noisy_pose(camera, pose, points[ids], sigma_px, draws[view])
     return measured
+
+
+def noisy_pose(
+    camera: Camera,
+    cam_from_target: FloatArray,
+    points: FloatArray,
+    sigma_px: float,
+    draws: FloatArray,
+) -> FloatArray:
+    """A pose (4, 4) with the error of a fit to (n, 3) points that are seen.
+
+    Args:
+        camera: The camera.
+        cam_from_target: (4, 4) the true pose.
+        points: In the target frame [m].
+        sigma_px: Noise of the points in the image, per axis [px].
+        draws: (6,) white noise.
+    """
+    # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
+    factor = np.linalg.qr(_pose_jacobian(camera, cam_from_target, points), mode="r")
+    return cam_from_target @ exp(sigma_px * np.linalg.solve(factor, draws))
 
 
 def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
@@ -219,7 +237,7 @@ def _image_session(cell: Cell, name: str, progress: Callable[[float], None] | No
 def pairs_session(cell: Cell, name: str) -> Session:
     """The session of a cell with `cam_from_target` as measured, and neither camera nor target."""
     numbers = [
-        {**row, **{f"cft_{key}": value for key, value in _pose_row(pose).items()}}
+        {**row, **{f"cft_{key}": value for key, value in pose_row(pose).items()}}
         for row, pose in zip(_report_rows(cell), measured_poses(cell), strict=True)
     ]
     views = [
@@ -242,7 +260,7 @@ def _session(
     """The session of a cell with its board, or with both of them."""
     target = cell.sheets[0].target
     if len(cell.sheets) == 1:
-        return Session(document, columns, tuple(views), target, _target_document(target), images)
+        return Session(document, columns, tuple(views), target, target_document(target), images)
     targets = {name: it.target for name, it in zip(BOARDS, cell.sheets, strict=True)}
     shown = zip(views, cell.shown.stops.tolist(), cell.shown.boards.tolist(), strict=True)
     return Session(
@@ -253,7 +271,7 @@ def _session(
             for view, stop, board in shown
         ),
         target,
-        {name: _target_document(it) for name, it in targets.items()},
+        {name: target_document(it) for name, it in targets.items()},
         images,
         targets=targets,
     )
@@ -262,16 +280,16 @@ def _session(
 def _targets(cell: Cell) -> dict[str, Any]:
     """What session.toml says of the boards."""
     if len(cell.sheets) == 1:
-        return {"target": _target_place(cell.sheets[0].target, "target.toml")}
+        return {"target": target_place(cell.sheets[0].target, "target.toml")}
     return {
         "targets": {
-            name: {"target": _target_place(it.target, f"target_{name}.toml")}
+            name: {"target": target_place(it.target, f"target_{name}.toml")}
             for name, it in zip(BOARDS, cell.sheets, strict=True)
         }
     }
 
 
-def _target_place(target: Target, path: str) -> str:
+def target_place(target: Target, path: str) -> str:
     """Names a board that comes with visioncal, or the file that is written."""
     return target.name if target in (charuco_target(), checkerboard_target()) else path
 
@@ -298,7 +316,8 @@ def _camera_table(cell: Cell) -> dict[str, Any]:
     return table
 
 
-def _target_document(target: Target) -> dict[str, Any]:
+def target_document(target: Target) -> dict[str, Any]:
+    """What the file of a board says."""
     document: dict[str, Any] = {"kind": target.kind}
     if target.kind == "marker":
         document |= {"id": target.marker_id, "size_m": target.square_m}
@@ -317,7 +336,7 @@ def _report_rows(cell: Cell) -> Iterator[dict[str, float]]:
     for view in range(len(cell.corners)):
         joints = {f"q{i + 1}_rad": float(q) for i, q in enumerate(cell.joints[view])}
         load = load_row(cell.payloads[view]) if cell.payloads else {}
-        yield {"stamp_s": _PACE_S * view} | _pose_row(cell.base_from_flange[view]) | joints | load
+        yield {"stamp_s": _PACE_S * view} | pose_row(cell.base_from_flange[view]) | joints | load
 
 
 def load_row(load: Payload) -> dict[str, float]:
@@ -332,7 +351,7 @@ def approach_text(cell: Cell, view: int) -> dict[str, str]:
     return {} if cell.approach is None else {"approach": "+" if cell.approach[view] > 0 else "-"}
 
 
-def _pose_row(pose: FloatArray) -> dict[str, float]:
+def pose_row(pose: FloatArray) -> dict[str, float]:
     """Seven columns of a pose (4, 4)."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
     return dict(zip(_POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))

@@ -10,7 +10,7 @@ from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import sees
 from visioncal.simulation.options import CellOptions, Second
 from visioncal.transforms import compose
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import Camera, FloatArray, IntArray, Mask
 
 # What a session calls the boards where there are two.
 BOARDS = ("first", "second")
@@ -87,7 +87,7 @@ def shown_at(options: CellOptions, sheets: Sequence[Sheet], poses: Sequence[Floa
     count = len(poses[0])
     if len(sheets) == 1:
         return Shown(np.arange(count), np.zeros(count, dtype=np.int64))
-    seen = [_looks_at(options, *it) for it in zip(sheets, poses, strict=True)]
+    seen = [looks_at(options.camera, *it) for it in zip(sheets, poses, strict=True)]
     # What a stop was made for is in view.
     aimed = np.arange(count) % len(sheets)
     visible = np.array(seen).T
@@ -96,14 +96,16 @@ def shown_at(options: CellOptions, sheets: Sequence[Sheet], poses: Sequence[Floa
     return Shown(stops, boards)
 
 
-def _looks_at(options: CellOptions, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
+def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     """(s,) in which of the stops a board is in view, not too much from the side."""
     points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
     points = points + cam_from_target[:, None, :3, 3]
     towards = points / np.linalg.norm(points, axis=2, keepdims=True)
     facing = np.einsum("mni,mi->mn", towards, cam_from_target[:, :3, 2]) > _LEAST_COSINE
     looks = facing.all(axis=1) & (towards[:, :, 2] > _LEAST_COSINE).all(axis=1)
-    share = sees(options.camera, points[looks], _EDGE_PX).mean(axis=1)
+    if not looks.any():
+        return np.asarray(looks)
+    share = sees(camera, points[looks], _EDGE_PX).mean(axis=1)
     # A checkerboard is found whole or not at all.
     looks[looks] = share >= (1.0 if sheet.target.kind == "checkerboard" else _LEAST_SHARE)
     return np.asarray(looks)

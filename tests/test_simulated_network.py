@@ -1,0 +1,137 @@
+"""Simulated cells of several robots: the rows say what was really there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from visioncal.errors import DataError
+from visioncal.session import Session
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    PointAt,
+    checkerboard_target,
+    network_session,
+    simulate_network,
+    write_network,
+)
+from visioncal.simulation.network import is_symmetric
+from visioncal.transforms import invert, pose_difference
+
+EVEN = replace(checkerboard_target(), name="even", columns=8, rows=6)
+OPTIONS = NetworkOptions(
+    cameras=(*NetworkOptions().cameras, CameraAt("hand", "a")),
+    boards=(*NetworkOptions().boards[1:], BoardAt("even", target=EVEN)),
+    instruments=(InstrumentAt("tracker", (1.0, -1.5, 0.5), 0.3),),
+    points=(PointAt("nest", "cell", (0.2, 0.1, 0.0)), PointAt("ball", "b", (0.0, 0.05, 0.1))),
+    stops=8,
+    lens_views=3,
+)
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return simulate_network(OPTIONS)
+
+
+def chained(cell, frame, robots):
+    """`cell_from_frame` by the poses that rows tell, written out anew."""
+    parent, placed = cell.parents[frame], cell.transforms[frame]
+    if parent == "cell":
+        return placed
+    name = parent.removeprefix("flange_")
+    told = robots[name].base_from_flange().as_matrix()
+    return cell.transforms[f"base_{name}"] @ told @ placed
+
+
+def test_rows_tell_all_that_their_observations_need(cell):
+    session = network_session(cell, "cell", seen="poses")
+    assert session.frames["target_even"] == "cell"
+    assert session.frames["cam_hand"] == "flange_a"
+    assert session.frames["point_ball"] == "flange_b"
+    pairs = {(it.seer, it.seen) for it in session.observations}
+    # The camera on one robot looks at the board on the other.
+    assert ("cam_hand", "target_plate_b") in pairs
+    for it in session.observations:
+        assert not it.lacks
+        seer = chained(cell, it.seer, it.robots)
+        seen = chained(cell, it.seen, it.robots)
+        if it.view.reading_m is not None:
+            off_mm = 1e3 * np.linalg.norm((invert(seer) @ seen)[:3, 3] - it.view.reading_m)
+            # Four sigma of the tracker (15 um) and of the arm, whose turn acts at 0.1 m.
+            assert off_mm < 0.2
+            continue
+        mm, deg = pose_difference(invert(seer) @ seen, it.view.cam_from_target().as_matrix())
+        # Arms repeat to 0.03 mm and 0.003 deg, but the depth of small boards is seen to 1 mm.
+        assert mm < 6.0
+        assert deg < 0.5
+
+
+def test_faults_are_where_the_truth_says(cell):
+    faulty = simulate_network(
+        replace(
+            OPTIONS,
+            swapped_rows=1,
+            stray_images=2,
+            moved=(Moved("target_plate_b"), Moved("cam_left", 6, 0.02)),
+        )
+    )
+    assert len(faulty.wrong_views) == 4
+    other = {
+        new.view
+        for old, new in zip(cell.sights, faulty.sights, strict=False)
+        if old.view == new.view and not np.allclose(old.cam_from_target, new.cam_from_target)
+    }
+    moved = {
+        it.view
+        for it in cell.sights
+        if (it.board == "plate_b" and it.stop >= 4) or (it.camera == "left" and it.stop >= 6)
+    }
+    # A push may take a board out of an image: then rows are numbered otherwise from there on.
+    early = {it.view for it in cell.sights if 0 <= it.stop < 4}
+    assert other & early == set(faulty.wrong_views) & early
+    assert other & moved & {it.view for it in cell.sights if it.stop == 4}
+
+
+def test_a_board_that_looks_alike_from_both_ends_begins_anywhere(cell):
+    assert is_symmetric(EVEN)
+    turned = []
+    for sight in cell.sights:
+        if sight.board == "even":
+            # Pixel noise is far below the 10 px and more between corners.
+            first, last = (
+                np.linalg.norm(sight.corners.px[0] - sight.exact.px[end]) for end in (0, -1)
+            )
+            assert min(first, last) < 1.0
+            turned.append(bool(last < first))
+    assert set(turned) == {True, False}
+
+
+def test_it_is_written_whole_with_pictures_and_truth(tmp_path):
+    options = replace(
+        OPTIONS,
+        cameras=(CameraAt("low", place_m=(0.0, -0.5, 0.7), state_intrinsics=False),),
+        boards=(BoardAt("plate", "a"), BoardAt("floor", target=EVEN)),
+        stops=1,
+        lens_views=1,
+    )
+    cell = simulate_network(options)
+    session = Session.load(write_network(cell, tmp_path / "cell"))
+    assert session.digest() == network_session(cell, "cell").digest()
+    assert all(session.images.exists(it.image) for it in session.views if it.image)
+    assert [it.image for it in session.views if it.is_of_lens] == [
+        f"lens_low/{cell.sights[-1].view:04d}.png"
+    ]
+    assert session.cameras["low"].matrix is None
+    assert (tmp_path / "cell.truth.json").is_file()
+
+
+def test_what_is_nowhere_is_refused():
+    with pytest.raises(DataError, match="hand is on 'c'; there are a, b, cell"):
+        NetworkOptions(cameras=(CameraAt("hand", "c"),))
+    with pytest.raises(DataError, match="'target_flor' cannot be pushed"):
+        simulate_network(replace(OPTIONS, moved=(Moved("target_flor"),)))

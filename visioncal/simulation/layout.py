@@ -1,0 +1,193 @@
+"""What a simulated cell of several robots, cameras and boards is made of, and what befalls it."""
+
+from dataclasses import dataclass, field
+
+from visioncal.errors import DataError
+from visioncal.simulation.optics import fine_camera, wide_camera
+from visioncal.simulation.options import charuco_target, checkerboard_target
+from visioncal.types import Camera, Target
+
+# Where robots meet [m].
+MIDDLE_M = (0.0, 0.0, 0.4)
+CELL = "cell"
+
+
+@dataclass(frozen=True)
+class RobotAt:
+    """A robot that stands in the cell and turns its front to the middle.
+
+    Attributes:
+        name: What the session calls it.
+        place_m: Where its base stands in the cell [m].
+        robot: `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
+        sigma_m: Repeatability of its flange, per axis [m].
+        sigma_rad: The same for its rotation [rad].
+        offset_sigma_rad: Departure of its joint offsets from the nominal ones [rad].
+        dh_sigma_m: Departure of its lengths [m].
+        dh_sigma_rad: Departure of its angles [rad].
+    """
+
+    name: str
+    place_m: tuple[float, float, float]
+    robot: str = "ur5e"
+    sigma_m: float = 3e-5
+    sigma_rad: float = 5e-5
+    offset_sigma_rad: float = 0.0
+    dh_sigma_m: float = 0.0
+    dh_sigma_rad: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraAt:
+    """A camera on a robot's flange, or one that stands in the cell and looks at a place of it.
+
+    Attributes:
+        name: What the session calls it.
+        on: The robot on whose flange it is, or `cell`.
+        place_m: Where it stands in the cell, if it does [m].
+        camera: Its optics.
+        state_intrinsics: Whether the session states them.
+        looks_at_m: The place at which one in the cell looks [m].
+    """
+
+    name: str
+    on: str = CELL
+    place_m: tuple[float, float, float] = (0.0, -1.0, 1.1)
+    camera: Camera = field(default_factory=wide_camera)
+    state_intrinsics: bool = True
+    looks_at_m: tuple[float, float, float] = MIDDLE_M
+
+
+@dataclass(frozen=True)
+class BoardAt:
+    """A board on a robot's flange, or one that lies in the cell.
+
+    Attributes:
+        name: What the session calls it.
+        on: The robot on whose flange it is, or `cell`.
+        place_m: Where its middle lies in the cell, if it does [m].
+        tilt_rad: How far it leans towards the middle of the cell [rad].
+        target: The board as its file states it.
+        scale: Printed size over stated size.
+        bow_m: How far its corners are bent away from the camera [m].
+    """
+
+    name: str
+    on: str = CELL
+    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tilt_rad: float = 0.0
+    target: Target = field(default_factory=charuco_target)
+    scale: float = 1.0
+    bow_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class PointAt:
+    """A point that instruments read, on a flange or in the cell.
+
+    Attributes:
+        name: What the session calls it.
+        on: The robot on whose flange it is, or `cell`.
+        place_m: Where it is in the frame of that flange, or of the cell [m].
+    """
+
+    name: str
+    on: str
+    place_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class InstrumentAt:
+    """An instrument that stands upright in the cell and reads every point at every stop.
+
+    Attributes:
+        name: What the session calls it.
+        place_m: Where it stands [m].
+        turn_rad: How far it is turned about the vertical [rad].
+        sigma_m: Noise of its readings, per axis [m].
+    """
+
+    name: str
+    place_m: tuple[float, float, float]
+    turn_rad: float = 0.0
+    sigma_m: float = 1.5e-5
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Something that is pushed in the course of the recording.
+
+    Attributes:
+        frame: The frame that hangs otherwise from then on, as `target_floor` or `cam_left`.
+        from_stop: The first stop after the push; None for half-way.
+        shift_m: How far it is pushed, in a direction of chance [m].
+        turn_rad: How far it is turned [rad].
+    """
+
+    frame: str
+    from_stop: int | None = None
+    shift_m: float = 0.005
+    turn_rad: float = 0.01
+
+
+def _two_robots() -> tuple[RobotAt, ...]:
+    return RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))
+
+
+def _two_cameras() -> tuple[CameraAt, ...]:
+    left = CameraAt("left", place_m=(0.0, -1.0, 1.1))
+    return left, CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
+
+
+def _three_boards() -> tuple[BoardAt, ...]:
+    floor = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
+    return floor, BoardAt("plate_a", "a", target=checkerboard_target()), BoardAt("plate_b", "b")
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkOptions:
+    """A simulated cell with several of a kind: two robots, two fixed cameras and three boards.
+
+    Nothing hides anything else: what is in a camera's image is seen.
+
+    Attributes:
+        robots: The robots.
+        cameras: The cameras.
+        boards: The boards.
+        instruments: Instruments, if there are any.
+        points: The points that these read.
+        stops: How often all robots stand still together.
+        share_seen: Share of what could be seen that is recorded; the rest is left out by chance.
+        lens_views: Images of each camera that are of its lens alone, as the board is held by hand.
+        pixel_sigma_px: Noise of the corners, per axis [px].
+        moved: What is pushed in the course of the recording.
+        swapped_rows: Pairs of rows of one camera and board whose images are exchanged.
+        stray_images: Rows whose image is from another stop.
+        seed: Of everything random; each source of randomness has a stream of its own.
+    """
+
+    robots: tuple[RobotAt, ...] = field(default_factory=_two_robots)
+    cameras: tuple[CameraAt, ...] = field(default_factory=_two_cameras)
+    boards: tuple[BoardAt, ...] = field(default_factory=_three_boards)
+    instruments: tuple[InstrumentAt, ...] = ()
+    points: tuple[PointAt, ...] = ()
+    stops: int = 30
+    share_seen: float = 1.0
+    lens_views: int = 0
+    pixel_sigma_px: float = 0.05
+    moved: tuple[Moved, ...] = ()
+    swapped_rows: int = 0
+    stray_images: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.stops < 1:
+            raise DataError(f"simulation: stops is {self.stops}, at least 1 is needed.")
+        known = {CELL, *(it.name for it in self.robots)}
+        on = [(it.name, it.on) for it in self.cameras]
+        on += [(it.name, it.on) for it in self.boards] + [(it.name, it.on) for it in self.points]
+        for name, carrier in on:
+            if carrier not in known:
+                raise DataError(
+                    f"simulation: {name} is on {carrier!r}; there are {', '.join(sorted(known))}."
+                )

@@ -1,0 +1,363 @@
+"""A simulated cell of several robots, cameras and boards: what really is and what is reported."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.session import frame_name
+from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
+from visioncal.simulation.boards import Sheet, corners_m
+from visioncal.simulation.layout import BoardAt, CameraAt, Moved, NetworkOptions
+from visioncal.simulation.optics import project, sees
+from visioncal.simulation.options import CellOptions
+from visioncal.simulation.poses import draw_views
+from visioncal.simulation.second import looks_at
+from visioncal.simulation.standing import Stream, mounted, parents_of, postures, sheet_of, stream
+from visioncal.transforms import exp, invert
+from visioncal.types import Corners, FloatArray, IntArray, Target
+
+# A corner nearer to the image's edge is not detected [px].
+_EDGE_PX = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A camera's image of a board at a stop.
+
+    Attributes:
+        view: The number of its row.
+        stop: When it was taken; -1 for an image of the camera's lens alone.
+        camera: The camera's name.
+        board: The board's.
+        cam_from_target: (4, 4) where the board is in the image that the row has.
+        exact: Where its corners are in that image.
+        corners: The same as a detector would report them; which end of a board that looks alike
+            from both it takes for the first, hangs on how it lies in the image.
+    """
+
+    view: int
+    stop: int
+    camera: str
+    board: str
+    cam_from_target: FloatArray
+    exact: Corners
+    corners: Corners
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What an instrument read of a point at a stop: (3,) in the instrument's frame [m]."""
+
+    view: int
+    stop: int
+    instrument: str
+    point: str
+    at_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A simulated cell of several robots, and what was seen in it.
+
+    Attributes:
+        options: What was asked for.
+        parents: What each frame but the flanges hangs on, by its name in a session.
+        transforms: (4, 4) where each of them hangs in it, before anything is pushed.
+        arms: The nominal arms by the robots' names.
+        true_arms: The arms as they were built.
+        joints: (s, n) what each robot reports [rad].
+        base_from_flange: (s, 4, 4) the poses that it reports.
+        true_base_from_flange: (s, 4, 4) where its flange really stood.
+        sights: What cameras saw, by ascending view, and last the images of lenses alone.
+        readings: What instruments read.
+        told: The row that tells where a robot stood, for those that no other row of their stop
+            tells: (view, stop, robot).
+        wrong_views: Rows with another row's image, ascending.
+    """
+
+    options: NetworkOptions
+    parents: Mapping[str, str]
+    transforms: Mapping[str, FloatArray]
+    arms: Mapping[str, Arm]
+    true_arms: Mapping[str, Arm]
+    joints: Mapping[str, FloatArray]
+    base_from_flange: Mapping[str, FloatArray]
+    true_base_from_flange: Mapping[str, FloatArray]
+    sights: tuple[Sight, ...]
+    readings: tuple[Reading, ...]
+    told: tuple[tuple[int, int, str], ...]
+    wrong_views: tuple[int, ...]
+
+    @property
+    def corners(self) -> tuple[Corners, ...]:
+        """What was detected in all images, by ascending view."""
+        return tuple(it.corners for it in self.sights)
+
+    def between(self, first: str, second: str) -> FloatArray:
+        """(4, 4) `first_from_second` of two frames of the cell, none of which a robot moves."""
+        return invert(self._in_cell(first)) @ self._in_cell(second)
+
+    def _in_cell(self, frame: str) -> FloatArray:
+        parent = self.parents.get(frame, "")
+        if frame == "cell":
+            return np.eye(4)
+        if parent != "cell":
+            raise DataError(f"simulation: {frame} does not stand in the cell.")
+        return self.transforms[frame]
+
+    def teller(self, frame: str) -> str | None:
+        """The robot whose pose the rows of a camera, board or point tell; None for none."""
+        on = self.parents[frame]
+        return on.removeprefix("flange_") if on.startswith("flange_") else None
+
+
+def simulate_network(options: NetworkOptions) -> Network:
+    """Builds a cell of several robots, moves them, and looks at the boards.
+
+    Args:
+        options: What the cell is made of. The same options give the same cell.
+
+    Raises:
+        DataError: A robot cannot reach enough poses at which it shows a board to a camera.
+    """
+    parents, transforms = parents_of(options), mounted(options)
+    joints = postures(options, transforms)
+    arms = {it.name: arm_named(it.robot) for it in options.robots}
+    true_arms, flanges = {}, {}
+    for at, robot in enumerate(options.robots):
+        errors = ArmErrors(robot.dh_sigma_m, robot.dh_sigma_rad, robot.offset_sigma_rad)
+        true = disturb(arms[robot.name], errors, stream(options, Stream.ARM, at))
+        sigma = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
+        jitter = stream(options, Stream.ROBOT, at).standard_normal((options.stops, 6)) * sigma
+        true_arms[robot.name] = true
+        flanges[robot.name] = forward(true, joints[robot.name]) @ exp(jitter)
+    cell = Network(
+        options=options,
+        parents=parents,
+        transforms=transforms,
+        arms=arms,
+        true_arms=true_arms,
+        joints=joints,
+        base_from_flange={name: forward(arm, joints[name]) for name, arm in arms.items()},
+        true_base_from_flange=flanges,
+        sights=(),
+        readings=(),
+        told=(),
+        wrong_views=(),
+    )
+    return _with_faults(_observed(cell))
+
+
+def _observed(cell: Network) -> Network:
+    """Adds what cameras and instruments see, stop by stop, and numbers the rows."""
+    options, where = cell.options, _places(cell)
+    poses = {
+        (camera.name, board.name): invert(where[frame_name("camera", camera.name)])
+        @ where[frame_name("target", board.name)]
+        for camera in options.cameras
+        for board in options.boards
+    }
+    shown = {key: _shown(cell, *key, pose) for key, pose in poses.items()}
+    sights: list[Sight] = []
+    readings: list[Reading] = []
+    told: list[tuple[int, int, str]] = []
+    view = 0
+    for stop in range(options.stops):
+        needed: dict[str, bool] = {}
+        for (camera, board), pose in poses.items():
+            if shown[camera, board][stop]:
+                sights.append(_sight(cell, view, stop, camera, board, pose[stop]))
+                _need(cell, needed, frame_name("camera", camera), frame_name("target", board))
+                view += 1
+        for reading in _read(cell, where, stop, view):
+            readings.append(reading)
+            _need(cell, needed, frame_name("point", reading.point), "")
+            view += 1
+        for robot in [it for it, is_told in needed.items() if not is_told]:
+            told.append((view, stop, robot))
+            view += 1
+    sights += _of_lenses(cell, view)
+    return replace(cell, sights=tuple(sights), readings=tuple(readings), told=tuple(told))
+
+
+def _need(cell: Network, needed: dict[str, bool], first: str, second: str) -> None:
+    """Notes the robots between two frames, and that the row tells of the first of them."""
+    robots = [it for frame in (first, second) if frame and (it := cell.teller(frame)) is not None]
+    if len(set(robots)) < len(robots):
+        return
+    for place, robot in enumerate(robots):
+        needed[robot] = needed.get(robot, False) or place == 0
+
+
+def _places(cell: Network) -> dict[str, FloatArray]:
+    """(s, 4, 4) where each frame really is in the cell, stop by stop."""
+    stops = cell.options.stops
+    hangs = {name: np.tile(it, (stops, 1, 1)) for name, it in cell.transforms.items()}
+    for at, moved in enumerate(cell.options.moved):
+        if moved.frame not in hangs:
+            raise DataError(
+                f"simulation: {moved.frame!r} cannot be pushed; there are {', '.join(hangs)}."
+            )
+        start = first_pushed(cell.options, moved)
+        twist = stream(cell.options, Stream.FAULTS, 10 + at).standard_normal((2, 3))
+        twist *= np.array([[moved.turn_rad], [moved.shift_m]]) / np.linalg.norm(
+            twist, axis=1, keepdims=True
+        )
+        hangs[moved.frame][start:] = hangs[moved.frame][start:] @ exp(twist.ravel())
+    for robot in cell.options.robots:
+        base = hangs[frame_name("base", robot.name)]
+        flange = frame_name("flange", robot.name)
+        hangs[flange] = base @ cell.true_base_from_flange[robot.name]
+    for frame, parent in cell.parents.items():
+        if parent.startswith("flange_"):
+            hangs[frame] = hangs[parent] @ hangs[frame]
+    return hangs
+
+
+def first_pushed(options: NetworkOptions, moved: Moved) -> int:
+    """The first stop after a push."""
+    return options.stops // 2 if moved.from_stop is None else moved.from_stop
+
+
+def _shown(cell: Network, camera: str, board: str, pose: FloatArray) -> FloatArray:
+    """(s,) at which stops a camera has a board in its image, and it is recorded."""
+    options = cell.options
+    seen = looks_at(camera_named(options, camera).camera, sheet_named(options, board), pose)
+    places = (
+        [it.name for it in options.cameras].index(camera),
+        [it.name for it in options.boards].index(board),
+    )
+    kept = stream(options, Stream.SHARE, *places).random(options.stops) < options.share_seen
+    return np.asarray(seen & kept)
+
+
+def _sight(cell: Network, view: int, stop: int, camera: str, board: str, pose: FloatArray) -> Sight:
+    """What a camera sees of a board, corner by corner."""
+    options = cell.options
+    optics, sheet = camera_named(options, camera).camera, sheet_named(options, board)
+    points = corners_m(sheet) @ pose[:3, :3].T + pose[:3, 3]
+    ids = np.flatnonzero(sees(optics, points, _EDGE_PX)).astype(np.int64)
+    px = project(optics, points[ids])
+    exact = Corners(view, ids, px, 0.7)
+    noise = stream(options, Stream.PIXELS, view).standard_normal(px.shape)
+    found = _as_detected(sheet, exact, px + options.pixel_sigma_px * noise)
+    return Sight(view, stop, camera, board, pose, exact, found)
+
+
+def _as_detected(sheet: Sheet, exact: Corners, px: FloatArray) -> Corners:
+    """A detector begins a board that looks alike from both ends at the upper left."""
+    ids: IntArray = exact.ids
+    if is_symmetric(sheet.target) and px[0].sum() > px[-1].sum():
+        count = sheet.target.columns * sheet.target.rows
+        ids, px = (count - 1 - ids)[::-1], px[::-1]
+    return Corners(exact.view, ids, px, exact.blur_px)
+
+
+def is_symmetric(target: Target) -> bool:
+    """Whether a board looks alike when it is turned by half a turn."""
+    return target.kind == "checkerboard" and (target.columns + target.rows) % 2 == 0
+
+
+def _of_lenses(cell: Network, first_view: int) -> list[Sight]:
+    """Images of a board that is held by hand before each camera, for its lens alone."""
+    options = cell.options
+    found: list[Sight] = []
+    for place, camera in enumerate(options.cameras):
+        board, rng = options.boards[0], stream(options, Stream.LENS, place)
+        views = np.empty((0, 4, 4))
+        drawing = CellOptions(target=board.target, camera=camera.camera, cut_views=0.0)
+        while len(views) < options.lens_views:
+            more = draw_views(drawing, sheet_of(board), 4 * options.lens_views, rng)
+            views = np.concatenate([views, more])
+        for pose in views[: options.lens_views]:
+            view = first_view + len(found)
+            found.append(_sight(cell, view, -1, camera.name, board.name, pose))
+    return found
+
+
+def _read(
+    cell: Network, where: Mapping[str, FloatArray], stop: int, first_view: int
+) -> list[Reading]:
+    """What instruments read at a stop."""
+    found: list[Reading] = []
+    for instrument in cell.options.instruments:
+        instrument_from_cell = invert(where[frame_name("instrument", instrument.name)][stop])
+        for point in cell.options.points:
+            place = where[frame_name("point", point.name)][stop, :3, 3]
+            view = first_view + len(found)
+            noise = stream(cell.options, Stream.READINGS, view).standard_normal(3)
+            at = instrument_from_cell[:3, :3] @ place + instrument_from_cell[:3, 3]
+            at_m = at + instrument.sigma_m * noise
+            found.append(Reading(view, stop, instrument.name, point.name, at_m))
+    return found
+
+
+def _with_faults(cell: Network) -> Network:
+    """Exchanges images of rows, and takes some from other stops."""
+    options, rng = cell.options, stream(cell.options, Stream.FAULTS)
+    sights = list(cell.sights)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for at, sight in enumerate(sights):
+        if sight.stop >= 0 and _moves(cell, sight):
+            groups.setdefault((sight.camera, sight.board), []).append(at)
+    pools = [rng.permutation(it).tolist() for it in groups.values() if len(it) > 1]
+    wrong: list[int] = []
+    for _ in range(options.swapped_rows):
+        pool = _pool(pools, 2)
+        first, second = pool.pop(), pool.pop()
+        sights[first], sights[second] = (
+            _showing(cell.sights[first], cell.sights[second]),
+            _showing(cell.sights[second], cell.sights[first]),
+        )
+        wrong += [first, second]
+    for _ in range(options.stray_images):
+        rng.shuffle(pools)
+        pool = _pool(pools, 2)
+        row = pool.pop()
+        sights[row] = _showing(cell.sights[row], cell.sights[pool[0]])
+        wrong.append(row)
+    views = sorted(cell.sights[it].view for it in wrong)
+    return replace(cell, sights=tuple(sights), wrong_views=tuple(views))
+
+
+def _moves(cell: Network, sight: Sight) -> bool:
+    """Whether a board moves before a camera."""
+    carriers = [
+        cell.parents[frame_name("camera", sight.camera)],
+        cell.parents[frame_name("target", sight.board)],
+    ]
+    return carriers[0] != carriers[1]
+
+
+def _pool(pools: list[list[int]], least: int) -> list[int]:
+    for pool in pools:
+        if len(pool) >= least:
+            return pool
+    raise DataError("simulation: there are too few rows of one camera and board for such faults.")
+
+
+def _showing(row: Sight, image: Sight) -> Sight:
+    """A row with the image of another."""
+    return replace(
+        row,
+        cam_from_target=image.cam_from_target,
+        exact=replace(image.exact, view=row.view),
+        corners=replace(image.corners, view=row.view),
+    )
+
+
+def camera_named(options: NetworkOptions, name: str) -> CameraAt:
+    """The camera of that name."""
+    return next(it for it in options.cameras if it.name == name)
+
+
+def board_named(options: NetworkOptions, name: str) -> BoardAt:
+    """The board of that name."""
+    return next(it for it in options.boards if it.name == name)
+
+
+def sheet_named(options: NetworkOptions, name: str) -> Sheet:
+    """The board of that name, as it was printed."""
+    return sheet_of(board_named(options, name))

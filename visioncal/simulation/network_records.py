@@ -1,0 +1,251 @@
+"""Simulated cells of several robots on disk: the session, and the truth beside it."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.files import write_atomically
+from visioncal.session import MemoryImages, Session, View, frame_name
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.cell import Cell
+from visioncal.simulation.layout import CameraAt
+from visioncal.simulation.network import (
+    Network,
+    Sight,
+    board_named,
+    camera_named,
+    first_pushed,
+    sheet_named,
+)
+from visioncal.simulation.options import CellOptions
+from visioncal.simulation.records import (
+    noisy_pose,
+    pose_row,
+    target_document,
+    target_place,
+    truth_path,
+)
+from visioncal.simulation.render import Scene, encode, prepare_scene, render
+from visioncal.simulation.second import Shown
+from visioncal.simulation.standing import Stream, stream
+from visioncal.types import FloatArray
+
+# What rows have of what was seen: rendered images, the names of images that are not there, or the
+# board's pose as it was measured.
+Seen: TypeAlias = Literal["images", "names", "poses"]
+
+
+def write_network(
+    cell: Network,
+    folder: Path | str,
+    progress: Callable[[float], None] | None = None,
+    *,
+    seen: Seen = "images",
+) -> Path:
+    """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
+
+    Args:
+        cell: The cell.
+        folder: The session's folder; it must not hold anything yet.
+        progress: Called with the share of the images that is done, 0 to 1.
+        seen: What rows have of what was seen.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: The folder cannot be written, or a target cannot be drawn.
+    """
+    folder = Path(folder)
+    network_session(cell, folder.name, progress, seen=seen).save(folder)
+    write_atomically(truth_path(folder), _truth_text(cell))
+    return folder
+
+
+def network_session(
+    cell: Network,
+    name: str,
+    progress: Callable[[float], None] | None = None,
+    *,
+    seen: Seen = "images",
+) -> Session:
+    """The session of a cell of several robots; see `write_network`.
+
+    With `seen="names"`, `Network.corners` is what was detected in the images that are not there.
+    """
+    sights = [it for it in cell.sights if seen != "poses" or it.stop >= 0]
+    views = {it.view: _row(cell, it, seen) for it in sights}
+    for reading in cell.readings:
+        robot = cell.teller(frame_name("point", reading.point))
+        numbers = dict(
+            zip(("meas_x_m", "meas_y_m", "meas_z_m"), reading.at_m.tolist(), strict=True)
+        )
+        text = {"instrument": reading.instrument, "point": reading.point}
+        views[reading.view] = _view(cell, reading.view, reading.stop, robot, numbers, text)
+    for number, stop, robot in cell.told:
+        views[number] = _view(cell, number, stop, robot, {}, {})
+    rows = [views[number] for number in sorted(views)]
+    files = _rendered(cell, sights, progress) if seen == "images" else {}
+    targets = {it.name: it.target for it in cell.options.boards}
+    documents = {it: target_document(target) for it, target in targets.items()}
+    numbers_used = dict.fromkeys(key for row in rows for key in row.numbers)
+    texts_used = dict.fromkeys(key for row in rows for key in row.text)
+    images = ("image",) if any(row.image for row in rows) else ()
+    columns = ("view", "stop", *texts_used, *images, *numbers_used)
+    return Session.assemble(
+        _document(cell, name),
+        columns,
+        [[row.cell(column) for column in columns] for row in rows],
+        MemoryImages(files),
+        target_document=documents if len(documents) > 1 else next(iter(documents.values())),
+    )
+
+
+def _document(cell: Network, name: str) -> dict[str, Any]:
+    options = cell.options
+    document: dict[str, Any] = {
+        "schema": 1,
+        "name": name,
+        "robots": {it.name: {"model": it.robot, "tip": "flange"} for it in options.robots},
+        "cameras": {it.name: _camera_table(it) for it in options.cameras},
+        "targets": {
+            it.name: {"target": target_place(it.target, f"target_{it.name}.toml")}
+            for it in options.boards
+        },
+        "frames": {it: on for it, on in cell.parents.items() if not it.startswith("base")},
+    }
+    if options.instruments:
+        document["instruments"] = {it.name: {"sigma_m": it.sigma_m} for it in options.instruments}
+    return document
+
+
+def _camera_table(camera: CameraAt) -> dict[str, Any]:
+    optics = camera.camera
+    table: dict[str, Any] = {"resolution": list(optics.resolution), "model": optics.model}
+    if camera.state_intrinsics:
+        table |= {"matrix": optics.matrix.tolist(), "distortion": optics.distortion.tolist()}
+    return table
+
+
+def _row(cell: Network, sight: Sight, seen: Seen) -> View:
+    """The row of what a camera saw."""
+    text = {"camera": sight.camera, "target": sight.board}
+    if sight.stop < 0:
+        return View(sight.view, image=_image(sight), text=text | {"role": "intrinsics"})
+    frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
+    robots = [it for frame in frames if (it := cell.teller(frame)) is not None]
+    robot = robots[0] if len(set(robots)) == len(robots) > 0 else None
+    if seen != "poses":
+        return _view(cell, sight.view, sight.stop, robot, {}, text, _image(sight))
+    sigma_px = cell.options.pixel_sigma_px
+    draws = stream(cell.options, Stream.PAIRS, sight.view).standard_normal(6)
+    points = corners_m(sheet_named(cell.options, sight.board))[sight.exact.ids]
+    optics = camera_named(cell.options, sight.camera).camera
+    pose = noisy_pose(optics, sight.cam_from_target, points, sigma_px, draws)
+    measured = {f"cft_{key}": value for key, value in pose_row(pose).items()}
+    return _view(cell, sight.view, sight.stop, robot, measured, text)
+
+
+def _view(
+    cell: Network,
+    number: int,
+    stop: int,
+    robot: str | None,
+    numbers: Mapping[str, float],
+    text: Mapping[str, str],
+    image: str = "",
+) -> View:
+    """A row of a stop, with what it tells of a robot."""
+    told: dict[str, float] = {}
+    named: dict[str, str] = {}
+    if robot is not None:
+        told = pose_row(cell.base_from_flange[robot][stop])
+        joints = cell.joints[robot][stop].tolist()
+        told |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
+        named = {"robot": robot}
+    return View(number, image, stop=stop, numbers=told | dict(numbers), text=named | dict(text))
+
+
+def _image(sight: Sight) -> str:
+    folder = f"lens_{sight.camera}" if sight.stop < 0 else f"images/{sight.camera}"
+    return f"{folder}/{sight.view:04d}.png"
+
+
+def _rendered(
+    cell: Network, sights: list[Sight], progress: Callable[[float], None] | None
+) -> dict[str, bytes]:
+    """Takes the pictures, each of which shows one board."""
+    files: dict[str, bytes] = {}
+    for camera, board in dict.fromkeys((it.camera, it.board) for it in sights):
+        mine = [it for it in sights if (it.camera, it.board) == (camera, board)]
+        scene = _scene(cell, camera, board, np.array([it.cam_from_target for it in mine]))
+        for at, sight in enumerate(mine):
+            files[_image(sight)] = encode(render(scene, at), None)
+            if progress is not None:
+                progress(len(files) / len(sights))
+    return files
+
+
+def _scene(cell: Network, camera: str, board: str, poses: FloatArray) -> Scene:
+    """A cell of one camera and one board, as it is drawn."""
+    options = cell.options
+    sheet = sheet_named(options, board)
+    places = (
+        [it.name for it in options.cameras].index(camera),
+        options.boards.index(board_named(options, board)),
+    )
+    drawing = CellOptions(
+        views=len(poses),
+        target=sheet.target,
+        camera=camera_named(options, camera).camera,
+        seed=seed_of(options.seed, *places),
+    )
+    robot = next(iter(cell.arms))
+    exact = tuple(it.exact for it in cell.sights if (it.camera, it.board) == (camera, board))
+    none = np.tile(np.eye(4), (len(poses), 1, 1))
+    return prepare_scene(
+        Cell(
+            options=drawing,
+            arm=cell.arms[robot],
+            true_arm=cell.true_arms[robot],
+            sheet=sheet,
+            stated_camera=drawing.camera,
+            transforms={},
+            joints=np.zeros((len(poses), cell.arms[robot].a.size)),
+            base_from_flange=none,
+            true_base_from_flange=none,
+            cam_from_target=poses,
+            exact_corners=exact,
+            corners=exact,
+            wrong_views=(),
+            sheets=(sheet,),
+            shown=Shown(np.arange(len(poses)), np.zeros(len(poses), dtype=np.int64)),
+        )
+    )
+
+
+def seed_of(*numbers: int) -> int:
+    """One seed of several numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
+def _truth_text(cell: Network) -> str:
+    options = asdict(cell.options)
+    content = {
+        "schema": 1,
+        "parents": cell.parents,
+        "transforms": cell.transforms,
+        "wrong_views": cell.wrong_views,
+        "moved": [
+            {"frame": it.frame, "from_stop": first_pushed(cell.options, it)}
+            for it in cell.options.moved
+        ],
+        "options": options,
+        "arms": {name: asdict(arm) for name, arm in cell.true_arms.items()},
+        "base_from_flange": cell.true_base_from_flange,
+    }
+    return json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n"
