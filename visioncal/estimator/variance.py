@@ -52,15 +52,17 @@ class Knowledge:
 
 @dataclass(frozen=True)
 class RatioPrior:
-    """What is known beforehand of the first two sigmas' ratio, as a log-normal.
+    """What is known beforehand of the ratio of two sigmas, as a log-normal.
 
     Attributes:
         ratio: The second over the first, typically.
         spread: Standard deviation of the ratio's logarithm.
+        places: Which two sigmas these are; of several pairs, all of them.
     """
 
     ratio: float
     spread: float
+    places: tuple[tuple[int, int], ...] = ((0, 1),)
 
 
 def estimate_sigmas(
@@ -85,7 +87,7 @@ def estimate_sigmas(
         components: What the covariance is made of.
         known: What is known of the parameters from elsewhere.
         start: (k,) sigmas to start from.
-        prior: Of the first two sigmas' ratio: it decides where the residuals cannot, because one
+        prior: Of the ratio of pairs of sigmas: it decides where the residuals cannot, because one
             kind of them can be fitted away altogether. None where nothing is known of it.
         free: (k,) which sigmas to estimate; the others stay at their start. All where None.
 
@@ -193,11 +195,12 @@ def _likelihood(
     )
     if prior is None:
         return _Likelihood(value, slope, curvature)
-    offset = (logs[1] - logs[0] - np.log(prior.ratio)) / prior.spread
-    lean = np.zeros(len(logs))
-    lean[:2] = np.array([-1.0, 1.0]) / prior.spread
+    lean = np.zeros((len(prior.places), len(logs)))
+    for row, (first, second) in zip(lean, prior.places, strict=True):
+        row[first], row[second] = -1.0 / prior.spread, 1.0 / prior.spread
+    offset = lean @ logs - np.log(prior.ratio) / prior.spread
     return _Likelihood(
-        value + 0.5 * float(offset**2), slope + offset * lean, curvature + np.outer(lean, lean)
+        value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )
 
 

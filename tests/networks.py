@@ -1,0 +1,163 @@
+"""Whole cells in plain arrays, by a forward model of their own: what is seen is the truth's chain.
+
+Two robots on one floor, cameras that stand still or ride on a flange, boards on the floor and on
+the flanges. A stop is one posture of every robot; at each, every camera sees some of the boards.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.estimator.network import Common, Network, Sightings, State
+from visioncal.estimator.networktree import Branch, Tree
+
+# Of a camera's poses [rad and m]: across the view, and towards it.
+CAMERA_SIGMAS = np.array([3e-4, 3e-4, 1e-4, 3e-5, 3e-5, 1.2e-4])
+ROBOT_SIGMAS = {"a": (5e-5, 3e-5), "b": (1e-4, 8e-5)}
+
+
+def pose(rotvec_deg, place_m):
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix()
+    matrix[:3, 3] = place_m
+    return matrix
+
+
+def moved(matrix, twist):
+    """A transform after a small motion on its right: rotation first, which is as good as exp."""
+    step = np.eye(4)
+    step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
+    step[:3, 3] = twist[3:]
+    return matrix @ step
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A cell and what is seen of it.
+
+    Attributes:
+        truth: (4, 4) `parent_from_frame` of every frame but the flanges.
+        parents: What each frame hangs on.
+        flanges: (s, 4, 4) true `base_from_flange` by robot.
+        pairs: Which camera sees which board, at which stops.
+    """
+
+    truth: dict
+    parents: dict
+    flanges: dict
+    pairs: list
+    robot_sigmas: dict = field(default_factory=lambda: dict(ROBOT_SIGMAS))
+
+    def place(self, frame, stop, changed=None):
+        """(4, 4) `cell_from_frame` at a stop."""
+        matrix = np.eye(4)
+        while frame != "cell":
+            if frame.startswith("flange_"):
+                edge = self.flanges[frame[-1]][stop]
+            else:
+                edge = (changed or {}).get((frame, stop), self.truth[frame])
+            matrix = edge @ matrix
+            frame = self.parents[frame]
+        return matrix
+
+    def tree(self, known=("base_a",)):
+        branches = {}
+        for name, parent in self.parents.items():
+            robot = name[-1] if name.startswith("flange_") else ""
+            branches[name] = Branch(parent, robot, self.truth[name] if name in known else None)
+        return Tree("cell", branches)
+
+
+PARENTS = {
+    "base_a": "cell",
+    "base_b": "cell",
+    "flange_a": "base_a",
+    "flange_b": "base_b",
+    "cam_left": "cell",
+    "cam_right": "cell",
+    "target_floor": "cell",
+    "target_a": "flange_a",
+    "target_b": "flange_b",
+}
+
+
+def world(rng, stops=40, seen=0.7):
+    """Two robots that hold a board each, two cameras that stand, a board on the floor."""
+    truth = {
+        "base_a": np.eye(4),
+        "base_b": pose((2, -1, 170), (1.6, 0.1, 0.02)),
+        "cam_left": pose((180, 5, 20), (0.75, -0.25, 1.5)),
+        "cam_right": pose((170, 25, -10), (0.9, 0.3, 1.4)),
+        "target_floor": pose((3, -2, 15), (0.7, 0.0, 0.05)),
+        "target_a": pose((0, 3, 40), (0.01, 0.02, 0.05)),
+        "target_b": pose((5, -3, -60), (-0.02, 0.01, 0.06)),
+    }
+    flanges = {"a": [], "b": []}
+    for robot, base in (("a", truth["base_a"]), ("b", truth["base_b"])):
+        middle = np.array([0.6, -0.05, 0.4]) if robot == "a" else np.array([0.9, 0.1, 0.45])
+        for _ in range(stops):
+            place = pose(rng.uniform(-35, 35, 3), middle + rng.uniform(-0.2, 0.2, 3))
+            flanges[robot].append(np.linalg.inv(base) @ place)
+    flanges = {robot: np.array(it) for robot, it in flanges.items()}
+    pairs = [
+        (cam, target, stop)
+        for stop in range(stops)
+        for cam in ("cam_left", "cam_right")
+        for target in ("target_floor", "target_a", "target_b")
+        if rng.random() < seen
+    ]
+    return World(truth, PARENTS, flanges, pairs)
+
+
+def observed(world, rng, changed=None, noise=1.0):
+    """Sees the world, with noise of cameras and robots.
+
+    Args:
+        world: The world.
+        changed: Edges that differ from the truth at some stops, by frame and stop.
+        noise: Share of the usual noise.
+    """
+    reported, rows = {}, []
+    erring = {}
+    for robot, flanges in world.flanges.items():
+        sigma = np.repeat(world.robot_sigmas[robot], 3) * noise
+        twists = rng.normal(size=(len(flanges), 6)) * sigma
+        reported[robot] = np.array([moved(a, b) for a, b in zip(flanges, twists, strict=True)])
+        erring[robot] = flanges
+    for cam, target, stop in world.pairs:
+        true = np.linalg.inv(world.place(cam, stop, changed)) @ world.place(target, stop, changed)
+        rows.append(moved(true, rng.normal(size=6) * CAMERA_SIGMAS * noise))
+    count = len(rows)
+    sightings = Sightings(
+        tuple(it[0] for it in world.pairs),
+        tuple(it[1] for it in world.pairs),
+        np.array([it[2] for it in world.pairs]),
+        np.full(count, -1),
+        np.array(rows),
+        np.tile(np.diag(CAMERA_SIGMAS**2), (count, 1, 1)),
+        np.ones(count, dtype=bool),
+        np.zeros((count, 6, 0)),
+    )
+    return Network(world.tree(), reported, sightings, Common.none())
+
+
+def true_state(world, tree):
+    return State(np.array([world.truth[it] for it in tree.unknown]), np.zeros(0))
+
+
+def away(world, network, state):
+    """(6 e,) twists of the estimated edges from the true ones, on their right."""
+    found = []
+    for name, edge in zip(network.tree.unknown, state.edges, strict=True):
+        between = np.linalg.inv(world.truth[name]) @ edge
+        turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
+        found.append(np.concatenate([turn, between[:3, 3]]))
+    return np.concatenate(found)
+
+
+def swapped(network, robot, first, second):
+    """The network with a robot's poses of two stops exchanged."""
+    poses = network.poses[robot].copy()
+    poses[[first, second]] = poses[[second, first]]
+    return replace(network, poses={**network.poses, robot: poses})

@@ -1,0 +1,432 @@
+"""A whole cell at once: its frames, what was seen of them, and how that moves with the unknowns.
+
+An observation is that one frame (a camera's, an instrument's) saw where another was (a board's, a
+point's). Its residual is `log(predicted^-1 * measured)`, in the frame that was seen. Noise is that
+of the observation itself, whose covariance is known up to its sensor's level, and one small error
+of each robot's flange at each of its stops, which all that was seen by way of that flange shares
+(Strobl and Hirzinger 2006; Ulrich and Hillemann 2021, for one robot).
+
+The flanges' errors are taken out stop by stop (Schur complement; Triggs et al. 2000, section 6.1):
+what all observations of a stop together say of them is one 6-vector a robot, and what is left says
+something of the unknowns whatever the robots do.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from visioncal.estimator.linalg import gram
+from visioncal.estimator.networktree import Step, Tree
+from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
+from visioncal.types import FloatArray, IntArray, Mask
+
+# A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
+_UNTOLD = 1.0
+# Eigenvalues of the information on a flange below this share of the largest are none.
+_NULL = 1e-9
+# What a flange's error may be where nothing was seen of it [rad^2 and m^2]: nothing is known.
+_ANYTHING = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """What n observations saw.
+
+    Attributes:
+        seers: (n,) the frame that saw.
+        seen: (n,) the frame that was seen.
+        stops: (n,) the stop, numbered from 0.
+        sensors: (n,) whose noise level it is, numbered from 0; -1 where the covariance is known.
+        measured: (n, 4, 4) `seer_from_seen`.
+        covariance: (n, 6, 6) of its right perturbation, at a sensor's level of one.
+        turned: (n,) whether its rotation was measured; else its place alone.
+        by_shared: (n, 6, k) how it moves with what is shared.
+    """
+
+    seers: tuple[str, ...]
+    seen: tuple[str, ...]
+    stops: IntArray
+    sensors: IntArray
+    measured: FloatArray
+    covariance: FloatArray
+    turned: Mask
+    by_shared: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stops)
+
+    def subset(self, chosen: Mask) -> "Sightings":
+        """Returns those of an (n,) mask."""
+        rows = np.flatnonzero(chosen).tolist()
+        return Sightings(
+            tuple(self.seers[it] for it in rows),
+            tuple(self.seen[it] for it in rows),
+            self.stops[chosen],
+            self.sensors[chosen],
+            self.measured[chosen],
+            self.covariance[chosen],
+            self.turned[chosen],
+            self.by_shared[chosen],
+        )
+
+    def renamed(self, frame: str, twin: str, rows: Mask) -> "Sightings":
+        """Returns them with a frame that goes by another name in the rows of an (n,) mask."""
+
+        def names(old: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(
+                twin if name == frame and row else name
+                for name, row in zip(old, rows.tolist(), strict=True)
+            )
+
+        return replace(self, seers=names(self.seers), seen=names(self.seen))
+
+    def involves(self, frame: str) -> Mask:
+        """(n,) which of them a frame saw or was seen in."""
+        pairs = zip(self.seers, self.seen, strict=True)
+        return np.array([frame in pair for pair in pairs], dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """What is known of the k values that sightings share, without any robot: lenses and boards.
+
+    Attributes:
+        information: (k, k) on them.
+        pull: (k,) half the gradient of what is known, where the sightings were made.
+    """
+
+    information: FloatArray
+    pull: FloatArray
+
+    @classmethod
+    def none(cls) -> "Common":
+        """Nothing is shared."""
+        return cls(np.zeros((0, 0)), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of the unknowns: (e, 4, 4) `parent_from_frame` of each unknown frame, and (k,)."""
+
+    edges: FloatArray
+    shared: FloatArray
+
+    def moved(self, step: FloatArray) -> "State":
+        """Returns the unknowns after a (6 e + k,) step, on the right of the edges."""
+        size = 6 * len(self.edges)
+        by = exp(step[:size].reshape(-1, 6))
+        return State(self.edges @ by, self.shared + step[size:])
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations.
+
+    Attributes:
+        robots: (r, 2) of each robot's flange, of rotation [rad] and translation [m], per axis.
+        sensors: (s,) by which each sensor's covariances are to be taken larger, as sigmas.
+    """
+
+    robots: FloatArray
+    sensors: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """The observations of one pair of frames, and the way between them."""
+
+    rows: IntArray
+    way: tuple[Step, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Residuals (n, 6), their derivatives (n, 6, p), and by the flanges' errors (n, 6, 6 w).
+
+    The latter in the places of the robots that the observation's unit has; see `Network.units`.
+    """
+
+    residuals: FloatArray
+    jacobian: FloatArray
+    slack: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """The frames, the robots' poses and the observations.
+
+    Attributes:
+        tree: The frames.
+        poses: (s, 4, 4) `base_from_flange` by robot and stop; not a number where unknown.
+        sightings: What was seen.
+        common: What is known of the values that are shared.
+    """
+
+    tree: Tree
+    poses: Mapping[str, FloatArray]
+    sightings: Sightings
+    common: Common
+
+    def __len__(self) -> int:
+        return len(self.sightings)
+
+    def subset(self, chosen: Mask) -> "Network":
+        """Returns the network with the observations of an (n,) mask."""
+        return replace(self, sightings=self.sightings.subset(chosen))
+
+    @cached_property
+    def unknown(self) -> Mapping[str, int]:
+        """Places of the unknown frames among the edges."""
+        return {name: at for at, name in enumerate(self.tree.unknown)}
+
+    @property
+    def size(self) -> int:
+        """How many unknowns there are."""
+        return 6 * len(self.unknown) + len(self.common.pull)
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots, in the order of the noise's levels."""
+        return tuple(self.poses)
+
+    @cached_property
+    def groups(self) -> tuple[_Group, ...]:
+        """The observations by pairs of frames."""
+        rows: dict[tuple[str, str], list[int]] = {}
+        pairs = zip(self.sightings.seers, self.sightings.seen, strict=True)
+        for at, pair in enumerate(pairs):
+            rows.setdefault(pair, []).append(at)
+        return tuple(_Group(np.array(at), self.tree.way(*pair)) for pair, at in rows.items())
+
+    @cached_property
+    def units(self) -> tuple[IntArray, IntArray]:
+        """Observations whose robots' errors belong together.
+
+        Returns:
+            (n,) the unit of each observation, -1 where no robot has a part in it, and (u, w) the
+            robots of each unit by their places, -1 where it has fewer.
+        """
+        count, joined = len(self.robots), []
+        first = np.full(len(self), -1, dtype=np.int64)
+        for group in self.groups:
+            mine = [self.robots.index(it.robot) for it in group.way if it.robot]
+            keys = self.sightings.stops[group.rows] * count
+            if mine:
+                first[group.rows] = keys + mine[0]
+                joined += [np.stack([keys + mine[0], keys + it], axis=1) for it in mine]
+        if not joined:
+            return first, np.zeros((0, 0), dtype=np.int64)
+        used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
+        pairs = pairs.reshape(-1, 2)
+        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
+        units, of_key = connected_components(links, directed=False)
+        members = [np.unique(used[of_key == it] % count) for it in range(units)]
+        robots = np.full((units, max(map(len, members))), -1, dtype=np.int64)
+        for row, robot in zip(robots, members, strict=True):
+            row[: len(robot)] = robot
+        of = np.where(first < 0, -1, of_key[np.searchsorted(used, np.maximum(first, used[0]))])
+        return of, robots
+
+    def _edge(self, step: Step, state: State, stops: IntArray) -> FloatArray:
+        """(4, 4) or (m, 4, 4) `parent_from_frame` of a step."""
+        if step.robot:
+            return self.poses[step.robot][stops]
+        known = self.tree.branches[step.frame].known
+        return state.edges[self.unknown[step.frame]] if known is None else known
+
+    def _product(self, way: tuple[Step, ...], state: State, stops: IntArray) -> FloatArray:
+        product = np.broadcast_to(np.eye(4), (len(stops), 4, 4))
+        for step in way:
+            edge = self._edge(step, state, stops)
+            product = product @ (invert(edge) if step.is_up else edge)
+        return product
+
+    def predicted(self, state: State) -> FloatArray:
+        """The (n, 4, 4) `seer_from_seen` that the unknowns and the robots predict."""
+        found = np.zeros((len(self), 4, 4))
+        for group in self.groups:
+            found[group.rows] = self._product(group.way, state, self.sightings.stops[group.rows])
+        return found
+
+    def measured(self, state: State) -> FloatArray:
+        """The (n, 4, 4) measured poses as they are under the values that are shared."""
+        seen = self.sightings
+        if not len(state.shared):
+            return seen.measured
+        return seen.measured @ exp(seen.by_shared @ state.shared)
+
+    def linear(self, state: State, *, ideal: bool = False) -> Linear:
+        """Linearises all residuals.
+
+        Args:
+            state: Where.
+            ideal: As if all that was measured were what is predicted: noise then does not pass for
+                information about directions that are open.
+        """
+        seen, predicted = self.sightings, self.predicted(state)
+        error = np.broadcast_to(np.eye(4), predicted.shape)
+        if not ideal:
+            error = invert(predicted) @ self.measured(state)
+        residuals = np.where(seen.turned[:, None], log(error), _places(error))
+        by_measured = np.where(
+            seen.turned[:, None, None], inverse_right_jacobian(residuals), _place_slope(error)
+        )
+        by_predicted = -np.where(
+            seen.turned[:, None, None],
+            by_measured @ adjoint(invert(error)),
+            _place_slope(np.broadcast_to(np.eye(4), error.shape)),
+        )
+        edges, slack = self._slopes(state)
+        shared = by_measured @ seen.by_shared
+        return Linear(
+            residuals, np.concatenate([by_predicted @ edges, shared], axis=2), by_predicted @ slack
+        )
+
+    def _slopes(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """How what is predicted moves with the edges (n, 6, 6 e) and the flanges (n, 6, 6 w)."""
+        of, members = self.units
+        edges = np.zeros((len(self), 6, 6 * len(self.unknown)))
+        slack = np.zeros((len(self), 6, 6 * members.shape[1]))
+        for group in self.groups:
+            rest = np.broadcast_to(np.eye(4), (len(group.rows), 4, 4))
+            stops = self.sightings.stops[group.rows]
+            for step in reversed(group.way):
+                edge = self._edge(step, state, stops)
+                # An edge moves on its right: at its end, or at its start where it is gone up.
+                before = invert(edge) @ rest if step.is_up else edge @ rest
+                moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+                if step.frame in self.unknown:
+                    at = 6 * self.unknown[step.frame]
+                    edges[group.rows, :, at : at + 6] += moved
+                if step.robot:
+                    mine = members[of[group.rows]] == self.robots.index(step.robot)
+                    for slot in range(members.shape[1]):
+                        rows = group.rows[mine[:, slot]]
+                        slack[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
+                rest = before
+        return edges, slack
+
+    def change_of(self, frame: str, state: State) -> FloatArray:
+        """The change of a frame's edge that each observation asks for, were all else right.
+
+        Args:
+            frame: An unknown frame.
+            state: The unknowns.
+
+        Returns:
+            (n, 4, 4) on the right of the edge; not a number where it has no part in what was seen.
+        """
+        asked = np.full((len(self), 4, 4), np.nan)
+        error = invert(self.predicted(state)) @ self.measured(state)
+        for group in self.groups:
+            frames = [step.frame for step in group.way]
+            if frame not in frames:
+                continue
+            at, stops = frames.index(frame), self.sightings.stops[group.rows]
+            step, rest = group.way[at], self._product(group.way[at + 1 :], state, stops)
+            if step.is_up:
+                carry = invert(self._edge(step, state, stops)) @ rest
+                asked[group.rows] = carry @ invert(error[group.rows]) @ invert(carry)
+            else:
+                asked[group.rows] = rest @ error[group.rows] @ invert(rest)
+        return asked
+
+    def spread(self, noise: Noise) -> FloatArray:
+        """Covariances (n, 6, 6) of the observations' own noise."""
+        seen = self.sightings
+        # Behind the sensors' levels, that of covariances which are known.
+        level = np.append(noise.sensors, 1.0)[seen.sensors]
+        spread = level[:, None, None] ** 2 * seen.covariance
+        untold = np.flatnonzero(~seen.turned)
+        spread[untold, :3, :] = spread[untold, :, :3] = 0.0
+        spread[untold, :3, :3] = _UNTOLD * np.eye(3)
+        return spread
+
+    def flange_spread(self, noise: Noise) -> FloatArray:
+        """Variances (u, 6 w) of the flanges' errors of each unit."""
+        _, members = self.units
+        levels = np.repeat(noise.robots, 3, axis=1) ** 2
+        spread = np.where(members[:, :, None] >= 0, levels[members], _ANYTHING)
+        return spread.reshape(len(members), -1) if len(members) else np.zeros((0, 0))
+
+
+def _places(error: FloatArray) -> FloatArray:
+    """Residuals (n, 6) of places alone."""
+    return np.concatenate([np.zeros_like(error[:, :3, 3]), error[:, :3, 3]], axis=1)
+
+
+def _place_slope(error: FloatArray) -> FloatArray:
+    """How a place (n, 6, 6) moves with a motion of its frame."""
+    slope = np.zeros((len(error), 6, 6))
+    slope[:, 3:, 3:] = error[:, :3, :3]
+    return slope
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """The observations once the flanges' errors have been taken out, unit by unit.
+
+    Attributes:
+        information: (p, p) on the unknowns, whatever the robots do.
+        pull: (p,) half its gradient.
+        cost: Its squared error.
+        flanges: (u, 6 w) what each unit says of its flanges' errors.
+        slopes: (u, 6 w, p) how that moves with the unknowns.
+        spread: (u, 6 w, 6 w) its covariance, by the observations alone.
+    """
+
+    information: FloatArray
+    pull: FloatArray
+    cost: float
+    flanges: FloatArray
+    slopes: FloatArray
+    spread: FloatArray
+
+
+def reduce(network: Network, state: State, linear: Linear, weights: FloatArray) -> Reduced:
+    """Takes the flanges' errors out.
+
+    Args:
+        network: The network.
+        state: Where it was linearised.
+        linear: The residuals there.
+        weights: (n, 6, 6) inverse covariances of the observations' own noise.
+    """
+    of, members = network.units
+    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    weighted = weights @ every
+    total = gram(every, weighted)
+    width, size = linear.slack.shape[2], len(total) - 1
+    own, cross = np.zeros((len(members), width, width)), np.zeros((len(members), width, size + 1))
+    rows = of >= 0
+    slack = np.swapaxes(linear.slack[rows], 1, 2)
+    np.add.at(own, of[rows], slack @ weights[rows] @ linear.slack[rows])
+    np.add.at(cross, of[rows], slack @ weighted[rows])
+    inverse, blind = _pseudo_inverse(own)
+    answer = inverse @ cross
+    total = total - gram(cross, answer)
+    known, shared = network.common, state.shared
+    edges = 6 * len(state.edges)
+    total[edges:size, edges:size] += known.information
+    pull = known.information @ shared + known.pull
+    total[edges:size, -1] += pull
+    cost = float(total[-1, -1] + shared @ (known.pull + pull))
+    # A residual is what the flange's error made of it: the error itself has the other sign.
+    return Reduced(
+        total[:-1, :-1], total[:-1, -1], cost, answer[:, :, -1], answer[:, :, :-1], inverse + blind
+    )
+
+
+def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses (u, w, w) where there is information, and what is open where there is none."""
+    values, vectors = np.linalg.eigh(information)
+    most = values[:, -1:] if values.shape[1] else values
+    told = values > _NULL * np.maximum(most, np.finfo(float).tiny)
+    inverse = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
+    turned = np.swapaxes(vectors, 1, 2)
+    blind = np.where(told, 0.0, _ANYTHING)
+    return (vectors * inverse[:, None, :]) @ turned, (vectors * blind[:, None, :]) @ turned

@@ -1,0 +1,167 @@
+"""Which observations of a whole cell belong together, and what moved between them.
+
+What is wrong as a whole (an image of another stop, a pose of another row) is left out, by how far
+it is from what all others predict. A frame that moved while the session was taken is no noise: from
+some stop on, all that saw it asks for one other place. It is then two frames, and nothing is lost.
+
+It begins with the earliest stops, where what moves later on has not moved yet.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.chance import chi2_limit, f_limit
+from visioncal.estimator.network import Network, State
+from visioncal.estimator.networkfit import (
+    NetworkFit,
+    fit_network,
+    starting_noise,
+    surprises,
+)
+from visioncal.estimator.networkmoves import Move, gross_move, moved_network, slight_move
+from visioncal.types import FloatArray, Mask
+
+# A sound observation is lost in one session of a thousand.
+_FALSE_ALARM = 1e-3
+# The earliest share of the stops, at the least, that the search begins with.
+_EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
+_ROUNDS, _MOST_MOVES = 10, 8
+# Distances are compared with the limit once more, without the observation's own say in the noise,
+# when they come this near.
+_SUSPECT_SHARE = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Agreed:
+    """The observations that agree, and their fit.
+
+    Attributes:
+        network: All n observations; what moved is two frames in its tree.
+        fit: The unknowns and the noise, by those that agree.
+        used: (n,) mask of these.
+        surprise: (n,) squared distance of each from what the others predict.
+        limit: (n,) what it may be.
+        moves: What moved, in the order in which it was found.
+    """
+
+    network: Network
+    fit: NetworkFit
+    used: Mask
+    surprise: FloatArray
+    limit: FloatArray
+    moves: tuple[Move, ...]
+
+
+def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
+    """Finds what belongs together, what does not, and what moved.
+
+    Args:
+        network: All observations.
+        state: A start.
+        movable: Unknown frames that may have moved.
+    """
+    used, fit = _early(network, state)
+    moves: list[Move] = []
+    while len(moves) < _MOST_MOVES:
+        beyond = _beyond(network, used, fit)
+        move = gross_move(network, fit, beyond < 1.0, movable)
+        if move is None:
+            break
+        network, fit = _with(network, fit, move)
+        movable = (*movable, move.twin)
+        moves.append(move)
+        used |= network.sightings.involves(move.twin)
+        used &= _beyond(network, used, fit) < 1.0
+        used, fit = _widened(network, used, fit)
+    used, fit = _settled(network, *_widened(network, used, fit))
+    while len(moves) < _MOST_MOVES:
+        slight = slight_move(network.subset(used), fit, movable)
+        if slight is None:
+            break
+        network, fit = _with(network, fit, slight)
+        movable = (*movable, slight.twin)
+        moves.append(slight)
+        used, fit = _settled(network, *_widened(network, used, fit))
+    squares, directions = surprises(network, used, fit)
+    return Agreed(network, fit, used, squares, _limit(network, used, directions), tuple(moves))
+
+
+def _with(network: Network, fit: NetworkFit, move: Move) -> tuple[Network, NetworkFit]:
+    """The network and the state with what moved as two frames."""
+    moved = moved_network(network, move)
+    at = network.unknown[move.frame]
+    there = dict(zip(network.unknown, fit.state.edges, strict=True))
+    there[move.twin] = fit.state.edges[at] @ move.change
+    edges = np.array([there[name] for name in moved.unknown])
+    return moved, replace(fit, state=State(edges, fit.state.shared))
+
+
+def _limit(network: Network, used: Mask, directions: FloatArray) -> FloatArray:
+    """Largest surprise (n,) that noise may give, corrected for how many observations there are.
+
+    Robots' levels are estimated from half of the residuals each, which gives the surprise the tails
+    of an F distribution.
+    """
+    told = np.where(network.sightings.turned[used], 6, 3).sum()
+    freedom = max(0.5 * (float(told) - network.size), 6.0)
+    counted = np.maximum(directions, 1.0)
+    return np.asarray(counted * f_limit(_FALSE_ALARM / len(network), counted, freedom))
+
+
+def _beyond(network: Network, used: Mask, fit: NetworkFit) -> FloatArray:
+    """Surprises (n,) as shares of what they may be, the noise scaled by the used ones' median."""
+    squares, directions = surprises(network, used, fit)
+    typical = chi2_limit(0.5, np.maximum(directions, 1.0))
+    scale = max(float(np.median((squares / typical)[used])), 1.0) if used.any() else 1.0
+    return np.asarray(squares / (scale * _limit(network, used, directions)))
+
+
+def _early(network: Network, state: State) -> tuple[Mask, NetworkFit]:
+    """Fits the earliest stops, without what is far from the start."""
+    stops = network.sightings.stops
+    last = max(_EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:_FEWEST_EARLY][-1]))
+    early = stops <= last
+    fit = NetworkFit(state, starting_noise(network))
+    return _widened(network, early & (_beyond(network, early, fit) < 1.0), fit, early)
+
+
+def _widened(
+    network: Network, used: Mask, fit: NetworkFit, among: Mask | None = None
+) -> tuple[Mask, NetworkFit]:
+    """Fits, and takes all within reach of the noise, in turn."""
+    noise = None
+    for _ in range(_ROUNDS):
+        fit = fit_network(network.subset(used), fit.state, noise)
+        noise = fit.noise
+        before, used = used, _beyond(network, used, fit) < 1.0
+        if among is not None:
+            used &= among
+        if np.array_equal(before, used):
+            break
+    return used, fit
+
+
+def _settled(network: Network, used: Mask, fit: NetworkFit) -> tuple[Mask, NetworkFit]:
+    """Takes observations in and out one at a time, until none moves."""
+    for _ in range(len(network)):
+        squares, directions = surprises(network, used, fit)
+        beyond = squares / _limit(network, used, directions)
+        outside = np.flatnonzero(~used & (beyond < 1.0))
+        if len(outside):
+            used = used.copy()
+            used[outside[beyond[outside].argmin()]] = True
+            fit = fit_network(network.subset(used), fit.state, fit.noise)
+            continue
+        worst = int(np.where(used, beyond, -1.0).argmax())
+        if beyond[worst] < _SUSPECT_SHARE:
+            break
+        fewer = used.copy()
+        fewer[worst] = False
+        again = fit_network(network.subset(fewer), fit.state, fit.noise)
+        squares, directions = surprises(network, fewer, again)
+        if squares[worst] < _limit(network, fewer, directions)[worst]:
+            break
+        used, fit = fewer, again
+    return used, fit

@@ -1,0 +1,186 @@
+"""What moved while a whole cell was looked at: a board that slipped, a camera that was bumped.
+
+From some stop on, all that has to do with the frame asks for the same other place of it. A large
+move is found by how many observations it explains that nothing else does; a slight one, which hides
+in the noise of each, by Rao's score test of a step at every stop (as Page 1955 asks for a change).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.chance import chi2_limit, f_limit
+from visioncal.estimator.linalg import covariance, spectrum
+from visioncal.estimator.network import Network
+from visioncal.estimator.networkfit import NetworkFit, equations_by_stop, normal_equations
+from visioncal.transforms import exp, invert, log
+from visioncal.types import FloatArray, IntArray, Mask
+
+# A move must explain so many observations, of so many stops, more than they are explained now.
+_FEWEST = 3
+# So many observations are asked in turn which other place they speak for.
+_ASKED = 24
+_FALSE_ALARM, _FALSE_MOVE = 1e-3, 1e-4
+# The noise that a share of the stops shows is not all that there is.
+_MARGIN = 2.0
+# Another frame that explains so many as well may be the one that moved.
+_RIVAL_SHARE = 0.9
+# A step that the other unknowns take up to this share of its information is no step of its own.
+_TAKEN = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A frame that stands elsewhere from some stop on.
+
+    Attributes:
+        frame: The frame, as the network knows it until then.
+        twin: Its name from then on.
+        stop: The first stop at which it stands elsewhere.
+        before: The last stop at which it was seen before; -1 where it was not.
+        change: (4, 4) where it then is, in its own frame before: as first estimated.
+        rivals: Frames of which the same may be said as well.
+    """
+
+    frame: str
+    twin: str
+    stop: int
+    before: int
+    change: FloatArray
+    rivals: tuple[str, ...] = ()
+
+
+def moved_network(network: Network, move: Move) -> Network:
+    """The network in which what moved is two frames."""
+    rows = network.sightings.stops >= move.stop
+    return replace(
+        network,
+        tree=network.tree.with_twin(move.frame, move.twin),
+        sightings=network.sightings.renamed(move.frame, move.twin, rows),
+    )
+
+
+def twin_name(network: Network, frame: str) -> str:
+    """A name for a frame from when on it moved."""
+    first, _, number = frame.partition("@")
+    count = int(number or 1) + 1
+    while f"{first}@{count}" in network.tree.branches:
+        count += 1
+    return f"{first}@{count}"
+
+
+def gross_move(
+    network: Network, fit: NetworkFit, agrees: Mask, movable: Sequence[str]
+) -> Move | None:
+    """The move that explains most of what is not explained yet; None where none explains enough.
+
+    Args:
+        network: All n observations.
+        fit: The unknowns and the noise, by those that agree.
+        agrees: (n,) what is explained.
+        movable: Frames that may have moved.
+    """
+    found = []
+    for frame in movable:
+        rows = np.flatnonzero(network.sightings.involves(frame))
+        unexplained = rows[~agrees[rows]]
+        if len(unexplained) < _FEWEST:
+            continue
+        found.append((*_best_step(network, fit, agrees, frame, rows), frame))
+    found = [it for it in found if it[0] >= _FEWEST]
+    if not found:
+        return None
+    gain, stop, change, frame = max(found, key=lambda it: it[0])
+    rivals = [name for other, _, _, name in found if other >= _RIVAL_SHARE * gain and name != frame]
+    return _move(network, frame, stop, change, tuple(rivals))
+
+
+def _move(
+    network: Network, frame: str, stop: int, change: FloatArray, rivals: tuple[str, ...] = ()
+) -> Move:
+    mine = network.sightings.stops[network.sightings.involves(frame)]
+    before = int(mine[mine < stop].max(initial=-1))
+    return Move(frame, twin_name(network, frame), stop, before, change, rivals)
+
+
+def _best_step(
+    network: Network, fit: NetworkFit, agrees: Mask, frame: str, rows: IntArray
+) -> tuple[int, int, FloatArray]:
+    """How many more observations a step of a frame explains, from which stop on, and the step."""
+    part = network.subset(np.isin(np.arange(len(network)), rows))
+    order = np.argsort(part.sightings.stops, kind="stable")
+    asked, spread = part.change_of(frame, fit.state), _asked_spread(part, fit, frame)
+    stops, explained = part.sightings.stops[order], agrees[rows][order]
+    open_rows = np.flatnonzero(~explained)
+    some = open_rows[np.linspace(0, len(open_rows) - 1, min(_ASKED, len(open_rows))).astype(int)]
+    apart = log(invert(asked[order][some])[:, None] @ asked[order][None])
+    both = spread[order][some][:, None] + spread[order][None]
+    squares = np.einsum("abi,abi->ab", apart, np.linalg.solve(both, apart[..., None])[..., 0])
+    alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(network), 6)
+    gains = np.cumsum((alike.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
+    first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)
+    at, place = np.unravel_index(gains[:, first].argmax(), (len(some), len(first)))
+    begin = first[place]
+    after = alike[at] & (stops >= stops[begin])
+    enough = (
+        len(np.unique(stops[after])) >= _FEWEST
+        and len(np.unique(stops[explained & (stops < stops[begin])])) >= _FEWEST
+        and 2 * after.sum() > len(stops) - begin
+    )
+    if not enough:
+        return 0, 0, np.eye(4)
+    # The mean of all that ask for this step, each with its own information.
+    weights = np.linalg.inv(spread[order][after])
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, apart[at, after]))
+    return int(gains[at, begin]), int(stops[begin]), asked[order][some[at]] @ exp(mean)
+
+
+def _asked_spread(network: Network, fit: NetworkFit, frame: str) -> FloatArray:
+    """Covariances (n, 6, 6) of the changes that observations ask for."""
+    linear = network.linear(fit.state, ideal=True)
+    spread = network.spread(fit.noise)
+    rows = network.units[0] >= 0
+    if rows.any():
+        slack = linear.slack[rows]
+        between = network.flange_spread(fit.noise)[network.units[0][rows]]
+        spread[rows] += (slack * between[:, None, :]) @ np.swapaxes(slack, 1, 2)
+    at = 6 * network.unknown[frame]
+    back = np.linalg.inv(linear.jacobian[:, :, at : at + 6])
+    return np.asarray(back @ spread @ np.swapaxes(back, 1, 2))
+
+
+def slight_move(network: Network, fit: NetworkFit, movable: Sequence[str]) -> Move | None:
+    """The most significant step of a frame at any stop; None where noise explains all of them.
+
+    Args:
+        network: The observations that agree.
+        fit: The unknowns and the noise.
+        movable: Frames that may have moved.
+    """
+    information, pull = equations_by_stop(network, fit)
+    known = covariance(normal_equations(network, fit.state, fit.noise)[0])
+    # Sums over each stop and all after it.
+    information, pull = (np.cumsum(it[::-1], axis=0)[::-1] for it in (information, pull))
+    best, limit = None, _move_limit(network, len(movable) * len(pull))
+    for frame in movable:
+        at = slice(6 * network.unknown[frame], 6 * network.unknown[frame] + 6)
+        stops = np.unique(network.sightings.stops[network.sightings.involves(frame)])
+        for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
+            across = information[stop][at]
+            own = across[:, at] - across @ known @ across.T
+            if spectrum(across[:, at]).ratio < _TAKEN or spectrum(own).values[0] < _TAKEN:
+                continue
+            step = -covariance(own) @ pull[stop][at]
+            surprise = float(-step @ pull[stop][at])
+            if surprise > limit:
+                best, limit = (frame, stop, step), surprise
+    if best is None:
+        return None
+    frame, stop, step = best
+    return _move(network, frame, stop, exp(step))
+
+
+def _move_limit(network: Network, tried: int) -> float:
+    freedom = max(0.5 * (6.0 * len(network) - network.size), 6.0)
+    return 6.0 * float(f_limit(_FALSE_MOVE / tried, 6, freedom))

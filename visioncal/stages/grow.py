@@ -1,0 +1,286 @@
+"""Grows the tree of a whole cell's frames from what pairs of them say of each other.
+
+Each body of frames (what stands in the cell, what a flange carries) is grown by the best transforms
+first (Prim 1957). What these do not reach is placed by views of which all else is known. A board
+that looks the same turned does not say which way round it was seen: what is placed by way of such
+a board is tried every way round, and all views together tell which it was.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from visioncal.estimator.arm import LEVER_M
+from visioncal.estimator.networktree import Step, Tree
+from visioncal.stages.choose import CLEAR_RATIO, Candidates
+from visioncal.transforms import invert, mean_transform, rotation_angle
+from visioncal.types import FloatArray, IntArray
+
+# The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
+_EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
+# A view that is farther off than this says nothing more about which start is right [m].
+_FAR_M = 0.1
+# So many starts are tried, by turns of boards, and not more.
+_MOST_TRIED = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Sighted:
+    """What n observations may have seen.
+
+    Attributes:
+        seers: (n,) the frame that saw.
+        seen: (n,) the frame that was seen.
+        stops: (n,) the stop, numbered from 0 in the order of time.
+        candidates: Padded (n, c, 4, 4) poses `seer_from_seen`, and their validity.
+        turns: (n, c) which turn of the target's own each candidate has applied.
+        turned: By the frame of a target that looks the same turned: (t, 4, 4) its turns.
+    """
+
+    seers: tuple[str, ...]
+    seen: tuple[str, ...]
+    stops: IntArray
+    candidates: Candidates
+    turns: IntArray
+    turned: Mapping[str, FloatArray]
+
+    def turns_of(self, frame: str) -> FloatArray:
+        """The turns (t, 4, 4) after which a frame looks the same; the identity comes first."""
+        return self.turned.get(frame, np.eye(4)[None])
+
+    def early(self, rows: IntArray) -> IntArray:
+        """The earliest of a pair's rows, which are in the order of time."""
+        last = _EARLY_SHARE * float(self.stops.max())
+        count = int(np.searchsorted(self.stops[rows], last, side="right"))
+        return rows[: max(count, _FEWEST_EARLY)]
+
+
+@dataclass(frozen=True, eq=False)
+class Relation:
+    """A transform between two frames of one body.
+
+    Attributes:
+        first: The one.
+        second: The other.
+        matrix: (4, 4) `first_from_second`.
+        sigma_m: What it is known to, rotations on a lever [m].
+        turns: (t, 4, 4) those by which the second may have been seen turned.
+    """
+
+    first: str
+    second: str
+    matrix: FloatArray
+    sigma_m: float
+    turns: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """The observations of one pair of frames.
+
+    Attributes:
+        seer: The frame that saw.
+        seen: The frame that was seen.
+        rows: The observations, in the order of time.
+        way: The way from the one to the other.
+    """
+
+    seer: str
+    seen: str
+    rows: IntArray
+    way: tuple[Step, ...]
+
+    @property
+    def robots(self) -> tuple[Step, ...]:
+        """The robots in the way."""
+        return tuple(it for it in self.way if it.robot)
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """All that the tree may grow by.
+
+    Attributes:
+        tree: The frames.
+        poses: (s, 4, 4) `base_from_flange` by robot and stop.
+        sighted: What was seen.
+        pairs: The same by pairs of frames.
+        relations: What pairs say by themselves.
+    """
+
+    tree: Tree
+    poses: Mapping[str, FloatArray]
+    sighted: Sighted
+    pairs: Sequence[Pair]
+    relations: Sequence[Relation]
+
+
+@dataclass(frozen=True, eq=False)
+class _Grown:
+    """Frames (4, 4) in their bodies, and those that stand there by a turned board, one or more."""
+
+    placed: dict[str, FloatArray]
+    by_turn: tuple[str, ...]
+    counts: tuple[int, ...]
+
+
+def grow(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Places all frames in their bodies.
+
+    Returns:
+        (4, 4) `body_from_frame` by name, and the frames that might as well be elsewhere, because
+        nothing tells which way round a board was seen.
+    """
+    first = _grown(growth, ())
+    if not first.by_turn:
+        return first.placed, ()
+    found = []
+    for chosen in _choices(first.counts):
+        grown = _grown(growth, chosen)
+        found.append((_score(growth, grown.placed), chosen, grown))
+    found.sort(key=lambda it: it[0])
+    score, chosen, best = found[0]
+    rivals = [it for value, it, _ in found[1:] if value < CLEAR_RATIO * score]
+    ambiguous = {
+        name
+        for rival in rivals
+        for name, mine, other in zip(best.by_turn, chosen, rival, strict=False)
+        if mine != other
+    }
+    return best.placed, tuple(it for it in best.placed if it in ambiguous)
+
+
+def _choices(counts: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    tried = list(counts)
+    while np.prod(tried, dtype=float) > _MOST_TRIED:
+        tried[tried.index(max(tried))] = 1
+    yield from product(*(range(it) for it in tried))
+
+
+def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
+    tree = growth.tree
+    placed = {tree.root: np.eye(4)}
+    placed |= {name: np.eye(4) for name, branch in tree.branches.items() if branch.robot}
+    by_turn: list[str] = []
+    counts: list[int] = []
+    while options := [*_related(growth, placed)] or [*_implied(growth, placed)]:
+        # What a turned board places comes last: others may come by a way that is certain.
+        name, matrices, _ = min(options, key=lambda it: (len(it[1]), it[2]))
+        at = 0
+        if len(matrices) > 1:
+            at = chosen[len(by_turn)] if len(by_turn) < len(chosen) else 0
+            by_turn.append(name)
+            counts.append(len(matrices))
+        placed[name] = matrices[at]
+    return _Grown(placed, tuple(by_turn), tuple(counts))
+
+
+def _related(
+    growth: Growth, placed: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, FloatArray, float]]:
+    """Frames that a relation places: each with (t, 4, 4) where it may be, and how well [m]."""
+    for it in growth.relations:
+        if it.first in placed and it.second not in placed:
+            yield it.second, (placed[it.first] @ it.matrix)[None], it.sigma_m
+        elif it.second in placed and it.first not in placed:
+            yield it.first, placed[it.second] @ invert(it.matrix @ it.turns), it.sigma_m
+
+
+def _implied(
+    growth: Growth, placed: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, FloatArray, float]]:
+    """Frames that are all that is not placed of what some views have to do with."""
+    for pair in growth.pairs:
+        rows = growth.sighted.early(pair.rows)
+        factors = _factors(growth, pair, rows)
+        missing = [it for it in factors if it.frame and it.frame not in placed]
+        if len(missing) != 1:
+            continue
+        (it,) = missing
+        at = factors.index(it)
+        before, after = (_product(part, placed) for part in (factors[:at], factors[at + 1 :]))
+        candidates, turns = some(growth.sighted.candidates, rows), growth.sighted.turns[rows]
+        poses = invert(before)[:, None] @ candidates.poses @ invert(after)[:, None]
+        there = Candidates(invert(poses) if it.is_inverse else poses, candidates.valid)
+        # A board's own frame may be either way round: that of its first view is taken.
+        ways = range(1 if it.frame == pair.seen else len(growth.sighted.turns_of(pair.seen)))
+        found = [consensus(there, turns, way) for way in ways]
+        yield it.frame, np.array([matrix for matrix, _ in found]), found[0][1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Factor:
+    """A part of a chain: where a frame is in its body, or a robot's poses (m, 4, 4)."""
+
+    frame: str
+    robot: FloatArray
+    is_inverse: bool
+
+
+def _factors(growth: Growth, pair: Pair, rows: IntArray) -> list[_Factor]:
+    """The chain `seer_from_seen` by bodies."""
+    stops = growth.sighted.stops[rows]
+    none = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
+    chain = [_Factor(pair.seer, none, True)]
+    for step in pair.robots:
+        robot = growth.poses[step.robot][stops]
+        base = _Factor(growth.tree.branches[step.frame].parent, none, step.is_up)
+        flange = _Factor("", robot, step.is_up)
+        chain += [flange, base] if step.is_up else [base, flange]
+    return [*chain, _Factor(pair.seen, none, False)]
+
+
+def _product(factors: Sequence[_Factor], placed: Mapping[str, FloatArray]) -> FloatArray:
+    product = np.eye(4)[None]
+    for it in factors:
+        matrix = it.robot @ placed[it.frame] if it.frame else it.robot
+        product = product @ (invert(matrix) if it.is_inverse else matrix)
+    return product
+
+
+def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
+    """Mean distance [m] of the early views from what the placed frames predict."""
+    away = []
+    for pair in growth.pairs:
+        rows = growth.sighted.early(pair.rows)
+        factors = _factors(growth, pair, rows)
+        if all(it.frame in placed for it in factors if it.frame):
+            predicted = _product(factors, placed)
+            distances = distances_from(predicted, some(growth.sighted.candidates, rows))
+            away.append(np.minimum(distances.min(axis=1), _FAR_M))
+    return float(np.concatenate(away).mean()) if away else 0.0
+
+
+def some(candidates: Candidates, rows: IntArray) -> Candidates:
+    """The candidates of some observations."""
+    return Candidates(candidates.poses[rows], candidates.valid[rows])
+
+
+def distances_from(predicted: FloatArray, candidates: Candidates) -> FloatArray:
+    """Distances (n, c) [m] of candidates from (n, 4, 4) predictions, rotations on a lever."""
+    between = invert(predicted)[:, None] @ candidates.poses
+    away = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
+    return np.asarray(np.where(candidates.valid, away, np.inf))
+
+
+def consensus(candidates: Candidates, turns: IntArray, turn: int = 0) -> tuple[FloatArray, float]:
+    """The transform that most of m views agree on, and what it is known to [m].
+
+    Args:
+        candidates: What each view allows.
+        turns: (m, c) which turn of the target each candidate has applied.
+        turn: By which turn the target is taken to be other than the view has it that agrees best.
+    """
+    half, least, best = len(turns) // 2 + 1, np.inf, (0, 0)
+    for view, pose in np.argwhere(candidates.valid & (turns == 0)).tolist():
+        away = distances_from(candidates.poses[view, pose][None], candidates)
+        trimmed = float(np.sort(away.min(axis=1))[:half].sum())
+        if trimmed < least:
+            least, best = trimmed, (view, pose)
+    # Candidates come in blocks of all turns.
+    away = distances_from(candidates.poses[best[0], best[1] + turn][None], candidates)
+    nearest = np.argsort(away.min(axis=1))[:half]
+    picked = candidates.poses[nearest, away[nearest].argmin(axis=1)]
+    return mean_transform(picked), least / half / np.sqrt(half)
