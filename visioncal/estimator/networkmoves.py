@@ -119,7 +119,8 @@ def _best_step(
     squares = np.einsum("abi,abi->ab", apart, np.linalg.solve(both, apart[..., None])[..., 0])
     alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(network), 6)
     gains = np.cumsum((alike.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
-    first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)
+    # Of stops that explain as much the last: between them nothing speaks for either.
+    first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)[::-1]
     at, place = np.unravel_index(gains[:, first].argmax(), (len(some), len(first)))
     begin = first[place]
     after = alike[at] & (stops >= stops[begin])

@@ -59,7 +59,7 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
         DegenerateError: The motion leaves most views ambiguous.
     """
     if all(len(view.cam_from_target) == 1 for view in views) or len(views) < 3:
-        return Choice(tuple(_chosen(view, 0, target) for view in views), ())
+        return Choice(tuple(chosen(view, 0, target) for view in views), ())
     candidates = padded(views)
     turns = len(set(views[0].turns))
     picks = _as_the_first(_assign(robot, candidates, views), turns)
@@ -81,7 +81,7 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
         )
     return Choice(
         tuple(
-            _chosen(view, int(pick), target)
+            chosen(view, int(pick), target)
             for view, pick, it in zip(views, picks, unclear, strict=True)
             if not it
         ),
@@ -103,7 +103,7 @@ def choose_by(view: ViewPoses, robot: FloatArray, edges: Edges, target: Target |
         target: What was seen, for its symmetries.
     """
     pick = distances_to(robot[None], padded([view]), edges.x, edges.z)[0].argmin()
-    return _chosen(view, int(pick), target)
+    return chosen(view, int(pick), target)
 
 
 def padded(views: Sequence[ViewPoses]) -> Candidates:
@@ -191,7 +191,7 @@ def distances_to(
     return np.asarray(np.where(candidates.valid, away, np.inf))
 
 
-def _chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
+def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
     """Leaves one pose to a view, and numbers its corners accordingly."""
     corners, turn = view.corners, view.turns[pick]
     if corners is not None and target is not None and turn:

@@ -1,0 +1,185 @@
+"""What a session tells of a whole cell: its frames, where its robots stood, who saw what."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from visioncal.errors import DataError
+from visioncal.estimator.networktree import Branch, Tree
+from visioncal.robot import Robot
+from visioncal.session import Observation, Session, View, frame_name
+from visioncal.types import FloatArray
+
+_CELL = "cell"
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """An observation that can be used, before it is known what was found in it."""
+
+    view: int
+    stop: int | None
+    station: int
+    seer: str
+    seen: str
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A session as a whole cell.
+
+    Attributes:
+        session: The session.
+        tree: Its frames; the base of one robot, or one other frame, stands for the cell.
+        reference: That frame.
+        poses: (s, 4, 4) `base_from_flange` by robot and station; not a number where unknown.
+        rows: The observations that can be used.
+        reasons: Why others cannot, by view.
+        stops: What the session calls each station: its stop's number, or its first view's.
+    """
+
+    session: Session
+    tree: Tree
+    reference: str
+    poses: Mapping[str, FloatArray]
+    rows: tuple[Row, ...]
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    stops: tuple[int, ...] = ()
+
+    def without(self, reasons: Mapping[int, str]) -> "Cell":
+        """Returns the cell without some views."""
+        rows = tuple(it for it in self.rows if it.view not in reasons)
+        return replace(self, rows=rows, reasons={**self.reasons, **reasons})
+
+    def tied(self) -> tuple[str, ...]:
+        """The frames that observations tie to the reference, in the tree's order."""
+        names = [_CELL, *self.tree.branches]
+        place = {name: at for at, name in enumerate(names)}
+        pairs = [
+            (place[name], place[branch.parent])
+            for name, branch in self.tree.branches.items()
+            if branch.known is not None
+        ]
+        for seer, seen in {(it.seer, it.seen) for it in self.rows}:
+            ends = [seer, seen]
+            for step in self.tree.way(seer, seen):
+                if step.robot:
+                    ends += [step.frame, self.tree.branches[step.frame].parent]
+            pairs += [(place[seer], place[it]) for it in ends]
+        links = coo_array(
+            (np.ones(len(pairs)), np.array(pairs, dtype=np.int64).reshape(-1, 2).T),
+            shape=(len(names), len(names)),
+        )
+        part = connected_components(links, directed=False)[1]
+        return tuple(it for it in self.tree.branches if part[place[it]] == part[0])
+
+    def held_to(self, reference: str) -> "Cell":
+        """Returns the cell in which one frame stands for it."""
+        tree = self.tree.with_known(reference, np.eye(4))
+        return replace(self, tree=tree, reference=reference)
+
+
+def read_cell(session: Session) -> Cell:
+    """Reads a session as a whole cell.
+
+    Raises:
+        DataError: It observes nothing, or what it says of its frames is not clear.
+    """
+    frames = session.frames
+    branches = {
+        name: Branch(parent, robot=_robot_of(session, name)) for name, parent in frames.items()
+    }
+    seen = [it for it in session.observations if not it.view.is_of_lens]
+    if not seen:
+        raise DataError(
+            f"session {session.name!r}: no row tells what a camera or an instrument saw.",
+            next_step="Give rows images and cameras, or poses in cft_ columns.",
+        )
+    poses, unread = _poses(session, seen)
+    reasons, rows = dict(unread), []
+    for it in seen:
+        reason = _unusable(session, it)
+        if reason:
+            reasons[it.view.number] = reason
+        elif it.view.number not in reasons:
+            rows.append(Row(it.view.number, it.view.stop, it.station, it.seer, it.seen))
+    stations: dict[int, int] = {}
+    for it in seen:
+        number = it.view.number if it.view.stop is None else it.view.stop
+        stations.setdefault(it.station, number)
+    tree = Tree(_CELL, branches)
+    cell = Cell(session, tree, "", poses, tuple(rows), reasons)
+    cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
+    return cell.held_to(_reference(cell))
+
+
+def _robot_of(session: Session, frame: str) -> str:
+    """The name that a flange's robot goes by, by its frame: two may not share an empty one."""
+    for name in session.robots:
+        if frame == frame_name("flange", name):
+            return robot_key(name)
+    return ""
+
+
+def robot_key(name: str) -> str:
+    """What a robot is called where every robot must have a name."""
+    return name or "robot"
+
+
+def _unusable(session: Session, it: Observation) -> str:
+    if it.view.text.get("role", "").strip() == "holdout":
+        return "held back: role is holdout"
+    if it.lacks:
+        robots = ", ".join(filter(None, it.lacks)) or "the robot"
+        return f"no row of its stop tells where {robots} stood"
+    return ""
+
+
+def _poses(
+    session: Session, seen: Sequence[Observation]
+) -> tuple[dict[str, FloatArray], dict[int, str]]:
+    """Where every robot stood at every station, and the rows whose robot's pose is not known."""
+    count = 1 + max(it.station for it in seen)
+    poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in session.robots}
+    models = {
+        name: Robot.from_document(document) for name, document in session.robot_documents.items()
+    }
+    unread: dict[int, str] = {}
+    for it in seen:
+        for name, view in it.robots.items():
+            pose = _pose(view, models.get(name))
+            if pose is None:
+                of = f" of robot {name}" if name else " of the robot"
+                unread[it.view.number] = (
+                    f"no pose{of}: view {view.number} has joint angles that no known model of it "
+                    "takes"
+                )
+            else:
+                poses[robot_key(name)][it.station] = pose
+    return poses, unread
+
+
+def _pose(view: View, model: Robot | None) -> FloatArray | None:
+    pose, joints = view.base_from_flange(), view.joints_rad
+    if pose is not None:
+        return np.asarray(pose.as_matrix())
+    if joints is None or model is None or len(joints) != model.joint_count:
+        return None
+    return np.asarray(model.base_from_flange(joints[None])[0])
+
+
+def _reference(cell: Cell) -> str:
+    """The frame that stands for the cell: the first base of most observations, or the like."""
+    tree = cell.tree
+    bases = [tree.branches[it].parent for it in tree.branches if tree.branches[it].robot]
+    still = [it for it, branch in tree.branches.items() if branch.parent == _CELL]
+    choices = [it for it in bases if it in still] or still
+
+    def rows(name: str) -> int:
+        tied = cell.held_to(name).tied()
+        return sum(it.seer in tied for it in cell.rows)
+
+    return max(choices, key=rows)

@@ -1,0 +1,193 @@
+"""Lenses and boards of a whole cell: every camera has its lens, and all see the same boards.
+
+Each camera's images are compressed as those of a single camera are; what they say of lens and
+boards comes together here, with what is known of them beforehand.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Compressed, compress
+from visioncal.estimator.corners import floored_sigma_px
+from visioncal.estimator.joint import Problem
+from visioncal.estimator.linalg import covariance
+from visioncal.estimator.network import Common
+from visioncal.types import Camera, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """The cameras' corners, and what lenses and boards are taken to be.
+
+    Attributes:
+        problems: Each camera's corners, by the camera.
+        values: (k,) all lenses' intrinsics, camera by camera, and then all boards' shapes.
+        poses: (v, 4, 4) of the views, camera by camera.
+    """
+
+    problems: Mapping[str, Problem]
+    values: FloatArray
+    poses: FloatArray
+
+    @classmethod
+    def of(cls, problems: Mapping[str, Problem], poses: Mapping[str, FloatArray]) -> "Looks":
+        """Lenses and boards as they are stated or were estimated before.
+
+        Args:
+            problems: Each camera's corners, of the same boards.
+            poses: (v, 4, 4) the poses of each camera's views, in the order of its corners.
+        """
+        lenses = [intrinsics(it.scene.camera) for it in problems.values()]
+        boards = next(iter(problems.values())).basis.shape[2]
+        return cls(
+            problems,
+            np.concatenate([*lenses, np.zeros(boards)]),
+            np.concatenate([poses[name] for name in problems]),
+        )
+
+    @cached_property
+    def lenses(self) -> Mapping[str, slice]:
+        """Places of each camera's intrinsics among the values."""
+        places, at = {}, 0
+        for name, problem in self.problems.items():
+            places[name] = slice(at, at + len(problem.lens))
+            at += len(problem.lens)
+        return places
+
+    @property
+    def boards(self) -> slice:
+        """Places of the boards' shapes."""
+        return slice(sum(len(it.lens) for it in self.problems.values()), len(self.values))
+
+    @property
+    def scales(self) -> IntArray:
+        """Places (b,) of the boards' scales."""
+        return np.arange(self.boards.start, self.boards.stop, len(BOARD_NAMES))
+
+    def shape_of(self, board: int) -> IntArray:
+        """Places (8,) of one board's aspect and bend."""
+        start = int(self.scales[board])
+        return np.arange(start + 1, start + len(BOARD_NAMES))
+
+    @cached_property
+    def prior_sigma(self) -> FloatArray:
+        """(k,) what the values are known to beforehand; inf where nothing is."""
+        lenses = [it.prior_sigma[it.lens] for it in self.problems.values()]
+        one = next(iter(self.problems.values()))
+        return np.concatenate([*lenses, one.prior_sigma[len(one.lens) :]])
+
+    @cached_property
+    def stated(self) -> FloatArray:
+        """(k,) the values as they are stated, or were estimated before."""
+        return Looks.of(self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}).values
+
+    @property
+    def first(self) -> IntArray:
+        """What is free from the start: sizes, lenses that were estimated or are to be refined."""
+        free = [self.scales]
+        for name, problem in self.problems.items():
+            scene, lens = problem.scene, self.lenses[name]
+            known = scene.matrix_sigma_px is not None and scene.mode != "hold"
+            refined = scene.mode == "refine" and problem.has_spare_corners
+            if scene.estimated or refined:
+                free.append(np.arange(lens.start, lens.stop))
+            elif known:
+                free.append(np.arange(lens.start, lens.start + 4))
+        return np.unique(np.concatenate(free))
+
+    def camera(self, name: str) -> Camera:
+        """A camera with its lens as it is taken to be."""
+        return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
+
+    def moved(self, free: IntArray, change: FloatArray) -> "Looks":
+        """Returns them after a (f,) change of some values."""
+        values = self.values.copy()
+        values[free] += change
+        return replace(self, values=values)
+
+    def seen(self, free: IntArray) -> "Seen":
+        """Compresses all corners, (f,) values being free."""
+        found, sigmas = [], []
+        information = np.zeros((len(self.values), len(self.values)))
+        pull = np.zeros(len(self.values))
+        begin = 0
+        for name, problem in self.problems.items():
+            end = begin + len(problem.stack.views)
+            appearance = Appearance(self.camera(name), self.values[self.boards])
+            compressed = compress(problem.stack, problem.basis, appearance, self.poses[begin:end])
+            places = self.places(name)
+            open_values = int(np.isin(places, free).sum())
+            freedom = compressed.residuals.size - 6 * (end - begin) - open_values
+            sigma = float(np.sqrt(np.sum(compressed.residuals**2) / max(freedom, 1)))
+            weight = 1.0 / floored_sigma_px(sigma) ** 2
+            information[np.ix_(places, places)] += weight * compressed.shared_information
+            pull[places] += weight * compressed.shared_pull
+            found.append(compressed)
+            sigmas.append(sigma)
+            begin = end
+        prior = 1.0 / self.prior_sigma**2
+        information += np.diag(prior)
+        pull += prior * (self.values - self.stated)
+        poses = np.concatenate([it.cam_from_target for it in found])
+        return Seen(
+            replace(self, poses=poses),
+            free,
+            tuple(found),
+            tuple(sigmas),
+            Common(information[np.ix_(free, free)], pull[free]),
+        )
+
+    def places(self, name: str) -> IntArray:
+        """Places of what one camera's corners tell of: its lens and all boards."""
+        lens, boards = self.lenses[name], self.boards
+        return np.concatenate(
+            [np.arange(lens.start, lens.stop), np.arange(boards.start, boards.stop)]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What all corners say of poses, lenses and boards, where they were linearised.
+
+    Attributes:
+        looks: Where that was.
+        free: (f,) places of the values that are free.
+        compressed: What each camera's corners say.
+        sigmas_px: Each camera's noise of a corner's coordinate [px].
+        common: What is known of the free values without any robot.
+    """
+
+    looks: Looks
+    free: IntArray
+    compressed: tuple[Compressed, ...]
+    sigmas_px: tuple[float, ...]
+    common: Common
+
+    @property
+    def spread(self) -> FloatArray:
+        """Covariances (v, 6, 6) of all views' poses."""
+        return np.concatenate(
+            [
+                floored_sigma_px(sigma) ** 2 * covariance(it.information)
+                for it, sigma in zip(self.compressed, self.sigmas_px, strict=True)
+            ]
+        )
+
+    @property
+    def by_free(self) -> FloatArray:
+        """How all views' poses (v, 6, f) move with the free values."""
+        parts = []
+        for name, it in zip(self.looks.problems, self.compressed, strict=True):
+            every = np.zeros((len(it.by_shared), 6, len(self.looks.values)))
+            every[:, :, self.looks.places(name)] = it.by_shared
+            parts.append(every[:, :, self.free])
+        return np.concatenate(parts)
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """The views, camera by camera."""
+        return tuple(view for it in self.looks.problems.values() for view in it.stack.views)
