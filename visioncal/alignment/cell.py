@@ -101,7 +101,7 @@ def read_cell(session: Session) -> Cell:
     poses, unread = _poses(session, seen)
     reasons, rows = dict(unread), []
     for it in seen:
-        reason = _unusable(session, it)
+        reason = _unusable(it)
         if reason:
             reasons[it.view.number] = reason
         elif it.view.number not in reasons:
@@ -129,7 +129,7 @@ def robot_key(name: str) -> str:
     return name or "robot"
 
 
-def _unusable(session: Session, it: Observation) -> str:
+def _unusable(it: Observation) -> str:
     if it.view.text.get("role", "").strip() == "holdout":
         return "held back: role is holdout"
     if it.lacks:

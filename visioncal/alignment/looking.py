@@ -7,7 +7,8 @@ import numpy as np
 
 from visioncal.alignment.cell import Cell
 from visioncal.errors import DataError, VisioncalError
-from visioncal.session import CameraTable, Session, View, frame_name
+from visioncal.session import Session, View, frame_name
+from visioncal.session.tables import CameraTable
 from visioncal.stages.detect import detect
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses
@@ -97,7 +98,8 @@ def _with_camera(
     mine = _numbered_through(session, views, corners)
     if not mine or resolution is None:
         return replace(looked, reasons={**looked.reasons, **reasons})
-    camera, unknowns, warnings = _stated(table, resolution), 0, ()
+    camera, unknowns = _stated(table, resolution), 0
+    warnings: tuple[str, ...] = ()
     estimated = camera is None
     try:
         if camera is None:
@@ -127,11 +129,9 @@ def _numbered_through(
     starts = dict(
         zip(session.boards, first_corners(tuple(session.boards.values())).tolist(), strict=True)
     )
-    return {
-        view.number: replace(it, ids=it.ids + starts[session.board_of(view)])
-        for view in views
-        if (it := corners.get(view.number)) is not None
-    }
+    mine = [it for it in views if it.number in corners]
+    first = {it.number: starts[session.board_of(it)] for it in mine}
+    return {it: replace(corners[it], ids=corners[it].ids + first[it]) for it in first}
 
 
 def _stated(table: CameraTable, resolution: tuple[int, int]) -> Camera | None:
@@ -141,9 +141,7 @@ def _stated(table: CameraTable, resolution: tuple[int, int]) -> Camera | None:
     return Camera(table.model, resolution, matrix, distortion)
 
 
-def _check_resolution(
-    frame: str, stated: tuple[int, int] | None, found: tuple[int, int]
-) -> None:
+def _check_resolution(frame: str, stated: tuple[int, int] | None, found: tuple[int, int]) -> None:
     if stated is not None and stated != found:
         raise DataError(
             f"{frame}: its images are {found[0]} x {found[1]} px, but its resolution is stated as "

@@ -55,7 +55,9 @@ class Agreed:
 
 
 def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
-    """Finds what belongs together, what does not, and what moved.
+    """Finds what belongs together at first sight, what does not, and what clearly moved.
+
+    `settle` has the last word, once lenses and boards are as well known as they can be.
 
     Args:
         network: All observations.
@@ -75,7 +77,13 @@ def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
         used |= network.sightings.involves(move.twin)
         used &= _beyond(network, used, fit) < 1.0
         used, fit = _widened(network, used, fit)
-    used, fit = _settled(network, *_widened(network, used, fit))
+    return _agreed(network, *_widened(network, used, fit), moves)
+
+
+def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
+    """Settles what agrees one by one, and what moved by less than single observations tell."""
+    network, moves = agreed.network, list(agreed.moves)
+    used, fit = _settled(network, agreed.used, agreed.fit)
     while len(moves) < _MOST_MOVES:
         slight = slight_move(network.subset(used), fit, movable)
         if slight is None:
@@ -84,6 +92,10 @@ def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
         movable = (*movable, slight.twin)
         moves.append(slight)
         used, fit = _settled(network, *_widened(network, used, fit))
+    return _agreed(network, used, fit, moves)
+
+
+def _agreed(network: Network, used: Mask, fit: NetworkFit, moves: Sequence[Move]) -> Agreed:
     squares, directions = surprises(network, used, fit)
     return Agreed(network, fit, used, squares, _limit(network, used, directions), tuple(moves))
 

@@ -11,7 +11,7 @@ from visioncal.estimator.network import Linear, Network, Noise, Reduced, State, 
 from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
 from visioncal.types import FloatArray, Mask
 
-_ROUNDS, _SETTLED = 20, 1e-10
+_ROUNDS, _SETTLED = 20, 1e-8
 # Noise levels that change by less have settled, far below what is known of them.
 _LEVELS_SETTLED = 1e-3
 # Robots' noise levels are started from above: at least here [rad and m].

@@ -4,10 +4,8 @@ Every frame hangs on its parent by an edge that is unknown, known, or a robot. F
 parts are one body: what stands in the cell, and what each flange carries.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from visioncal.types import FloatArray
 
@@ -75,6 +73,15 @@ class Tree:
         branch = replace(self.branches[frame], known=matrix)
         return replace(self, branches={**self.branches, frame: branch})
 
+    def without(self, frames: Collection[str]) -> "Tree":
+        """Returns the tree without some frames, and without all that hangs on these."""
+        kept = {
+            name: branch
+            for name, branch in self.branches.items()
+            if not any(it in frames for it in self.above(name))
+        }
+        return replace(self, branches=kept)
+
     def with_twin(self, frame: str, twin: str) -> "Tree":
         """Returns the tree with one more frame that hangs where another does, by its own edge."""
         branch = Branch(self.branches[frame].parent)
@@ -101,8 +108,3 @@ class Tree:
             *(Step(it, self.branches[it].robot, True) for it in up),
             *(Step(it, self.branches[it].robot, False) for it in reversed(down)),
         )
-
-
-def identity() -> FloatArray:
-    """The (4, 4) transform of a frame that is its parent by another name."""
-    return np.eye(4)

@@ -1,0 +1,299 @@
+"""From what was seen to the fit of the whole cell: start, agreement, lenses and boards."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.alignment.cell import Cell
+from visioncal.alignment.looking import CameraLook, Looked, nominal_spread
+from visioncal.alignment.ties import ambiguous_error, untied_robots
+from visioncal.estimator.joint import Problem, Scene, chance_limit
+from visioncal.estimator.linalg import covariance
+from visioncal.estimator.network import Common, Network, Sightings, State
+from visioncal.estimator.networkagree import Agreed, agree, settle
+from visioncal.estimator.networkfit import fit_network, normal_equations
+from visioncal.estimator.networklooks import Looks, Seen
+from visioncal.stages.choose import chosen, padded
+from visioncal.stages.grow import Sighted
+from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.tie import pick, tie
+from visioncal.targets import rotation_transforms
+from visioncal.types import Corners, FloatArray, IntArray, Target
+
+# Values that move by less than this share of their sigma have settled.
+_SETTLED, _ROUNDS = 0.02, 6
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The fit of a whole cell.
+
+    Attributes:
+        cell: The cell; its rows are the observations in the fit's order.
+        agreed: The fit, what it uses, and what moved.
+        seen: What all corners say of lenses and boards; None without images.
+        poses: Each row's one pose.
+        untied: Frames that nothing ties to the rest.
+    """
+
+    cell: Cell
+    agreed: Agreed
+    seen: Seen | None
+    poses: tuple[ViewPoses, ...]
+    untied: tuple[str, ...]
+
+
+def solve(cell: Cell, looked: Looked) -> Solved:
+    """Solves a whole cell.
+
+    Raises:
+        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+    """
+    missing = {
+        it.view: looked.reasons.get(it.view, "nothing was found in its image")
+        for it in cell.rows
+        if it.view not in looked.poses
+    }
+    cell = cell.without(missing)
+    cell, lost = _tied_part(cell)
+    views = [looked.poses[it.view] for it in cell.rows]
+    cell, views, network, state, unplaced = _started(cell, views)
+    agreed = agree(network, state, _movable(network))
+    seen = None
+    if looked.cameras:
+        agreed, seen = _with_looks(cell, looked.cameras, views, agreed)
+    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced))
+
+
+def _movable(network: Network) -> tuple[str, ...]:
+    """What may be bumped or slip: all that is unknown but bases."""
+    bases = {branch.parent for branch in network.tree.branches.values() if branch.robot}
+    return tuple(it for it in network.tree.unknown if it not in bases)
+
+
+def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
+    """The part of a cell that observations tie together, and the frames outside."""
+    tied = cell.tied()
+    lost = tuple(it for it in cell.tree.branches if it not in tied)
+    untied_robots(cell, lost)
+    return _without_frames(cell, lost), tuple(it for it in lost if not _is_flange(cell, it))
+
+
+def _is_flange(cell: Cell, frame: str) -> bool:
+    return bool(cell.tree.branches[frame].robot)
+
+
+def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
+    tree = cell.tree.without(frames)
+    reasons = {
+        it.view: f"nothing ties {it.seer if it.seer in frames else it.seen} to the rest of the cell"
+        for it in cell.rows
+        if it.seer not in tree.branches or it.seen not in tree.branches
+    }
+    robots = set(tree.robots)
+    poses = {name: it for name, it in cell.poses.items() if name in robots}
+    return replace(cell.without(reasons), tree=tree, poses=poses)
+
+
+def _started(
+    cell: Cell, views: Sequence[ViewPoses]
+) -> tuple[Cell, list[ViewPoses], Network, State, tuple[str, ...]]:
+    """Finds a start, and gives each view its one pose by it."""
+    targets = _targets(cell)
+    tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets))
+    if tied.untied:
+        untied_robots(cell, tied.untied)
+        kept = _without_frames(cell, tied.untied)
+        rows = {it.view for it in kept.rows}
+        cell, views = kept, [it for it in views if it.view in rows]
+    if tied.ambiguous:
+        raise ambiguous_error(cell, tied.ambiguous)
+    edges = np.array([tied.edges[it] for it in cell.tree.unknown]).reshape(-1, 4, 4)
+    state = State(edges, np.zeros(0))
+    rough = _network(cell, [chosen(it, 0, None) for it in views])
+    picks = pick(rough.predicted(state), _sighted(cell, views, targets))
+    views = [
+        chosen(view, at, targets.get(row.seen))
+        for view, at, row in zip(views, picks.tolist(), cell.rows, strict=True)
+    ]
+    return cell, views, _network(cell, views), state, tied.untied
+
+
+def _targets(cell: Cell) -> dict[str, Target]:
+    """The printed targets by their frames."""
+    return {f"target_{name}" if name else "target": it for name, it in cell.session.plates.items()}
+
+
+def _sighted(cell: Cell, views: Sequence[ViewPoses], targets: Mapping[str, Target]) -> Sighted:
+    candidates = padded(views)
+    turns = np.zeros(candidates.valid.shape, dtype=np.int64)
+    for row, view in zip(turns, views, strict=True):
+        row[: len(view.turns)] = view.turns
+    return Sighted(
+        tuple(it.seer for it in cell.rows),
+        tuple(it.seen for it in cell.rows),
+        np.array([it.station for it in cell.rows]),
+        candidates,
+        turns,
+        {
+            frame: turned
+            for frame, it in targets.items()
+            if len(turned := rotation_transforms(it)) > 1
+        },
+    )
+
+
+def _network(cell: Cell, views: Sequence[ViewPoses]) -> Network:
+    """The network of views with one pose each, lenses and boards as they are taken to be."""
+    given = np.array([not it.covariance.any() for it in views])
+    sensors = {it: at for at, it in enumerate(sensors_of(cell, views))}
+    spread = np.array([it.covariance[0] for it in views])
+    spread[given] = nominal_spread()
+    return Network(
+        cell.tree,
+        cell.poses,
+        Sightings(
+            tuple(it.seer for it in cell.rows),
+            tuple(it.seen for it in cell.rows),
+            np.array([it.station for it in cell.rows]),
+            np.array(
+                [
+                    sensors[row.seer] if is_given else -1
+                    for row, is_given in zip(cell.rows, given.tolist(), strict=True)
+                ],
+                dtype=np.int64,
+            ),
+            np.array([it.cam_from_target[0] for it in views]),
+            spread,
+            np.ones(len(views), dtype=bool),
+            np.zeros((len(views), 6, 0)),
+        ),
+        Common.none(),
+    )
+
+
+def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
+    """The frames whose observations have a noise level of their own."""
+    seers = [
+        row.seer for row, view in zip(cell.rows, views, strict=True) if not view.covariance.any()
+    ]
+    return tuple(dict.fromkeys(seers))
+
+
+def _with_looks(
+    cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPoses], agreed: Agreed
+) -> tuple[Agreed, Seen]:
+    """Fits lenses and boards with the rest, and looks again what agrees."""
+    looks = _looks(cell, cameras, views)
+    agreed, seen = _settled(cell, looks, looks.first, agreed)
+    wider = _wider(cell, seen, agreed)
+    if len(wider) > len(seen.free):
+        agreed, seen = _settled(cell, seen.looks, wider, agreed)
+    return settle(agreed, _movable(agreed.network)), seen
+
+
+def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPoses]) -> Looks:
+    targets = tuple(cell.session.boards.values())
+    one = {it.view: it for it in views}
+    problems, poses = {}, {}
+    for name, it in cameras.items():
+        scene = Scene(
+            "eye-to-hand",
+            targets,
+            it.camera,
+            it.estimated,
+            it.table.intrinsics,
+            it.table.matrix_sigma_px,
+            tuple(cell.session.boards),
+        )
+        mine = [one.get(view.view, view) for view in it.views]
+        corners: dict[int, Corners] = {
+            view.view: view.corners for view in mine if view.corners is not None
+        }
+        problems[name] = Problem.of(scene, corners)
+        poses[name] = np.array([view.cam_from_target[0] for view in mine])
+    return Looks.of(problems, poses)
+
+
+def _settled(cell: Cell, looks: Looks, free: IntArray, agreed: Agreed) -> tuple[Agreed, Seen]:
+    """Linearises corners and fits the cell in turn, until lenses and boards stay."""
+    for _ in range(_ROUNDS):
+        seen = looks.seen(free)
+        network = with_seen(cell, agreed.network, seen)
+        state = State(agreed.fit.state.edges, np.zeros(len(free)))
+        part = network.subset(agreed.used)
+        fit = fit_network(part, state, agreed.fit.noise)
+        change = fit.state.shared
+        sigma = np.sqrt(np.diag(covariance(normal_equations(part, fit.state, fit.noise)[0])))
+        agreed = replace(agreed, network=network, fit=fit)
+        if np.all(np.abs(change) <= _SETTLED * sigma[len(sigma) - len(free) :]):
+            break
+        looks = seen.looks.moved(free, change)
+    return agreed, seen
+
+
+def with_seen(cell: Cell, network: Network, seen: Seen) -> Network:
+    """The network with poses as its lenses and boards make them."""
+    places = {view: at for at, view in enumerate(seen.views)}
+    rows = np.array([places.get(it.view, -1) for it in cell.rows], dtype=np.int64)
+    mine = rows >= 0
+    measured, spread = network.sightings.measured.copy(), network.sightings.covariance.copy()
+    by_free = np.zeros((len(rows), 6, len(seen.free)))
+    measured[mine] = seen.looks.poses[rows[mine]]
+    spread[mine], by_free[mine] = seen.spread[rows[mine]], seen.by_free[rows[mine]]
+    sightings = replace(network.sightings, measured=measured, covariance=spread, by_shared=by_free)
+    return replace(network, sightings=sightings, common=seen.common)
+
+
+def _wider(cell: Cell, seen: Seen, agreed: Agreed) -> IntArray:
+    """What more the corners ask to set free: boards' bends, and lenses that were stated."""
+    looks = seen.looks
+    groups: list[IntArray] = [looks.shape_of(it) for it in range(len(looks.scales))]
+    for name, problem in looks.problems.items():
+        lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
+        if problem.scene.mode == "auto" and not np.isin(lens, seen.free).all():
+            groups.append(lens)
+    if not all(it.has_spare_corners for it in looks.problems.values()):
+        return seen.free
+    every = np.unique(np.concatenate([seen.free, *groups]))
+    scores = _Scores.of(with_seen(cell, agreed.network, looks.seen(every)), agreed, every)
+    free = seen.free
+    while groups:
+        gain, at = max((scores.gain(free, it), at) for at, it in enumerate(groups))
+        if gain <= 0.0:
+            break
+        free = np.union1d(free, groups.pop(at))
+    return free
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Normal equations with (f,) values free beside the edges: those that stand at some places."""
+
+    information: FloatArray
+    gradient: FloatArray
+    free: IntArray
+
+    @classmethod
+    def of(cls, network: Network, agreed: Agreed, free: IntArray) -> "_Scores":
+        state = State(agreed.fit.state.edges, np.zeros(len(free)))
+        part = network.subset(agreed.used)
+        return cls(*normal_equations(part, state, agreed.fit.noise), free)
+
+    def gain(self, free: IntArray, group: IntArray) -> float:
+        """By how much more than chance the squared error falls with a group free (Rao)."""
+        more = np.setdiff1d(group, free)
+        return self._score(np.union1d(free, more)) - self._score(free) - chance_limit(len(more))
+
+    def _score(self, free: IntArray) -> float:
+        edges = len(self.gradient) - len(self.free)
+        at = np.concatenate([np.arange(edges), edges + np.searchsorted(self.free, free)])
+        gradient = self.gradient[at]
+        return float(gradient @ covariance(self.information[np.ix_(at, at)]) @ gradient)
+
+
+def edges_spread(solved: Solved, spread: FloatArray) -> FloatArray:
+    """The part of a covariance of all unknowns that is of the edges."""
+    count = 6 * len(solved.agreed.network.unknown)
+    return spread[:count, :count]
