@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from visioncal.errors import DataError
+from visioncal.frames.touches import touches_of
+from visioncal.pipeline import calibrate
 from visioncal.recording import write_recording
 from visioncal.session import Session
 
@@ -240,3 +242,29 @@ def test_of_one_robot_what_its_camera_sees_is_in_the_cell(tmp_path):
     session = Session.load(tmp_path)
     assert session.frames["target_floor"] == session.frames["cam_top"] == "cell"
     assert [tuple(it.robots) for it in session.observations] == [("",), ("",)]
+
+
+@pytest.mark.parametrize("use", [calibrate, touches_of])
+def test_what_takes_one_camera_and_robot_points_to_align(folder, use):
+    with pytest.raises(
+        DataError, match=r"several cameras \(left, right\) and several robots"
+    ) as caught:
+        use(Session.load(folder))
+    assert "visioncal align" in caught.value.next_step
+
+
+def test_boards_on_either_side_of_one_camera_are_for_align(tmp_path):
+    (tmp_path / "session.toml").write_text(
+        'schema = 1\nname = "one arm"\n[camera]\n[robot]\nmodel = "ur5e"\n[targets]\n'
+        'floor = "charuco_9x6_30mm"\nplate = "checkerboard_9x6_25mm"\n'
+        '[frames]\ncam = "cell"\ntarget_plate = "flange"\ntarget_floor = "cell"\n'
+    )
+    (tmp_path / "views.csv").write_text(
+        f"view,target,image,x_m,y_m,z_m,qx,qy,qz,qw\n0,floor,a.png,{POSE}\n1,plate,b.png,{POSE}\n"
+    )
+    session = Session.load(tmp_path)
+    assert session.mount == "eye-to-hand"
+    with pytest.raises(
+        DataError, match="and target_floor on cell; this takes boards on the flange"
+    ):
+        calibrate(session)

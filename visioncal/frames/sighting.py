@@ -13,6 +13,7 @@ from visioncal.pipeline.known import HELD_BACK, by_reason
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
+from visioncal.session.single import check_one_of_each
 from visioncal.stages.detect import detect, image_of
 from visioncal.stages.reported import Reported, reported_poses
 from visioncal.types import FloatArray, Progress, Rejection, Target
@@ -141,6 +142,7 @@ def check_mount(session: Session, calibration: Calibration) -> None:
     Raises:
         DataError: So it is.
     """
+    check_one_of_each(session)
     if session.mount != calibration.mount:
         raise DataError(
             f"session {session.name!r} has its camera {session.mount}, and the calibration "

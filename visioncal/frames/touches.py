@@ -12,6 +12,7 @@ from visioncal.files import did_you_mean, some_of
 from visioncal.frames.verdicts import Doubt
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.single import check_one_of_each
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mask
 
@@ -76,7 +77,12 @@ class TouchRows:
 
 
 def touches_of(session: Session) -> TouchRows:
-    """Takes the rows of a session's views.csv for touches."""
+    """Takes the rows of a session's views.csv for touches.
+
+    Raises:
+        DataError: It is of several robots.
+    """
+    check_one_of_each(session)
     nowhere = np.full((4, 4), np.nan)
     poses, joints = [], []
     for view in session.views:

@@ -24,6 +24,7 @@ from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clock import set_clock
@@ -67,6 +68,7 @@ class Stage:
 
 
 def _read_robot(known: Known) -> Known:
+    check_one_of_each(known.session)
     session, document = known.session, known.session.robot_document
     robot = None if document is None else Robot.from_document(document)
     known = replace(known, robot=robot)
