@@ -1,5 +1,6 @@
 """The result of a calibration, its frames, and how they stand on disk."""
 
+from visioncal.calibration.alignment import Alignment, Moved, Sight, Untied
 from visioncal.calibration.document import to_document
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame, FrameFile, Observation
@@ -15,14 +16,18 @@ from visioncal.calibration.parts import (
 from visioncal.calibration.result import Calibration
 
 __all__ = [
+    "Alignment",
     "Calibration",
     "CameraResult",
     "Edge",
     "Frame",
     "FrameFile",
+    "Moved",
     "Observation",
     "Rms",
+    "Sight",
     "SolverResult",
+    "Untied",
     "Validation",
     "Verdict",
     "VerdictStatus",

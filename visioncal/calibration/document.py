@@ -49,7 +49,7 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
         "solvers": {name: _solver_document(it) for name, it in calibration.solvers.items()},
     }
     if camera is not None:
-        document["camera"] = _camera_document(camera)
+        document["camera"] = camera_document(camera)
     if robot is not None:
         document["robot"] = dict(robot.document)
     document |= {
@@ -72,7 +72,8 @@ def _solver_document(result: SolverResult) -> dict[str, Any]:
     return poses | present({"rms_mm": result.rms_mm, "rms_deg": result.rms_deg})
 
 
-def _camera_document(result: CameraResult) -> dict[str, Any]:
+def camera_document(result: CameraResult) -> dict[str, Any]:
+    """Writes a camera's intrinsics."""
     camera = result.camera
     return present(
         {
@@ -133,7 +134,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "rms": Rms(**document["rms"]),
         "validation": _validation(document["validation"]),
         "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
-        "camera": None if camera is None else _camera(camera),
+        "camera": None if camera is None else read_camera(camera),
         "robot": None if robot is None else Robot.from_document(robot),
         "frames": read_frames(document.get("frames", {})),
         "stages": {name: value for name, value in document.items() if name not in _OWN_KEYS},
@@ -145,7 +146,12 @@ def _solver(document: Mapping[str, Any]) -> SolverResult:
     return SolverResult(poses, document["rms_mm"], document.get("rms_deg"))
 
 
-def _camera(document: Mapping[str, Any]) -> CameraResult:
+def read_camera(document: Mapping[str, Any]) -> CameraResult:
+    """Reads what `camera_document` wrote.
+
+    Raises:
+        LookupError, TypeError, ValueError: The document is another.
+    """
     width, height = document["resolution"]
     return CameraResult(
         Camera(

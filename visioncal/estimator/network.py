@@ -346,6 +346,16 @@ class Network:
         spread[untold, :3, :3] = _UNTOLD * np.eye(3)
         return spread
 
+    def total(self, linear: Linear, noise: Noise) -> FloatArray:
+        """Covariances (n, 6, 6) of single residuals, the flanges' errors among their noise."""
+        spread, (of, _) = self.spread(noise), self.units
+        rows = of >= 0
+        if rows.any():
+            # Slots of robots that are not in an observation's way move nothing of it.
+            slack, between = linear.slack[rows], self.flange_spread(noise)[of[rows]]
+            spread[rows] += (slack * between[:, None, :]) @ np.swapaxes(slack, 1, 2)
+        return spread
+
     def flange_spread(self, noise: Noise) -> FloatArray:
         """Variances (u, 6 w) of the flanges' errors of each unit."""
         _, members = self.units

@@ -218,13 +218,7 @@ def surprises(network: Network, used: Mask, fit: NetworkFit) -> tuple[FloatArray
     """
     linear = network.linear(fit.state)
     known = covariance(normal_equations(network.subset(used), fit.state, fit.noise)[0])
-    spread = network.spread(fit.noise)
-    of, _ = network.units
-    rows = of >= 0
-    if rows.any():
-        slack, between = linear.slack[rows], network.flange_spread(fit.noise)[of[rows]]
-        # Slots of robots that a unit does not have, or that are not in this way, move nothing.
-        spread[rows] += (slack * between[:, None, :]) @ np.swapaxes(slack, 1, 2)
+    spread = network.total(linear, fit.noise)
     taken = linear.jacobian @ known @ np.swapaxes(linear.jacobian, 1, 2)
     left = spread + np.where(used, -1.0, 1.0)[:, None, None] * taken
     squares, directions = squared_lengths(linear.residuals, left, spread)

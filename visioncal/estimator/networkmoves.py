@@ -140,12 +140,7 @@ def _best_step(
 def _asked_spread(network: Network, fit: NetworkFit, frame: str) -> FloatArray:
     """Covariances (n, 6, 6) of the changes that observations ask for."""
     linear = network.linear(fit.state, ideal=True)
-    spread = network.spread(fit.noise)
-    rows = network.units[0] >= 0
-    if rows.any():
-        slack = linear.slack[rows]
-        between = network.flange_spread(fit.noise)[network.units[0][rows]]
-        spread[rows] += (slack * between[:, None, :]) @ np.swapaxes(slack, 1, 2)
+    spread = network.total(linear, fit.noise)
     at = 6 * network.unknown[frame]
     back = np.linalg.inv(linear.jacobian[:, :, at : at + 6])
     return np.asarray(back @ spread @ np.swapaxes(back, 1, 2))

@@ -1,0 +1,173 @@
+"""Aligning a whole cell: the way from a session to its frames, each with respect to all others."""
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.alignment.cell import Cell, read_cell
+from visioncal.alignment.faults import Version, movements, reasons, residuals, versions
+from visioncal.alignment.judging import check_determined, judge, size_warnings, weakest_link
+from visioncal.alignment.looking import Looked, look_around
+from visioncal.alignment.solving import Solved, sensors_of, solve
+from visioncal.alignment.ties import untied_words
+from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Untied
+from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.networkfit import network_information
+from visioncal.session import Session
+from visioncal.types import Corners, FloatArray, Progress
+
+
+def align(
+    session: Session | Path | str,
+    *,
+    corners: Mapping[int, Corners] | None = None,
+    progress: Progress | None = None,
+) -> Alignment:
+    """Aligns a cell of any number of robots, cameras and boards, in one joint adjustment.
+
+    Args:
+        session: A session, or the path of its folder or recording.
+        corners: What was found in its images before, by view; None to look.
+        progress: Told of long work.
+
+    Returns:
+        All frames with their joint covariance, and the verdict.
+
+    Raises:
+        DataError: The input is wrong or shows no target.
+        DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
+    """
+    loaded = session if isinstance(session, Session) else Session.load(session)
+    cell = read_cell(loaded)
+    looked = look_around(cell, corners, progress)
+    if progress is not None:
+        progress("align", 0, 1)
+    with one_blas_thread():
+        solved = solve(cell, looked)
+        return alignment_of(cell, looked, solved)
+
+
+def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
+    """Puts the result together.
+
+    Args:
+        cell: The whole cell as it was read.
+        looked: What its cameras saw.
+        solved: The fit of what of it is tied.
+
+    Raises:
+        DegenerateError: The observations leave a frame open.
+    """
+    agreed, session = solved.agreed, cell.session
+    network = agreed.network
+    information = network_information(
+        network.subset(agreed.used), agreed.fit.state, agreed.fit.noise
+    )
+    spread = covariance(information)
+    named = versions(solved)
+    edges = _edges(solved, named, spread)
+    last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
+    check_determined(solved, information, [it.name for it in named.values()], last)
+    parents = {name: network.tree.branches[it.key].parent for name, it in _by_name(named).items()}
+    kept = {
+        name: it.parent
+        for name, it in cell.tree.branches.items()
+        if name in solved.cell.tree.branches
+    }
+    moved, noise = movements(solved), _noise(solved)
+    untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
+    warnings = [*session.warnings, *looked.warnings, *size_warnings(solved, spread)]
+    return Alignment(
+        session_name=session.name,
+        session_sha256=session.digest(),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        reference=cell.reference,
+        frames=kept | parents,
+        robots={name: it.robot for name, it in solved.cell.tree.branches.items() if it.robot},
+        edges={f"{parents[name]}_from_{name}": edge for name, edge in edges.items()},
+        joint_covariance=spread[: 6 * len(edges), : 6 * len(edges)],
+        cameras=_cameras(solved, looked, spread),
+        noise=noise,
+        sights=_sights(cell, solved),
+        moved=moved,
+        untied=untied,
+        weakest=weakest_link(solved.cell, last),
+        verdict=judge(solved, last, noise, moved, untied, warnings),
+    )
+
+
+def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:
+    return {it.name: it for it in named.values()}
+
+
+def _edges(solved: Solved, named: Mapping[str, Version], spread: FloatArray) -> dict[str, Edge]:
+    """The estimated transforms by the frames that they place."""
+    network = solved.agreed.network
+    return {
+        named[key].name: Edge(
+            solved.agreed.fit.state.edges[at], spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6]
+        )
+        for key, at in network.unknown.items()
+    }
+
+
+def _noise(solved: Solved) -> dict[str, dict[str, float]]:
+    """Estimated standard deviations: of robots by name, of cameras and instruments by frame."""
+    fit, network = solved.agreed.fit, solved.agreed.network
+    found = {
+        robot: {
+            "translation_mm": 1e3 * float(sigma_m),
+            "rotation_deg": float(np.rad2deg(sigma_rad)),
+        }
+        for robot, (sigma_rad, sigma_m) in zip(network.robots, fit.noise.robots, strict=True)
+    }
+    if solved.seen is not None:
+        pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
+        found |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
+    sensors = sensors_of(solved.cell, solved.poses)
+    for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=True):
+        found[frame] = {**found.get(frame, {}), "level": level}
+    return found
+
+
+def _cameras(solved: Solved, looked: Looked, spread: FloatArray) -> dict[str, CameraResult]:
+    seen = solved.seen
+    if seen is None:
+        return {}
+    looks = seen.looks.moved(seen.free, solved.agreed.fit.state.shared)
+    first, found = len(spread) - len(seen.free), {}
+    for name, look in looked.cameras.items():
+        lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
+        if not np.isin(lens, seen.free).all():
+            found[name] = CameraResult(looks.camera(name), look.estimated)
+            continue
+        at = first + np.searchsorted(seen.free, lens)
+        found[name] = CameraResult(looks.camera(name), look.estimated, spread[np.ix_(at, at)])
+    return found
+
+
+def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
+    """What became of each observation, in the order of the session's rows."""
+    away, why = residuals(solved), reasons(solved)
+    found = {
+        row.view: Sight(
+            row.view,
+            solved.cell.stops[row.station],
+            row.seer,
+            row.seen,
+            bool(used),
+            why.get(row.view, ""),
+            float(mm),
+            float(deg),
+        )
+        for row, used, (mm, deg) in zip(solved.cell.rows, solved.agreed.used, away, strict=True)
+    }
+    lost = solved.cell.reasons
+    for it in cell.session.observations:
+        number = it.view.number
+        if number not in found and not it.view.is_of_lens:
+            stop = cell.stops[it.station] if it.station < len(cell.stops) else number
+            found[number] = Sight(number, stop, it.seer, it.seen, False, lost.get(number, ""))
+    return tuple(found[it] for it in (view.number for view in cell.session.views) if it in found)

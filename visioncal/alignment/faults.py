@@ -1,0 +1,233 @@
+"""What is wrong with observations that disagree, and what moved, for people."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.alignment.solving import Solved
+from visioncal.calibration import Moved
+from visioncal.chance import chi2_limit
+from visioncal.estimator.network import Network
+from visioncal.figures import figure
+from visioncal.transforms import pose_difference
+from visioncal.types import FloatArray, IntArray, Mask
+
+# An image fits another stop where it is as near to what is predicted there as noise may put it,
+# which it is by chance at one stop in so many.
+_CHANCE = 1e-3
+# Poses of one robot are exchanged where so many observations of the stops say so.
+_FEWEST = 2
+
+
+@dataclass(frozen=True)
+class Version:
+    """A frame over a part of the time.
+
+    Attributes:
+        key: Its name in the network.
+        frame: The frame that it is.
+        name: Its name in the result: the frame's own for the last.
+        start: The first station of it; -1 for the first version.
+    """
+
+    key: str
+    frame: str
+    name: str
+    start: int
+
+
+def versions(solved: Solved) -> dict[str, Version]:
+    """All unknown frames over time, by their names in the network."""
+    moves = {it.twin: it for it in solved.agreed.moves}
+    parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
+    for key in solved.agreed.network.unknown:
+        start = moves[key].stop if key in moves else -1
+        parts[key.partition("@")[0]].append((start, key))
+    found = {}
+    for frame, mine in parts.items():
+        ordered = sorted(mine)
+        for at, (start, key) in enumerate(ordered):
+            name = frame
+            if at + 1 < len(ordered):
+                last = _last_seen(solved, ordered[at + 1][1])
+                name = f"{frame}_until_stop_{last}"
+            found[key] = Version(key, frame, name, start)
+    return found
+
+
+def _last_seen(solved: Solved, twin: str) -> int:
+    move = next(it for it in solved.agreed.moves if it.twin == twin)
+    return solved.cell.stops[move.before] if move.before >= 0 else solved.cell.stops[move.stop]
+
+
+def movements(solved: Solved) -> tuple[Moved, ...]:
+    """What moved, in the order of time."""
+    found, names = [], versions(solved)
+    edges = dict(zip(solved.agreed.network.unknown, solved.agreed.fit.state.edges, strict=True))
+    for move in sorted(solved.agreed.moves, key=lambda it: it.stop):
+        after = names[move.twin]
+        earlier = [
+            it for it in names.values() if it.frame == after.frame and it.start < after.start
+        ]
+        before = max(earlier, key=lambda it: it.start)
+        mm, deg = pose_difference(edges[before.key], edges[after.key])
+        rivals = tuple(dict.fromkeys(it.partition("@")[0] for it in move.rivals))
+        found.append(
+            Moved(
+                after.frame,
+                before.name,
+                _last_seen(solved, move.twin),
+                solved.cell.stops[move.stop],
+                mm,
+                deg,
+                tuple(it for it in rivals if it != after.frame),
+            )
+        )
+    return tuple(found)
+
+
+def moved_words(moved: Moved) -> str:
+    """Says that something moved."""
+    what = "was bumped" if moved.frame.startswith("cam") else "moved"
+    rivals = (
+        f" (or {' or '.join(moved.rivals)} did: this session cannot tell)" if moved.rivals else ""
+    )
+    return (
+        f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
+        f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}; the result has it "
+        f"where it stood last, and as {moved.before} where it stood before."
+    )
+
+
+def reasons(solved: Solved) -> dict[int, str]:
+    """Why observations that disagree are left out, by view, with what they fit instead."""
+    agreed, rows = solved.agreed, solved.cell.rows
+    out = np.flatnonzero(~agreed.used)
+    if not len(out):
+        return {}
+    away = residuals(solved)[out]
+    fitting = _fitting(solved, out)
+    mutual = _mutual(solved, out, fitting)
+    robots = _exchanged_robots(solved, mutual)
+    found = {}
+    for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
+        words = f"disagrees with the rest of the cell by {figure(mm)} mm and {figure(deg)} deg"
+        if at in robots:
+            words += f": {robots[at]}"
+        elif at in mutual:
+            other = rows[mutual[at]]
+            words += (
+                f": it fits stop {_stop(solved, mutual[at])}, and view {other.view} fits stop "
+                f"{_stop(solved, at)}: these two rows are exchanged"
+            )
+        elif at in fitting:
+            stops = [solved.cell.stops[it] for it in fitting[at]]
+            words += (
+                f": its image is of stop {stops[0]}"
+                if len(stops) == 1
+                else (f": its image is of another stop, as {', '.join(map(str, stops[:3]))}")
+            )
+        found[rows[at].view] = words
+    return found
+
+
+def _stop(solved: Solved, row: int) -> int:
+    return solved.cell.stops[solved.cell.rows[row].station]
+
+
+def residuals(solved: Solved) -> FloatArray:
+    """Distance (n, 2) of each observation from what is predicted [mm], [deg]."""
+    network, state = solved.agreed.network, solved.agreed.fit.state
+    pairs = zip(network.predicted(state), network.measured(state), strict=True)
+    return np.array([pose_difference(a, b) for a, b in pairs]).reshape(-1, 2)
+
+
+def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
+    """The other stations that observations fit, which do not fit their own, best first."""
+    network, fit = solved.agreed.network, solved.agreed.fit
+    stations = len(solved.cell.stops)
+    starts = {it.twin: (it.frame, it.stop) for it in solved.agreed.moves}
+    found = {}
+    for at in out.tolist():
+        row = solved.cell.rows[at]
+        here = replace(
+            network.sightings.subset(np.arange(len(network)) == at),
+            seers=(row.seer,) * stations,
+            seen=(row.seen,) * stations,
+            stops=np.arange(stations),
+            sensors=np.repeat(network.sightings.sensors[at], stations),
+            measured=np.repeat(network.sightings.measured[[at]], stations, axis=0),
+            covariance=np.repeat(network.sightings.covariance[[at]], stations, axis=0),
+            turned=np.repeat(network.sightings.turned[[at]], stations),
+            by_shared=np.repeat(network.sightings.by_shared[[at]], stations, axis=0),
+        )
+        for twin, (frame, stop) in starts.items():
+            here = here.renamed(frame, twin, np.arange(stations) >= stop)
+        there = Network(network.tree, network.poses, here, network.common)
+        known = _known(there)
+        if not known.any():
+            continue
+        part = there.subset(known)
+        linear = part.linear(fit.state)
+        white = np.linalg.solve(part.total(linear, fit.noise), linear.residuals[:, :, None])
+        squares = np.sum(linear.residuals * white[:, :, 0], axis=1)
+        at_station = np.flatnonzero(known)
+        near = (squares < chi2_limit(_CHANCE, 6)) & (at_station != row.station)
+        order = np.argsort(squares[near])
+        moving = any(it.robot for group in part.groups for it in group.way)
+        if near.any() and moving:
+            found[at] = at_station[near][order].tolist()
+    return found
+
+
+def _known(network: Network) -> Mask:
+    """(n,) whether every robot in an observation's way has a known pose."""
+    known = np.ones(len(network), dtype=bool)
+    for group in network.groups:
+        for step in group.way:
+            if step.robot:
+                poses = network.poses[step.robot][network.sightings.stops[group.rows]]
+                known[group.rows] &= np.isfinite(poses[:, 0, 0])
+    return known
+
+
+def _mutual(solved: Solved, out: IntArray, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
+    """Pairs of observations of one camera and board, of which each fits the other's stop."""
+    rows, found = solved.cell.rows, {}
+    for a in out.tolist():
+        for b in out.tolist():
+            if a >= b or (rows[a].seer, rows[a].seen) != (rows[b].seer, rows[b].seen):
+                continue
+            if rows[b].station in fitting.get(a, ()) and rows[a].station in fitting.get(b, ()):
+                found[a], found[b] = b, a
+    return found
+
+
+def _exchanged_robots(solved: Solved, mutual: Mapping[int, int]) -> dict[int, str]:
+    """Observations that disagree because two poses of a robot are exchanged, in words."""
+    rows, network = solved.cell.rows, solved.agreed.network
+    ways = {(it.seer, it.seen): network.tree.way(it.seer, it.seen) for it in rows}
+    used = solved.agreed.used
+    found: dict[int, str] = {}
+    for robot in network.robots:
+        mine = [
+            at
+            for at, it in enumerate(rows)
+            if any(step.robot == robot for step in ways[it.seer, it.seen])
+        ]
+        pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
+        for at in mine:
+            if at in mutual:
+                both = sorted((rows[at].station, rows[mutual[at]].station))
+                pairs[both[0], both[1]].append(at)
+        for stations, members in pairs.items():
+            at_both = [at for at in mine if rows[at].station in stations]
+            if len(members) >= 2 * _FEWEST and not used[at_both].any():
+                stops = [solved.cell.stops[it] for it in stations]
+                words = (
+                    f"the poses of robot {robot} at stops {stops[0]} and {stops[1]} are exchanged"
+                )
+                found |= dict.fromkeys(members, words)
+    return found

@@ -1,0 +1,265 @@
+"""The result of aligning a whole cell: every frame of it, with respect to every other."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self, get_args
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.calibration.document import camera_document, read_camera
+from visioncal.calibration.edge import Edge, edge_document, read_array, read_edge
+from visioncal.calibration.frame import present
+from visioncal.calibration.parts import CameraResult, Verdict, VerdictStatus
+from visioncal.errors import DataError
+from visioncal.estimator.networktree import Branch, Step, Tree
+from visioncal.files import did_you_mean, read_bytes, write_atomically
+from visioncal.transforms import adjoint, invert
+from visioncal.types import FloatArray
+from visioncal.version import __version__
+
+SCHEMA = 1
+FILE = "alignment.json"
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What became of one observation. A figure that could not be computed is None.
+
+    Attributes:
+        view: The number of its row.
+        stop: Its stop, or the view's number where the session has none.
+        seer: The frame of the camera or instrument.
+        seen: The frame of the target or point.
+        used: Whether the fit used it.
+        reason: Why it was not used, in words; empty for a used one.
+        residual_mm: How far it is from what the rest of the cell predicts [mm].
+        residual_deg: The same in rotation [deg]; None where a place alone was read.
+    """
+
+    view: int
+    stop: int
+    seer: str
+    seen: str
+    used: bool
+    reason: str = ""
+    residual_mm: float | None = None
+    residual_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A frame that moved while the session was taken.
+
+    Attributes:
+        frame: The frame; its transform in the result is where it stood last.
+        before: Its name in the result until then.
+        last_stop: The last stop at which it was seen where it stood before.
+        first_stop: The first stop at which it stands elsewhere.
+        shift_mm: How far its origin moved [mm].
+        turn_deg: How far it turned [deg].
+        rivals: Frames that may have moved in its place: the session cannot tell.
+    """
+
+    frame: str
+    before: str
+    last_stop: int
+    first_stop: int
+    shift_mm: float
+    turn_deg: float
+    rivals: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Untied:
+    """A frame that nothing ties to the rest, and what would, in a sentence."""
+
+    frame: str
+    remedy: str
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A whole cell in one frame; `save` writes it as alignment.json.
+
+    Attributes:
+        session_name: The session's name.
+        session_sha256: Digest of the session's canonical content.
+        created: When, in ISO 8601.
+        reference: The frame that stands for the cell: the cell's frame is its.
+        frames: What each frame hangs on, by its name.
+        robots: The robot of each flange, by the flange's frame.
+        edges: The estimated transforms by name, as `cell_from_base_b`, in the order of
+            `joint_covariance`.
+        joint_covariance: (6 k, 6 k) covariance of all of them together, in that order.
+        cameras: The cameras by their frames.
+        noise: Estimated standard deviations, by frame or robot and by name.
+        sights: One entry for each observation.
+        moved: What moved while the session was taken.
+        untied: Frames that nothing ties to the rest.
+        weakest: The weakest link, in words.
+        verdict: Whether to trust it.
+        details: Further figures, as they stand on disk.
+    """
+
+    session_name: str
+    session_sha256: str
+    created: str
+    reference: str
+    frames: Mapping[str, str]
+    robots: Mapping[str, str]
+    edges: Mapping[str, Edge]
+    joint_covariance: FloatArray
+    cameras: Mapping[str, CameraResult]
+    noise: Mapping[str, Mapping[str, float]]
+    sights: tuple[Sight, ...]
+    moved: tuple[Moved, ...]
+    untied: tuple[Untied, ...]
+    weakest: str
+    verdict: Verdict
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """The estimated transforms by name."""
+        return {name: edge.transform for name, edge in self.edges.items()}
+
+    def edge_of(self, frame: str) -> Edge:
+        """How a frame hangs on its parent; the reference, exactly in the cell's place."""
+        if frame == self.reference:
+            return Edge(np.eye(4), np.zeros((6, 6)))
+        return self.edges[f"{self.frames[frame]}_from_{frame}"]
+
+    def between(
+        self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
+    ) -> Edge:
+        """Places any frame in any other, with the covariance that the whole cell gives it.
+
+        Args:
+            first: The one.
+            second: The other.
+            poses: (4, 4) `base_from_flange` by robot, where the two move before each other by it;
+                they count as exact.
+
+        Returns:
+            `first_from_second`.
+
+        Raises:
+            DataError: There is no such frame, or a robot's pose is needed.
+        """
+        tree, poses = self._tree, poses or {}
+        for frame in (first, second):
+            if frame != tree.root and frame not in tree.branches:
+                known = [tree.root, *tree.branches]
+                raise DataError(
+                    f"no frame {frame!r}: this alignment has {', '.join(known)}.",
+                    culprits=[frame],
+                    next_step=did_you_mean(frame, known),
+                )
+        way, places = tree.way(first, second), {it: at for at, it in enumerate(self.edges)}
+        rest, slope = np.eye(4), np.zeros((6, 6 * len(places)))
+        for step in reversed(way):
+            edge = self._matrix(step, poses)
+            before = invert(edge) @ rest if step.is_up else edge @ rest
+            moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+            at = places.get(f"{self.frames[step.frame]}_from_{step.frame}")
+            if at is not None:
+                slope[:, 6 * at : 6 * at + 6] += moved
+            rest = before
+        return Edge(rest, slope @ self.joint_covariance @ slope.T)
+
+    @property
+    def _tree(self) -> Tree:
+        return Tree(
+            "cell",
+            {name: Branch(on, self.robots.get(name, "")) for name, on in self.frames.items()},
+        )
+
+    def _matrix(self, step: Step, poses: Mapping[str, FloatArray]) -> FloatArray:
+        if not step.robot:
+            return self.edge_of(step.frame).matrix
+        if step.robot not in poses:
+            raise DataError(
+                f"{step.frame} moves with robot {step.robot!r}: its pose is needed.",
+                culprits=[step.frame],
+                next_step=f'Give poses={{"{step.robot}": base_from_flange}}.',
+            )
+        return np.asarray(poses[step.robot], dtype=float)
+
+    def document(self) -> dict[str, Any]:
+        """Builds the content of alignment.json; what was not computed is absent."""
+        return {
+            "schema": SCHEMA,
+            "visioncal": __version__,
+            "created": self.created,
+            "session": {"name": self.session_name, "sha256": self.session_sha256},
+            "reference": self.reference,
+            "frames": dict(self.frames),
+            "robots": dict(self.robots),
+            "transforms": {name: edge_document(edge) for name, edge in self.edges.items()},
+            "joint_covariance": {
+                "order": list(self.edges),
+                "matrix": self.joint_covariance.tolist(),
+            },
+            "cameras": {name: camera_document(it) for name, it in self.cameras.items()},
+            "noise": {name: dict(it) for name, it in self.noise.items()},
+            "observations": [present(vars(it)) for it in self.sights],
+            "moved": [{**vars(it), "rivals": list(it.rivals)} for it in self.moved],
+            "untied": [vars(it) for it in self.untied],
+            "weakest": self.weakest,
+            "verdict": {"status": self.verdict.status, "reasons": list(self.verdict.reasons)},
+            "details": dict(self.details),
+        }
+
+    def save(self, path: Path | str) -> None:
+        """Writes alignment.json, whole or not at all."""
+        text = json.dumps(self.document(), indent=2, allow_nan=False) + "\n"
+        write_atomically(Path(path), text)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads an alignment.json, or the one in a folder.
+
+        Raises:
+            DataError: The file is missing or is not an alignment of a known schema.
+        """
+        file = Path(path)
+        file = file / FILE if file.is_dir() else file
+        try:
+            return cls(**_fields(json.loads(read_bytes(file))))
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise DataError(f"{file}: not JSON: {error}.", culprits=[str(file)]) from error
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(
+                f"{file}: not an alignment that this version can read: {error!r}.",
+                culprits=[str(file)],
+                next_step="Run visioncal align again.",
+            ) from error
+
+
+def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
+    verdict = document["verdict"]
+    if document["schema"] != SCHEMA:
+        raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
+    if verdict["status"] not in get_args(VerdictStatus):
+        raise ValueError(f"verdict.status is {verdict['status']!r}")
+    return {
+        "session_name": document["session"]["name"],
+        "session_sha256": document["session"]["sha256"],
+        "created": document["created"],
+        "reference": document["reference"],
+        "frames": dict(document["frames"]),
+        "robots": dict(document["robots"]),
+        "edges": {name: read_edge(edge) for name, edge in document["transforms"].items()},
+        "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
+        "cameras": {name: read_camera(it) for name, it in document["cameras"].items()},
+        "noise": {name: dict(it) for name, it in document["noise"].items()},
+        "sights": tuple(Sight(**it) for it in document["observations"]),
+        "moved": tuple(Moved(**{**it, "rivals": tuple(it["rivals"])}) for it in document["moved"]),
+        "untied": tuple(Untied(**it) for it in document["untied"]),
+        "weakest": document["weakest"],
+        "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
+        "details": dict(document["details"]),
+    }
