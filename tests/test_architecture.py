@@ -44,7 +44,7 @@ LAYERS = (
     ("planning", "report", "viewer", "drivers"),
     ("capture",),
     ("rehearsal",),
-    ("verification",),
+    ("verification", "alignment"),
     ("outputs",),
     ("stored", "formats", "exports"),
     ("joining",),

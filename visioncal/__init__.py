@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 from visioncal.version import __version__
 
 if TYPE_CHECKING:
-    from visioncal.calibration import Calibration
+    from visioncal.alignment import align
+    from visioncal.calibration import Alignment, Calibration
     from visioncal.compensation import CalibratedArm, Corrected, correct
     from visioncal.errors import (
         ConvergenceError,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from visioncal.verification import verify
 
 _HOMES = {
+    "Alignment": "visioncal.calibration",
     "CalibratedArm": "visioncal.compensation",
     "Calibration": "visioncal.calibration",
     "Corrected": "visioncal.compensation",
@@ -54,6 +56,7 @@ _HOMES = {
     "Session": "visioncal.session",
     "Sight": "visioncal.frames.sight",
     "VisioncalError": "visioncal.errors",
+    "align": "visioncal.alignment",
     "calibrate": "visioncal.pipeline",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
@@ -64,6 +67,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "Alignment",
     "CalibratedArm",
     "Calibration",
     "ConvergenceError",
@@ -79,6 +83,7 @@ __all__ = [
     "Sight",
     "VisioncalError",
     "__version__",
+    "align",
     "calibrate",
     "correct",
     "locate",

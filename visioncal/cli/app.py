@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from visioncal.cli.align import align_command
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.console import report_error
 from visioncal.cli.convert import convert_command
@@ -43,6 +44,7 @@ app.command("plan")(plan_command)
 app.command("record")(record_command)
 app.command("rehearse")(rehearse_command)
 app.command("calibrate")(calibrate_command)
+app.command("align")(align_command)
 app.command("report")(report_command)
 app.command("verify")(verify_command)
 app.command("diff")(diff_command)

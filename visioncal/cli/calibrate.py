@@ -8,6 +8,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.calibration import to_document
+from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, print_summary, shown_progress
 from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
@@ -51,9 +52,13 @@ def calibrate_command(
 
     Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
     earlier result there are kept in frames.json. Exit status 0: there is a result, with a verdict;
-    2: the input or the motion cannot give one, and an existing folder stays as it was.
+    2: the input or the motion cannot give one, and an existing folder stays as it was. One robot
+    with several cameras is put in one frame, as align does it.
     """
     loaded = Session.load(session)
+    if len(loaded.cameras) > 1 and len(loaded.robots) == 1:
+        align_into(loaded, out, as_json=as_json)
+        return
     left = leftover(out)
     with naming(session), shown_progress(quiet=as_json) as told:
         result = run(loaded, solver=solver, level=level, convention=convention, progress=told)

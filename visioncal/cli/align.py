@@ -1,0 +1,63 @@
+"""`visioncal align`, and what `calibrate` does with one robot and several cameras."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from visioncal.alignment import align
+from visioncal.calibration import Alignment
+from visioncal.calibration.alignment import FILE
+from visioncal.cli.console import messages, print_verdict, shown_progress
+from visioncal.figures import figure
+from visioncal.session import Session
+
+
+def align_command(
+    session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")] = Path("out"),
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print alignment.json to stdout.")
+    ] = False,
+) -> None:
+    """Put a whole cell in one frame: several robots, cameras and boards, adjusted together.
+
+    Writes alignment.json: every frame with its covariance, each robot's and camera's noise, what
+    moved, and every observation that disagrees. Exit status 0: there is a result, with a verdict;
+    2: nothing ties a robot to the rest, or the observations leave a frame open.
+    """
+    align_into(Session.load(session), out, as_json=as_json)
+
+
+def align_into(session: Session, out: Path, *, as_json: bool) -> None:
+    """Aligns a session's cell, writes the result into a folder and tells of it."""
+    with shown_progress(quiet=as_json) as told:
+        result = align(session, progress=told)
+    out.mkdir(parents=True, exist_ok=True)
+    result.save(out / FILE)
+    if as_json:
+        typer.echo(json.dumps(result.document(), indent=2))
+        return
+    _tell(result)
+    messages().print(escape(f"wrote {out / FILE}"))
+
+
+def _tell(result: Alignment) -> None:
+    console = messages()
+    print_verdict(result.verdict, result.session_name)
+    console.print(f"the cell's frame is that of {result.reference}")
+    for name, edge in result.edges.items():
+        x, y, z = 1e3 * edge.transform.translation
+        console.print(
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm and "
+            f"{edge.sigma_deg:.2g} deg"
+        )
+    for name, levels in result.noise.items():
+        words = [f"{figure(value)} {key.rpartition('_')[2]}" for key, value in levels.items()]
+        console.print(f"noise of {name}: {', '.join(words)}")
+    for it in result.sights:
+        if not it.used:
+            console.print(escape(f"  view {it.view} ({it.seer} of {it.seen}): {it.reason}"))
+    console.print(escape(result.weakest))
