@@ -62,6 +62,7 @@ class World:
         return matrix
 
     def tree(self, known=("base_a",)):
+        """The frames, some of them known."""
         branches = {}
         for name, parent in self.parents.items():
             robot = name[-1] if name.startswith("flange_") else ""
@@ -115,6 +116,7 @@ def observed(world, rng, changed=None, noise=1.0):
 
     Args:
         world: The world.
+        rng: Of the noise.
         changed: Edges that differ from the truth at some stops, by frame and stop.
         noise: Share of the usual noise.
     """

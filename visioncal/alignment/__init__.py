@@ -1,5 +1,5 @@
 """Whole cells: several robots, cameras and boards in one frame."""
 
-from visioncal.alignment.align import align
+from visioncal.alignment.run import align
 
 __all__ = ["align"]
