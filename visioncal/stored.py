@@ -4,7 +4,8 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.calibration import Calibration, FrameFile, to_document
+from visioncal.calibration import Alignment, Calibration, FrameFile, to_document
+from visioncal.calibration.alignment import FILE as ALIGNMENT
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import read_bytes
@@ -75,15 +76,40 @@ def load_placed(path: Path) -> Calibration | FrameFile:
     return FrameFile.load(file) if _holds_frames(file) else load_calibration(path)
 
 
+def load_exportable(path: Path) -> Calibration | FrameFile | Alignment:
+    """Loads what `load_placed` does, or the alignment of a whole cell.
+
+    Args:
+        path: As there, or an alignment.json, which its content tells, or a folder with one and no
+            calibration.json.
+
+    Raises:
+        DataError: There is none of them, or it cannot be read.
+    """
+    cell = path.is_dir() and not (path / CALIBRATION).exists() and (path / ALIGNMENT).is_file()
+    return Alignment.load(path) if cell or _holds_cell(path) else load_placed(path)
+
+
 def _holds_frames(path: Path) -> bool:
     """Tells a file of frames by its content: every calibration has transforms."""
+    document = _content(path)
+    return "frames" in document and "transforms" not in document
+
+
+def _holds_cell(path: Path) -> bool:
+    """Tells the alignment of a cell by its content: a calibration has no reference."""
+    return {"reference", "transforms"} <= _content(path).keys()
+
+
+def _content(path: Path) -> dict[str, object]:
+    """The content of a JSON file; empty of what is none."""
     if path.suffix.lower() == ".rrd" or not path.is_file():
-        return False
+        return {}
     try:
         document = json.loads(read_bytes(path))
     except (ValueError, RecursionError):
-        return False
-    return isinstance(document, dict) and "frames" in document and "transforms" not in document
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 def _frames_alone(path: Path) -> DataError:

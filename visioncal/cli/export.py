@@ -11,7 +11,7 @@ from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
 from visioncal.files import check_free, read_text, write_atomically
-from visioncal.stored import load_placed
+from visioncal.stored import load_exportable
 
 
 def _show_formats(wanted: bool) -> None:
@@ -26,7 +26,8 @@ def export_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="An output folder, its calibration.json, a recording (.rrd), or a file of frames."
+            help="An output folder, its calibration.json or alignment.json, a recording (.rrd), or "
+            "a file of frames."
         ),
     ],
     to: Annotated[str, typer.Option("--to", help="The format; --list shows them all.")],
@@ -39,7 +40,7 @@ def export_command(
         typer.Option(
             "--edge",
             help="The transform; where none is named the camera's, the only tool or the only "
-            "fixture, as the format has it.",
+            "fixture, as the format has it. Of an aligned cell any frame from any other, or all.",
         ),
     ] = None,
     inverse: Annotated[bool, typer.Option("--inverse", help="Write the inverse of it.")] = False,
@@ -69,6 +70,10 @@ def export_command(
         str | None,
         typer.Option("--hash", help="ur-kinematics: the hash that ur_calibration extracts."),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option("--camera", help="Which camera of an aligned cell, in a format of lenses."),
+    ] = None,
     onto: Annotated[
         Path | None,
         typer.Option(
@@ -89,9 +94,18 @@ def export_command(
     load = _load(mass_kg, cog_mm)
     kept = None if onto is None else read_text(onto)
     selection = Selection(
-        edge, inverse, parent, child, number, load, convention, calibration_hash, kept
+        edge,
+        inverse,
+        parent,
+        child,
+        number,
+        load,
+        convention,
+        calibration_hash,
+        kept,
+        camera,
     )
-    written = document(load_placed(source), to, selection)
+    written = document(load_exportable(source), to, selection)
     for it in written.warnings:
         messages().print(f"[bold red]warning:[/] {escape(it)}")
     if out is None or out == Path("-"):

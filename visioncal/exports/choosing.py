@@ -28,7 +28,7 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """Picks what is to be exported.
 
     Args:
-        source: A calibration, or frames alone.
+        source: A calibration, frames alone, or an aligned cell.
         selection: What is asked for.
         form: The format that is to hold it.
 
@@ -36,10 +36,42 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
         DataError: There is no such transform, the format cannot hold what is asked for, or a
             frame's name cannot be written safely.
     """
-    there = placements(source)
+    there = placements(source, selection.camera)
     _check_takes(form, selection)
     _check_camera(form, selection, there)
-    name = _named(form, selection, there)
+    return _content(form, selection, there, _named(form, selection, there))
+
+
+def select_all(source: Source, selection: Selection, form: ExportFormat) -> tuple[Content, ...]:
+    """Picks all transforms of an aligned cell, each frame's in that on which it hangs.
+
+    Raises:
+        DataError: It is no such cell, the format holds one transform, or what is asked for is of
+            one.
+    """
+    there = placements(source, selection.camera)
+    _check_takes(form, selection)
+    several = [it.name for it in (form,) if it.write_all is not None]
+    one = [selection.inverse, selection.parent is not None, selection.child is not None]
+    if there.cell is None or not several or any(one):
+        why = (
+            f"{form.name} holds one transform"
+            if not several
+            else "--inverse, --parent and --child are of one transform"
+            if any(one)
+            else f"{there.words} is of no whole cell"
+        )
+        raise DataError(
+            f"--edge all: {why}.",
+            culprits=["--edge"],
+            next_step="Name one with --edge, as base_a_from_base_b."
+            if there.cell is not None
+            else f"Name one of {', '.join(there.by_name)}.",
+        )
+    return tuple(_content(form, selection, there, name) for name in there.by_name)
+
+
+def _content(form: ExportFormat, selection: Selection, there: Placements, name: str) -> Content:
     placed, frames = there.find(name)
     rotation_of = None if placed.oriented else frames[0]
     edge = placed.edge
@@ -63,7 +95,7 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
         child,
         frames,
         there.mount,
-        there.lens,
+        there.lenses.get(frames[1], there.lens) if there.cell is not None else there.lens,
         placed.origin,
         placed.verdict,
         rotation_of,
@@ -79,7 +111,12 @@ def _named(form: ExportFormat, selection: Selection, there: Placements) -> str:
         there.find(name)
         _check_kind(form, form.holds, name, inverse=selection.inverse)
         return name
-    return there.default() if selection.edge is None else selection.edge
+    if selection.edge is not None:
+        return selection.edge
+    if form.holds == "lens" and there.cell is not None:
+        frame = next(it for it, lens in there.lenses.items() if lens is there.lens)
+        return f"{there.cell.frames[frame]}_from_{frame}"
+    return there.default()
 
 
 def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> None:
@@ -135,27 +172,40 @@ def _check_camera(form: ExportFormat, selection: Selection, there: Placements) -
     """Refuses what the formats of the camera do not hold."""
     if form.holds not in ("lens", "hand-eye"):
         return
+    if form.holds == "lens" and there.cell is not None:
+        _check_lens_alone(form, selection)
+        if there.lens is None:
+            known = ", ".join(there.lenses) or "none"
+            raise DataError(
+                f"{form.name} holds one camera; this alignment has {known}.",
+                culprits=[form.name],
+                next_step="Name one with --camera." if there.lenses else "",
+            )
+        return
     if there.mount is None or there.mount == "instrument":
         raise DataError(
             f"{form.name} holds the camera, and {there.words} has none.",
             culprits=[form.name],
             next_step="Name the calibration instead, or choose a format of poses: --to ros.",
         )
-    if form.holds == "lens" and (
-        selection.inverse or selection.edge is not None or selection.parent is not None
-    ):
-        raise DataError(
-            f"{form.name} holds the lens and no transform: --edge, --inverse and --parent do not "
-            "go with it.",
-            culprits=[form.name],
-            next_step="Leave them out; --child names the camera.",
-        )
+    if form.holds == "lens":
+        _check_lens_alone(form, selection)
     hand_eye = selection.edge in (None, *HAND_EYE.values())
     if form.holds == "hand-eye" and (selection.inverse or not hand_eye):
         raise DataError(
             f"{form.name} holds the camera's pose on the flange or in the base, and nothing else.",
             culprits=[form.name],
             next_step="Leave --edge and --inverse out, or choose --to ros.",
+        )
+
+
+def _check_lens_alone(form: ExportFormat, selection: Selection) -> None:
+    if selection.inverse or selection.edge is not None or selection.parent is not None:
+        raise DataError(
+            f"{form.name} holds the lens and no transform: --edge, --inverse and --parent do not "
+            "go with it.",
+            culprits=[form.name],
+            next_step="Leave them out; --child names the camera.",
         )
 
 

@@ -34,6 +34,7 @@ class Selection:
         convention: In which form the joints of an arm are tabulated.
         calibration_hash: The `hash` of a UR's own kinematics.
         onto: The document of the reader's own that is to be written onto.
+        camera: Which camera of an aligned cell is meant, in a format of lenses.
     """
 
     edge: str | None = None
@@ -45,6 +46,7 @@ class Selection:
     convention: str | None = None
     calibration_hash: str | None = None
     onto: str | None = None
+    camera: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

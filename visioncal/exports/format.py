@@ -1,6 +1,6 @@
 """What a format is."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -29,6 +29,7 @@ class ExportFormat:
         frames: What its readers call our frames; ours keep their names where it says nothing.
         takes: What it can be told beside.
         counterpart: The maker's format of fixtures, for one of tools; and the other way round.
+        write_all: Builds the document of all transforms of a cell; None where it holds one.
         warn: Words what the user must still do before the document serves; empty for nothing.
     """
 
@@ -39,4 +40,5 @@ class ExportFormat:
     frames: Mapping[str, str] = field(default_factory=dict)
     takes: frozenset[Takes] = frozenset()
     counterpart: str = ""
+    write_all: Callable[[Sequence[Content]], str] | None = None
     warn: Callable[[Content], str] = _nothing_amiss

@@ -1,5 +1,7 @@
 """A transform for ROS 2 as a launch file that publishes it."""
 
+from collections.abc import Sequence
+
 from visioncal.conventions import POSE_FORMS, write_pose
 from visioncal.exports.content import Content
 from visioncal.exports.format import ExportFormat
@@ -13,8 +15,20 @@ _NUMBERS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 # session's name must not choose.
 
 
-def _program(content: Content) -> str:
+def _program(contents: Sequence[Content]) -> str:
     """Writes the program of a launch file (tf2_ros, static_transform_publisher's named options)."""
+    nodes = "".join(map(_node, contents))
+    return (
+        "from launch import LaunchDescription\n"
+        "from launch_ros.actions import Node\n"
+        "\n\n"
+        "def generate_launch_description() -> LaunchDescription:\n"
+        f"    nodes = [\n{nodes}    ]\n"
+        "    return LaunchDescription(nodes)\n"
+    )
+
+
+def _node(content: Content) -> str:
     pose = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
     options = {"--frame-id": content.parent, "--child-frame-id": content.child} | {
         option: repr(number) for option, number in zip(_NUMBERS, pose, strict=True)
@@ -25,25 +39,24 @@ def _program(content: Content) -> str:
         for option, value in options.items()
     )
     return (
-        "from launch import LaunchDescription\n"
-        "from launch_ros.actions import Node\n"
-        "\n\n"
-        "def generate_launch_description() -> LaunchDescription:\n"
-        "    nodes = [\n"
         "        Node(\n"
         '            package="tf2_ros",\n'
         '            executable="static_transform_publisher",\n'
         '            output="log",\n'
         f"            arguments=[\n{arguments}            ],\n"
         "        ),\n"
-        "    ]\n"
-        "    return LaunchDescription(nodes)\n"
     )
 
 
 def _write_launch(content: Content) -> str:
     first = f'"""Publishes where {content.child} is in {content.parent}."""\n\n'
-    return first + comments("#", ros_notes(content)) + _program(content)
+    return first + comments("#", ros_notes(content)) + _program([content])
+
+
+def _write_launches(contents: Sequence[Content]) -> str:
+    first = '"""Publishes where all frames of a cell are."""\n\n'
+    notes = [note for it in contents for note in it.notes[1:]]
+    return first + comments("#", [contents[0].origin, *notes]) + _program(contents)
 
 
 def _write_moveit(content: Content) -> str:
@@ -55,7 +68,7 @@ def _write_moveit(content: Content) -> str:
     """
     mount = "" if content.mount is None else f"{content.mount.upper()}: "
     first = f'""" {mount}{content.parent} -> {content.child} """\n'
-    return first + comments("#", ros_notes(content)) + _program(content)
+    return first + comments("#", ros_notes(content)) + _program([content])
 
 
 ROS_LAUNCH = ExportFormat(
@@ -63,6 +76,7 @@ ROS_LAUNCH = ExportFormat(
     "a ROS 2 launch file with a static_transform_publisher [m, quaternion]",
     _write_launch,
     frames=ROS_FRAMES,
+    write_all=_write_launches,
 )
 MOVEIT = ExportFormat(
     "moveit",

@@ -1,5 +1,7 @@
 """A transform as a 4x4 matrix: plain text, OpenCV's storage, Zivid's file."""
 
+from collections.abc import Sequence
+
 import cv2
 
 from visioncal.camera import matrix_3x3
@@ -14,6 +16,10 @@ def _write_text(content: Content) -> str:
     lines = [" ".join(map(repr, row)) for row in rows(content.matrix)]
     notes = comments("#", content.notes)
     return notes + "\n".join(lines) + "\n"
+
+
+def _write_texts(contents: Sequence[Content]) -> str:
+    return "".join(map(_write_text, contents))
 
 
 def _write_opencv(content: Content) -> str:
@@ -51,7 +57,12 @@ def _write_zivid(content: Content) -> str:
     return version + yaml_text({"FloatMatrix": {"Data": rows(matrix_mm)}}, short_lists=True)
 
 
-TEXT = ExportFormat("text", "the 4x4 matrix as text, as numpy.loadtxt reads it [m]", _write_text)
+TEXT = ExportFormat(
+    "text",
+    "the 4x4 matrix as text, as numpy.loadtxt reads it [m]",
+    _write_text,
+    write_all=_write_texts,
+)
 OPENCV = ExportFormat(
     "opencv",
     "OpenCV's FileStorage: transform, R, t and any lens [m]",

@@ -6,7 +6,7 @@ from visioncal.calibration import Verdict
 from visioncal.errors import DataError
 from visioncal.exports.arm import ArmFormat, select_arm
 from visioncal.exports.armfiles import ARMS
-from visioncal.exports.choosing import select
+from visioncal.exports.choosing import select, select_all
 from visioncal.exports.content import Selection
 from visioncal.exports.controllers import CONTROLLERS
 from visioncal.exports.format import ExportFormat
@@ -39,6 +39,8 @@ EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ARMS,
 )
 _EVERYTHING = Selection()
+# In the place of a transform's name: all of a cell's.
+_ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def export(source: Source, to: str, selection: Selection = _EVERYTHING) -> str:
     """Writes a result in somebody else's format.
 
     Args:
-        source: A calibration, or frames alone.
+        source: A calibration, frames alone, or an aligned cell.
         to: The name of a format among `EXPORT_FORMATS`.
         selection: Which transform, in which direction, and what its frames are to be called; of
             an arm, in which form.
@@ -84,6 +86,10 @@ def document(source: Source, to: str, selection: Selection = _EVERYTHING) -> Doc
         arm = select_arm(source, selection, form)
         omitted = tuple(f"{it}." for it in arm.omitted)
         return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm), *omitted))
+    if selection.edge == _ALL:
+        contents = select_all(source, selection, form)
+        written = "" if form.write_all is None else form.write_all(contents)
+        return Document(written, _of_verdict(contents[0].verdict))
     content = select(source, selection, form)
     warning = form.warn(content)
     return Document(

@@ -1,5 +1,7 @@
 """A transform for ROS as YAML: the fields of a message, and a calibration of easy_handeye2."""
 
+from collections.abc import Sequence
+
 from visioncal.conventions import POSE_FORMS, write_pose
 from visioncal.exports.content import Content
 from visioncal.exports.format import ExportFormat
@@ -52,11 +54,17 @@ def _write_easy_handeye2(content: Content) -> str:
     return comments("#", [*ros_notes(content), use]) + yaml_text(document)
 
 
+def _write_transforms(contents: Sequence[Content]) -> str:
+    """Writes a document of YAML for each transform."""
+    return "---\n".join(map(_write_transform, contents))
+
+
 ROS = ExportFormat(
     "ros",
     "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
     _write_transform,
     frames=ROS_FRAMES,
+    write_all=_write_transforms,
 )
 EASY_HANDEYE2 = ExportFormat(
     "easy-handeye2",

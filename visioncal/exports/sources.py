@@ -1,16 +1,24 @@
-"""What there is to export: a calibration's transforms with its frames, or frames alone."""
+"""What there is to export: a calibration's transforms with its frames, frames alone, or a cell."""
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from visioncal.calibration import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
+from visioncal.calibration import (
+    Alignment,
+    Calibration,
+    CameraResult,
+    Edge,
+    Frame,
+    FrameFile,
+    Verdict,
+)
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean
 from visioncal.types import Mount
 
-Source: TypeAlias = Calibration | FrameFile
+Source: TypeAlias = Calibration | FrameFile | Alignment
 Kind: TypeAlias = Literal["tool", "fixture"]
 
 # The camera's or the instrument's transform.
@@ -54,6 +62,8 @@ class Placements:
         words: What the source is, for messages.
         mount: How the camera is mounted; None where there is no calibration.
         lens: The camera, where there is one.
+        cell: The whole cell that was aligned: it places any of its frames in any other.
+        lenses: Its cameras by frame.
     """
 
     by_name: Mapping[str, Placement]
@@ -61,16 +71,20 @@ class Placements:
     words: str
     mount: Mount | None
     lens: CameraResult | None
+    cell: Alignment | None = None
+    lenses: Mapping[str, CameraResult] = field(default_factory=dict)
 
     def find(self, name: str) -> tuple[Placement, tuple[str, str]]:
         """Finds a transform by its name, with our names of its parent and child.
 
         Raises:
-            DataError: There is none.
+            DataError: There is none, or a robot's pose would be needed.
         """
         ends = ends_of(name)
         if name in self.by_name and all(ends):
             return self.by_name[name], ends
+        if self.cell is not None and all(ends):
+            return _of_cell(self.cell, self.cell.between(*ends)), ends
         turned = f"{ends[1]}_from_{ends[0]}"
         hint = did_you_mean(name, self.by_name)
         if turned in self.by_name:
@@ -91,6 +105,14 @@ class Placements:
             return HAND_EYE[self.mount]
         if len(self.frames) == 1:
             return self.frames[0]
+        if self.cell is not None:
+            known = list(self.cell.frames)
+            raise DataError(
+                f"{self.words.capitalize()} has {', '.join(known)}: which is meant is not said.",
+                culprits=["--edge"],
+                next_step=f"Name two of them, as --edge {self.cell.reference}_from_{known[-1]}; "
+                "or all: --edge all.",
+            )
         raise DataError(
             f"{self.words.capitalize()} has {', '.join(self.frames) or 'no frames'}: which one is "
             "meant is not said.",
@@ -132,8 +154,24 @@ def is_kind(name: str, kind: Kind) -> bool:
     return _PARENTS[kind].fullmatch(ends_of(name)[0]) is not None
 
 
-def placements(source: Source) -> Placements:
-    """Lists what a source has."""
+def placements(source: Source, camera: str | None = None) -> Placements:
+    """Lists what a source has.
+
+    Args:
+        source: A calibration, frames alone, or an aligned cell.
+        camera: Which of the cell's cameras is meant: its name or its frame.
+
+    Raises:
+        DataError: There is no such camera, or the source is of one camera.
+    """
+    if isinstance(source, Alignment):
+        return _of_alignment(source, camera)
+    if camera is not None:
+        raise DataError(
+            "Which camera is meant is said of a whole cell alone, and this is none.",
+            culprits=["--camera"],
+            next_step="Leave it out.",
+        )
     frames = {name: _of_frame(it) for name, it in source.frames.items()}
     if isinstance(source, FrameFile):
         return Placements(frames, tuple(frames), "this file of frames", None, None)
@@ -145,6 +183,39 @@ def placements(source: Source) -> Placements:
     return Placements(
         {**edges, **frames}, tuple(frames), "this calibration", source.mount, source.camera
     )
+
+
+def _of_alignment(cell: Alignment, camera: str | None) -> Placements:
+    # The reference and the cell are one frame: without it, the tree would be in two.
+    placed = {
+        f"{on}_from_{it}": cell.edge_of(it)
+        for it, on in cell.frames.items()
+        if it not in cell.robots
+    }
+    edges = {name: _of_cell(cell, edge) for name, edge in placed.items()}
+    lens = None
+    if camera is not None or len(cell.cameras) == 1:
+        lens = cell.cameras[_camera(cell, camera)]
+    return Placements(edges, (), "this alignment", None, lens, cell, cell.cameras)
+
+
+def _camera(cell: Alignment, camera: str | None) -> str:
+    known = list(cell.cameras)
+    if camera is None:
+        return known[0]
+    for frame in (camera, f"cam_{camera}"):
+        if frame in cell.cameras:
+            return frame
+    raise DataError(
+        f"There is no camera {camera!r}; this alignment has {', '.join(known) or 'none'}.",
+        culprits=["--camera"],
+        next_step=did_you_mean(camera, known),
+    )
+
+
+def _of_cell(cell: Alignment, edge: Edge) -> Placement:
+    origin = f"aligned by visioncal from {cell.session_name!r}, {cell.created}"
+    return Placement(edge, origin, cell.verdict)
 
 
 def _of_frame(frame: Frame) -> Placement:
