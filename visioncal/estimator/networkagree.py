@@ -20,7 +20,14 @@ from visioncal.estimator.networkfit import (
     starting_noise,
     surprises,
 )
-from visioncal.estimator.networkmoves import Move, gross_move, moved_network, slight_move
+from visioncal.estimator.networkmoves import (
+    Move,
+    gross_move,
+    moved_network,
+    needless_move,
+    slight_move,
+    unmoved,
+)
 from visioncal.types import FloatArray, Mask
 
 # A sound observation is lost in one session of a thousand.
@@ -77,7 +84,17 @@ def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
         used |= network.sightings.involves(move.twin)
         used &= _beyond(network, used, fit) < 1.0
         used, fit = _widened(network, used, fit)
-    return _agreed(network, *_widened(network, used, fit), moves)
+    used, fit = _widened(network, used, fit)
+    return _without_needless(_agreed(network, used, fit, moves))
+
+
+def _without_needless(found: Agreed) -> Agreed:
+    """Takes moves back that are none, now that all is fitted together."""
+    network, fit, used, moves = found.network, found.fit, found.used, list(found.moves)
+    while (move := needless_move(network.subset(used), fit, moves)) is not None:
+        network, fit, moves = unmoved(network, fit, moves, move)
+        used, fit = _widened(network, used, fit)
+    return found if len(moves) == len(found.moves) else _agreed(network, used, fit, moves)
 
 
 def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
@@ -92,7 +109,7 @@ def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
         movable = (*movable, slight.twin)
         moves.append(slight)
         used, fit = _settled(network, *_widened(network, used, fit))
-    return _agreed(network, used, fit, moves)
+    return _without_needless(_agreed(network, used, fit, moves))
 
 
 def _agreed(network: Network, used: Mask, fit: NetworkFit, moves: Sequence[Move]) -> Agreed:

@@ -12,9 +12,9 @@ import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.linalg import covariance, spectrum
-from visioncal.estimator.network import Network
+from visioncal.estimator.network import Network, State
 from visioncal.estimator.networkfit import NetworkFit, equations_by_stop, normal_equations
-from visioncal.transforms import exp, invert, log
+from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 
 # A move must explain so many observations, of so many stops, more than they are explained now.
@@ -59,6 +59,51 @@ def moved_network(network: Network, move: Move) -> Network:
         tree=network.tree.with_twin(move.frame, move.twin),
         sightings=network.sightings.renamed(move.frame, move.twin, rows),
     )
+
+
+def needless_move(network: Network, fit: NetworkFit, moves: Sequence[Move]) -> Move | None:
+    """The least significant move whose two places are one, up to noise; None where none is.
+
+    Args:
+        network: The observations that agree.
+        fit: The unknowns and the noise.
+        moves: What is thought to have moved.
+    """
+    if not moves:
+        return None
+    known = covariance(normal_equations(network, fit.state, fit.noise)[0])
+    found = []
+    for move in moves:
+        first, second = (network.unknown[it] for it in (move.frame, move.twin))
+        between = invert(fit.state.edges[first]) @ fit.state.edges[second]
+        slope = np.zeros((6, len(known)))
+        slope[:, 6 * first : 6 * first + 6] = -adjoint(invert(between))
+        slope[:, 6 * second : 6 * second + 6] = np.eye(6)
+        away = log(between)
+        found.append((float(away @ np.linalg.solve(slope @ known @ slope.T, away)), move))
+    squared, move = min(found, key=lambda it: it[0])
+    stops = len(np.unique(network.sightings.stops))
+    return move if squared < _move_limit(network, len(network.unknown) * stops) else None
+
+
+def unmoved(
+    network: Network, fit: NetworkFit, moves: Sequence[Move], move: Move
+) -> tuple[Network, NetworkFit, list[Move]]:
+    """The network without a move, its two places being one; what moved later stays."""
+    at = network.unknown[move.twin]
+    everywhere = np.ones(len(network), dtype=bool)
+    joined = replace(
+        network,
+        tree=network.tree.without([move.twin]),
+        sightings=network.sightings.renamed(move.twin, move.frame, everywhere),
+    )
+    state = State(np.delete(fit.state.edges, at, axis=0), fit.state.shared)
+    rest = [
+        replace(it, frame=move.frame if it.frame == move.twin else it.frame)
+        for it in moves
+        if it is not move
+    ]
+    return joined, replace(fit, state=state), rest
 
 
 def twin_name(network: Network, frame: str) -> str:

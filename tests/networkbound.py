@@ -1,0 +1,150 @@
+"""The Cramer-Rao bound of a simulated cell of several robots, by code of its own.
+
+Unknown are where every frame hangs but one base, each flange's error at every stop (with its
+variance as a prior), every board's size (likewise), and each lens that the session does not state.
+Derivatives are central differences of the simulation's projection, which shares nothing with the
+application's.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.session import frame_name
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.network import Network, Sight, camera_named, sheet_named
+from visioncal.simulation.optics import project
+from visioncal.transforms import exp, invert
+from visioncal.types import FloatArray
+
+# Small enough for central differences to be exact to 1e-8, large enough for rounding.
+_STEP = 1e-5
+# Focal lengths and centres count in thousands of pixels, so that one step suits all.
+_THOUSAND = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """The least covariance of the frames, by names that hang in their places.
+
+    Attributes:
+        frames: The frames, six unknowns each.
+        covariance: (6 f, 6 f) of (rotation, translation) right perturbations.
+    """
+
+    frames: tuple[str, ...]
+    covariance: FloatArray
+
+    def of(self, frame: str) -> FloatArray:
+        """(6, 6) of one frame."""
+        at = 6 * self.frames.index(frame)
+        return self.covariance[at : at + 6, at : at + 6]
+
+
+def network_bound(cell: Network, reference: str = "base_a") -> Bound:
+    """Computes the bound; `reference` stands for the cell."""
+    frames = tuple(it for it in cell.transforms if it != reference)
+    places = {name: slice(6 * at, 6 * at + 6) for at, name in enumerate(frames)}
+    size = 6 * len(frames)
+    for board in cell.options.boards:
+        places[f"size {board.name}"] = slice(size, size + 1)
+        size += 1
+    for camera in cell.options.cameras:
+        if not camera.state_intrinsics:
+            count = 4 + len(camera.camera.distortion)
+            places[f"lens {camera.name}"] = slice(size, size + count)
+            size += count
+    information = np.zeros((size, size))
+    for board in cell.options.boards:
+        at = places[f"size {board.name}"].start
+        target = board.target
+        information[at, at] = (target.square_m / target.square_sigma_m) ** 2
+    robots = [it.name for it in cell.options.robots]
+    sigmas = np.concatenate(
+        [np.repeat([it.sigma_rad, it.sigma_m], 3) for it in cell.options.robots]
+    )
+    for stop in range(-1, cell.options.stops):
+        between = np.zeros((len(sigmas), size))
+        own = np.diag(sigmas**-2.0)
+        for sight in (it for it in cell.sights if it.stop == stop):
+            slopes, slack = _slopes(cell, sight, places, robots, size)
+            information += slopes.T @ slopes
+            between += slack.T @ slopes
+            own += slack.T @ slack
+        information -= between.T @ np.linalg.solve(own, between)
+    scale = 1.0 / np.sqrt(np.diag(information))
+    spread = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    return Bound(frames, spread[: 6 * len(frames), : 6 * len(frames)])
+
+
+def _slopes(
+    cell: Network, sight: Sight, places: Mapping[str, slice], robots: list[str], size: int
+) -> tuple[FloatArray, FloatArray]:
+    """How one sight's pixels move with the unknowns and the flanges, in units of their noise."""
+    camera, board = frame_name("camera", sight.camera), frame_name("target", sight.board)
+    keys = [camera, board, f"size {sight.board}", f"lens {sight.camera}"]
+    carriers = [cell.teller(camera), cell.teller(board)]
+    keys += [frame_name("base", it) for it in carriers if it is not None]
+    keys = [it for it in keys if it in places]
+    if sight.stop < 0:
+        # Of its lens alone: the board was anywhere.
+        keys = [it for it in keys if it.startswith(("size", "lens"))]
+    slopes, slack = np.zeros((2 * len(sight.exact.ids), size)), []
+    for key in keys:
+        width = places[key].stop - places[key].start
+        slopes[:, places[key]] = _differences(cell, sight, key, width)
+    for robot in robots:
+        mine = robot in carriers and sight.stop >= 0
+        slack.append(
+            _differences(cell, sight, f"flange {robot}", 6) if mine else np.zeros((len(slopes), 6))
+        )
+    every = np.concatenate([slopes, *slack], axis=1) / cell.options.pixel_sigma_px
+    if sight.stop < 0:
+        free = _differences(cell, sight, "pose", 6) / cell.options.pixel_sigma_px
+        every = every - free @ np.linalg.lstsq(free, every, rcond=None)[0]
+    return every[:, :size], every[:, size:]
+
+
+def _differences(cell: Network, sight: Sight, key: str, width: int) -> FloatArray:
+    steps = _STEP * np.eye(width)
+    return np.stack(
+        [
+            (_pixels(cell, sight, key, it) - _pixels(cell, sight, key, -it)) / (2 * _STEP)
+            for it in steps
+        ],
+        axis=1,
+    )
+
+
+def _pixels(cell: Network, sight: Sight, key: str, change: FloatArray) -> FloatArray:
+    """Flat pixels of a sight when one thing changes."""
+    camera = camera_named(cell.options, sight.camera).camera
+    sheet = sheet_named(cell.options, sight.board)
+    kind, _, name = key.partition(" ")
+    if kind == "lens" and name == sight.camera:
+        matrix = camera.matrix + _THOUSAND * change[:4]
+        camera = replace(camera, matrix=matrix, distortion=camera.distortion + change[4:])
+    scale = 1.0 + (float(change[0]) if kind == "size" else 0.0)
+    points = scale * corners_m(sheet)[sight.exact.ids]
+    if sight.stop < 0:
+        pose = sight.cam_from_target @ (exp(change) if kind == "pose" else np.eye(4))
+    else:
+        frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
+        pose = invert(_place(cell, sight.stop, frames[0], key, change)) @ _place(
+            cell, sight.stop, frames[1], key, change
+        )
+    return project(camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
+
+
+def _place(cell: Network, stop: int, frame: str, key: str, change: FloatArray) -> FloatArray:
+    """(4, 4) `cell_from_frame` when one thing changes."""
+    place = cell.transforms[frame] @ (exp(change) if key == frame else np.eye(4))
+    robot = cell.teller(frame)
+    if robot is None:
+        return place
+    base = frame_name("base", robot)
+    flange = cell.true_base_from_flange[robot][stop]
+    if key == f"flange {robot}":
+        flange = flange @ exp(change)
+    return cell.transforms[base] @ (exp(change) if key == base else np.eye(4)) @ flange @ place
