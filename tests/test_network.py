@@ -239,3 +239,18 @@ def test_wrong_images_are_left_out_and_nothing_else():
     found = settle(agree(network, started(network), MOVABLE), MOVABLE)
     assert np.flatnonzero(~found.used).tolist() == wrong
     assert not found.moves
+
+
+def test_a_camera_on_one_arm_and_a_board_on_the_other_tie_both_bases():
+    rng = np.random.default_rng(12)
+    cell = world(rng, 25)
+    parents = {it: on for it, on in cell.parents.items() if it[:3] not in ("cam", "tar")}
+    parents |= {"cam_a": "flange_a", "target_b": "flange_b"}
+    truth = {**cell.truth, "cam_a": cell.truth["target_a"]}
+    pairs = [("cam_a", "target_b", stop) for stop in range(25)]
+    cell = replace(cell, parents=parents, truth=truth, pairs=pairs)
+    network = observed(cell, rng)
+    fit = fit_network(network, started(network))
+    off = away(cell, network, fit.state).reshape(-1, 2, 3)
+    # Twenty-five views of 0.1 mm and 0.3 mrad over levers of a metre.
+    assert np.abs(off[:, 1]).max() < 1e-3

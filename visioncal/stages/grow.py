@@ -8,14 +8,15 @@ a board is tried every way round, and all views together tell which it was.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 
-from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.networktree import Step, Tree
 from visioncal.stages.choose import CLEAR_RATIO, Candidates
-from visioncal.transforms import invert, mean_transform, rotation_angle
+from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
+from visioncal.stages.twoarms import between_arms
+from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray
 
 # The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
@@ -165,7 +166,9 @@ def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
     placed |= {name: np.eye(4) for name, branch in tree.branches.items() if branch.robot}
     by_turn: list[str] = []
     counts: list[int] = []
-    while options := [*_related(growth, placed)] or [*_implied(growth, placed)]:
+    while options := (
+        [*_related(growth, placed)] or [*_implied(growth, placed)] or [*_parted(growth, placed)]
+    ):
         # What a turned board places comes last: others may come by a way that is certain.
         name, matrices, _ = min(options, key=lambda it: (len(it[1]), it[2]))
         at = 0
@@ -210,6 +213,44 @@ def _implied(
         yield it.frame, np.array([matrix for matrix, _ in found]), found[0][1]
 
 
+def _parted(
+    growth: Growth, placed: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, FloatArray, float]]:
+    """Frames that are one of two that robots part, of all that some views have to do with.
+
+    Views say `before * u * between * v * after = seen`, u and v being unknown: a hand-eye
+    calibration with `between^-1` for its robot. Where three are unknown, two arms part them.
+    """
+    for pair in growth.pairs:
+        rows = growth.sighted.early(pair.rows)
+        factors = _factors(growth, pair, rows)
+        open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
+        if len(rows) < FEWEST or len(open_ones) not in (2, 3):
+            continue
+        parts = [
+            _product(factors[begin + 1 : end], placed)
+            for begin, end in pairwise([-1, *open_ones, len(factors)])
+        ]
+        candidates, turns = some(growth.sighted.candidates, rows), growth.sighted.turns[rows]
+        poses = invert(parts[0])[:, None] @ candidates.poses @ invert(parts[-1])[:, None]
+        there = Candidates(poses, candidates.valid)
+        if len(open_ones) == 2:
+            found = hand_eye(invert(parts[1]), there, turns, "eye-in-hand")
+            if found is not None:
+                (u_inverse, v), (sigma_u, sigma_v) = found
+                yield _as_placed(factors[open_ones[0]], invert(u_inverse), sigma_u)
+                yield _as_placed(factors[open_ones[1]], v, sigma_v)
+        elif (middle := between_arms(parts[1], parts[2], there, turns)) is not None:
+            yield _as_placed(factors[open_ones[1]], *middle)
+
+
+def _as_placed(
+    factor: "_Factor", matrix: FloatArray, sigma_m: float
+) -> tuple[str, FloatArray, float]:
+    there = invert(matrix) if factor.is_inverse else matrix
+    return factor.frame, there[None], sigma_m
+
+
 @dataclass(frozen=True, eq=False)
 class _Factor:
     """A part of a chain: where a frame is in its body, or a robot's poses (m, 4, 4)."""
@@ -251,36 +292,3 @@ def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
             distances = distances_from(predicted, some(growth.sighted.candidates, rows))
             away.append(np.minimum(distances.min(axis=1), _FAR_M))
     return float(np.concatenate(away).mean()) if away else 0.0
-
-
-def some(candidates: Candidates, rows: IntArray) -> Candidates:
-    """The candidates of some observations."""
-    return Candidates(candidates.poses[rows], candidates.valid[rows])
-
-
-def distances_from(predicted: FloatArray, candidates: Candidates) -> FloatArray:
-    """Distances (n, c) [m] of candidates from (n, 4, 4) predictions, rotations on a lever."""
-    between = invert(predicted)[:, None] @ candidates.poses
-    away = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
-    return np.asarray(np.where(candidates.valid, away, np.inf))
-
-
-def consensus(candidates: Candidates, turns: IntArray, turn: int = 0) -> tuple[FloatArray, float]:
-    """The transform that most of m views agree on, and what it is known to [m].
-
-    Args:
-        candidates: What each view allows.
-        turns: (m, c) which turn of the target each candidate has applied.
-        turn: By which turn the target is taken to be other than the view has it that agrees best.
-    """
-    half, least, best = len(turns) // 2 + 1, np.inf, (0, 0)
-    for view, pose in np.argwhere(candidates.valid & (turns == 0)).tolist():
-        away = distances_from(candidates.poses[view, pose][None], candidates)
-        trimmed = float(np.sort(away.min(axis=1))[:half].sum())
-        if trimmed < least:
-            least, best = trimmed, (view, pose)
-    # Candidates come in blocks of all turns.
-    away = distances_from(candidates.poses[best[0], best[1] + turn][None], candidates)
-    nearest = np.argsort(away.min(axis=1))[:half]
-    picked = candidates.poses[nearest, away[nearest].argmin(axis=1)]
-    return mean_transform(picked), least / half / np.sqrt(half)

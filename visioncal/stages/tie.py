@@ -8,37 +8,14 @@ found the best transforms are taken first (Prim 1957), until every frame hangs o
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
-from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
-from visioncal.estimator.linalg import covariance, spectrum
 from visioncal.estimator.networktree import Tree
-from visioncal.solvers import SOLVERS
-from visioncal.stages.choose import Candidates, distances_to
-from visioncal.stages.grow import (
-    Growth,
-    Pair,
-    Relation,
-    Sighted,
-    consensus,
-    distances_from,
-    grow,
-    some,
-)
+from visioncal.stages.grow import Growth, Pair, Relation, Sighted, grow
+from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray, Mount
-
-# Triples of views to start a hand-eye calibration from, and how many are followed up.
-_TRIPLES, _REFINED, _ROUNDS = 40, 4, 6
-_FEWEST = 3
-# Below this scaled eigenvalue ratio the motion leaves a direction open; an edge that is known worse
-# than this [m, with rotations on a lever] is no start.
-_NULL_RATIO, _WORST_M = 1e-8, 0.1
-# Noise by which pairs are weighed against each other [rad, m].
-_USUAL = Noise(5e-4, 5e-4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,76 +87,17 @@ def _solved(
         matrix, sigma_m = consensus(some(sighted.candidates, rows), sighted.turns[rows])
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, turns)
         return
-    if len(pair.robots) > 1 or len(rows) < _FEWEST:
+    if len(pair.robots) > 1 or len(rows) < FEWEST:
         return
     (step,) = pair.robots
     flange, base = step.frame, tree.branches[step.frame].parent
     robot = poses[step.robot][sighted.stops[rows]]
     mount: Mount = "eye-in-hand" if step.is_up else "eye-to-hand"
     robot = robot if step.is_up else invert(robot)
-    found = _hand_eye(robot, some(sighted.candidates, rows), sighted.turns[rows], mount)
+    found = hand_eye(robot, some(sighted.candidates, rows), sighted.turns[rows], mount)
     if found is None:
         return
     (x, z), (sigma_x, sigma_z) = found
     near, far = (flange, base) if step.is_up else (base, flange)
     yield Relation(near, pair.seer, x, sigma_x, np.eye(4)[None])
     yield Relation(far, pair.seen, z, sigma_z, turns)
-
-
-def _hand_eye(
-    robot: FloatArray, candidates: Candidates, turns: IntArray, mount: Mount
-) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]] | None:
-    """Both edges by a consensus of m views, and what each is known to [m]; None where open."""
-    half = len(robot) // 2 + 1
-    found = []
-    for rows, picks in _starts(candidates, turns):
-        away = distances_to(robot, candidates, *_park(robot[rows], candidates.poses[rows, picks]))
-        found.append((_trimmed(away, half), away))
-    found.sort(key=lambda it: it[0])
-    settled = [_concentrated(robot, candidates, away, half) for _, away in found[:_REFINED]]
-    _, chosen, picks, edges = min(settled, key=lambda it: it[0])
-    picked = candidates.poses[chosen, picks[chosen]]
-    data = Closure(mount, robot[chosen], picked, np.zeros((len(chosen), 6, 6)))
-    information = closure_information(data, Edges(*edges, np.zeros(0)), _USUAL)
-    if spectrum(information).ratio < _NULL_RATIO:
-        return None
-    spread = covariance(information)
-    variances = np.diag(spread).reshape(4, 3).sum(axis=1)
-    x, z = np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])
-    return None if max(x, z) > _WORST_M else (edges, (float(x), float(z)))
-
-
-def _trimmed(away: FloatArray, half: int) -> float:
-    return float(np.sort(away.min(axis=1))[:half].sum())
-
-
-def _park(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
-    solution = SOLVERS["park"](robot, camera)
-    return solution.x, solution.z
-
-
-def _starts(candidates: Candidates, turns: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Rows and picks to solve from: all views' best by image, then triples of views."""
-    yield np.arange(len(turns)), np.zeros(len(turns), dtype=np.int64)
-    rng = np.random.default_rng(0)
-    counts = candidates.valid.sum(axis=1)
-    likely = 1.0 / counts**2
-    for _ in range(_TRIPLES):
-        triple = rng.choice(len(turns), _FEWEST, replace=False, p=likely / likely.sum())
-        options = [list(range(counts[at])) for at in triple]
-        # A turn of the target in all views alike is a change of its frame, and no other solution.
-        options[0] = [at for at in options[0] if turns[triple[0], at] == 0]
-        for picks in product(*options):
-            yield triple, np.array(picks)
-
-
-def _concentrated(
-    robot: FloatArray, candidates: Candidates, away: FloatArray, half: int
-) -> tuple[float, IntArray, IntArray, tuple[FloatArray, FloatArray]]:
-    """Solves from the nearest half, again and again (Rousseeuw and Van Driessen 1999)."""
-    for _ in range(_ROUNDS):
-        picks = away.argmin(axis=1)
-        chosen = np.sort(np.argsort(away.min(axis=1))[:half])
-        edges = _park(robot[chosen], candidates.poses[chosen, picks[chosen]])
-        away = distances_to(robot, candidates, *edges)
-    return _trimmed(away, half), chosen, away.argmin(axis=1), edges
