@@ -58,8 +58,18 @@ def versions(solved: Solved) -> dict[str, Version]:
 
 
 def _last_seen(solved: Solved, twin: str) -> int:
+    """The last stop at which a frame was seen before it moved."""
     move = next(it for it in solved.agreed.moves if it.twin == twin)
-    return solved.cell.stops[move.before] if move.before >= 0 else solved.cell.stops[move.stop]
+    return _stops_of(solved, move.frame)[-1]
+
+
+def _stops_of(solved: Solved, key: str) -> list[int]:
+    """The stops at which a frame, as the network knows it, is in what is used; in order of time."""
+    network = solved.agreed.network
+    rows = network.sightings.involves(key)
+    some = rows & solved.agreed.used
+    stations = network.sightings.stops[some if some.any() else rows]
+    return [solved.cell.stops[it] for it in np.unique(stations).tolist()]
 
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
@@ -79,7 +89,7 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
                 after.frame,
                 before.name,
                 _last_seen(solved, move.twin),
-                solved.cell.stops[move.stop],
+                _stops_of(solved, move.twin)[0],
                 mm,
                 deg,
                 tuple(it for it in rivals if it != after.frame),

@@ -10,14 +10,11 @@ from visioncal.alignment.faults import moved_words
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Edge, Moved, Untied, Verdict, VerdictStatus
 from visioncal.errors import DegenerateError
-from visioncal.estimator.linalg import spectrum
 from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, axis_words
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.types import FloatArray
 
-# Below this scaled eigenvalue ratio a direction is not determined at all.
-_NULL_RATIO = 1e-12
 # A board whose size is off by more of its own sigmas than this is another than was stated.
 _SIZE_SIGMAS = 3.0
 
@@ -41,38 +38,23 @@ class Limits:
     left_out: tuple[float, float] = (0.25, 0.6)
 
 
-def check_determined(
-    solved: Solved, information: FloatArray, names: Sequence[str], edges: Mapping[str, Edge]
-) -> None:
+def check_determined(cell: Cell, edges: Mapping[str, Edge]) -> None:
     """Refuses a cell in which a frame is not determined well enough for anybody.
 
     Args:
-        solved: The fit.
-        information: (p, p) on its unknowns.
-        names: The frames of the first 6 e of them.
-        edges: The transforms that are to be known well: of frames where they stood last.
+        cell: The cell.
+        edges: The transforms that are to be known: of frames where they stood last.
 
     Raises:
-        DegenerateError: A direction is numerically null, or its sigma is over the limit.
+        DegenerateError: A direction's sigma is over the limit, or it is not determined at all.
     """
-    size = 6 * len(names)
-    spread = spectrum(information[:size, :size])
-    if size and spread.ratio < _NULL_RATIO:
-        parts = np.linalg.norm(spread.vectors[:, 0].reshape(-1, 6), axis=1)
-        culprit = names[int(parts.argmax())]
-        raise DegenerateError(
-            f"align: {culprit} is not determined: the observations leave a direction of it open "
-            f"(information ratio {spread.ratio:.0e}, needs {_NULL_RATIO:.0e}).",
-            culprits=[culprit],
-            next_step=_more(solved.cell, culprit),
-        )
     for name, edge in edges.items():
         worst = worst_direction(edge)
         if worst.sigma > worst.limit:
             raise DegenerateError(
                 f"align: {name}: {worst.words} has a predicted sigma of {worst.figure}.",
                 culprits=[name],
-                next_step=_more(solved.cell, name),
+                next_step=_more(cell, name),
             )
 
 

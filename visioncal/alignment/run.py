@@ -62,14 +62,13 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
     """
     agreed, session = solved.agreed, cell.session
     network = agreed.network
-    information = network_information(
-        network.subset(agreed.used), agreed.fit.state, agreed.fit.noise
+    spread = covariance(
+        network_information(network.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
     )
-    spread = covariance(information)
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
-    check_determined(solved, information, [it.name for it in named.values()], last)
+    check_determined(solved.cell, last)
     parents = {name: network.tree.branches[it.key].parent for name, it in _by_name(named).items()}
     kept = {
         name: it.parent

@@ -13,21 +13,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
+from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.network import Network, State
 from visioncal.estimator.networkfit import (
     NetworkFit,
     fit_network,
+    solve_network,
     starting_noise,
     surprises,
 )
 from visioncal.estimator.networkmoves import (
     Move,
+    better_stop,
     gross_move,
+    moved_earlier_or_later,
     moved_network,
     needless_move,
     slight_move,
     unmoved,
 )
+from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mask
 
 # A sound observation is lost in one session of a thousand.
@@ -35,6 +41,10 @@ _FALSE_ALARM = 1e-3
 # The earliest share of the stops, at the least, that the search begins with.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 _ROUNDS, _MOST_MOVES = 10, 8
+# An observation is near a start within so much [m], or so many times the median.
+_NEAR_M, _FAR = 0.04, 6.0
+# Whatever robots err by more is wrong, and no noise [rad, m].
+_MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # Distances are compared with the limit once more, without the observation's own say in the noise,
 # when they come this near.
 _SUSPECT_SHARE = 0.4
@@ -85,7 +95,19 @@ def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
         used &= _beyond(network, used, fit) < 1.0
         used, fit = _widened(network, used, fit)
     used, fit = _widened(network, used, fit)
-    return _without_needless(_agreed(network, used, fit, moves))
+    return _without_needless(_timed(_agreed(network, used, fit, moves)))
+
+
+def _timed(found: Agreed) -> Agreed:
+    """Moves at the stops from which on they explain most, now that all is fitted together."""
+    network, fit, moves = found.network, found.fit, list(found.moves)
+    for move in found.moves:
+        stop = better_stop(network, fit, move)
+        if stop != move.stop:
+            network, moves = moved_earlier_or_later(network, moves, move, stop)
+    if network is found.network:
+        return found
+    return _agreed(network, *_widened(network, found.used, fit), moves)
 
 
 def _without_needless(found: Agreed) -> Agreed:
@@ -152,8 +174,20 @@ def _early(network: Network, state: State) -> tuple[Mask, NetworkFit]:
     stops = network.sightings.stops
     last = max(_EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:_FEWEST_EARLY][-1]))
     early = stops <= last
-    fit = NetworkFit(state, starting_noise(network))
-    return _widened(network, early & (_beyond(network, early, fit) < 1.0), fit, early)
+    # Noise is estimated once what is wrong by far is out: it would pass for noise of a robot.
+    noise = starting_noise(network)
+    used = early & _near(network, state, early)
+    state, _ = solve_network(network.subset(used), state, noise)
+    fit = NetworkFit(state, noise)
+    return _widened(network, early & (_beyond(network, used, fit) < 1.0), fit, early)
+
+
+def _near(network: Network, state: State, among: Mask) -> Mask:
+    """(n,) whether an observation is where a start has it, as most among some are."""
+    between = invert(network.predicted(state)) @ network.measured(state)
+    away = np.linalg.norm(between[:, :3, 3], axis=1)
+    away = away + LEVER_M * np.where(network.sightings.turned, rotation_angle(between), 0.0)
+    return np.asarray(away < max(_FAR * float(np.median(away[among])), _NEAR_M))
 
 
 def _widened(
@@ -163,7 +197,8 @@ def _widened(
     noise = None
     for _ in range(_ROUNDS):
         fit = fit_network(network.subset(used), fit.state, noise)
-        noise = fit.noise
+        noise = replace(fit.noise, robots=np.minimum(fit.noise.robots, _MOST_NOISE))
+        fit = replace(fit, noise=noise)
         before, used = used, _beyond(network, used, fit) < 1.0
         if among is not None:
             used &= among

@@ -19,6 +19,8 @@ from visioncal.types import FloatArray, IntArray, Mask
 
 # A move must explain so many observations, of so many stops, more than they are explained now.
 _FEWEST = 3
+# ... and so many of those that follow; others may have moved, too, or be wrong.
+_LEAST_SHARE = 0.25
 # So many observations are asked in turn which other place they speak for.
 _ASKED = 24
 _FALSE_ALARM, _FALSE_MOVE = 1e-3, 1e-4
@@ -38,7 +40,6 @@ class Move:
         frame: The frame, as the network knows it until then.
         twin: Its name from then on.
         stop: The first stop at which it stands elsewhere.
-        before: The last stop at which it was seen before; -1 where it was not.
         change: (4, 4) where it then is, in its own frame before: as first estimated.
         rivals: Frames of which the same may be said as well.
     """
@@ -46,7 +47,6 @@ class Move:
     frame: str
     twin: str
     stop: int
-    before: int
     change: FloatArray
     rivals: tuple[str, ...] = ()
 
@@ -58,6 +58,46 @@ def moved_network(network: Network, move: Move) -> Network:
         network,
         tree=network.tree.with_twin(move.frame, move.twin),
         sightings=network.sightings.renamed(move.frame, move.twin, rows),
+    )
+
+
+def better_stop(network: Network, fit: NetworkFit, move: Move) -> int:
+    """The stop from which on a move explains most, now that both places are known better.
+
+    Args:
+        network: All n observations.
+        fit: The unknowns and the noise.
+        move: What moved.
+    """
+    mine = network.sightings.involves(move.frame) | network.sightings.involves(move.twin)
+    part = network.subset(mine)
+    every = np.ones(len(part), dtype=bool)
+    explained = []
+    for old, new in ((move.twin, move.frame), (move.frame, move.twin)):
+        there = replace(part, sightings=part.sightings.renamed(old, new, every))
+        linear = there.linear(fit.state)
+        white = np.linalg.solve(there.total(linear, fit.noise), linear.residuals[:, :, None])
+        squares = np.sum(linear.residuals * white[:, :, 0], axis=1)
+        explained.append(squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(network), 6))
+    stops = part.sightings.stops
+    choices = np.unique(stops)
+    counts = [np.sum(np.where(stops < it, *explained)) for it in choices]
+    best = max(counts)
+    if counts[int(np.searchsorted(choices, move.stop))] == best:
+        return move.stop
+    return int(choices[int(np.argmax(counts))])
+
+
+def moved_earlier_or_later(
+    network: Network, moves: Sequence[Move], move: Move, stop: int
+) -> tuple[Network, list[Move]]:
+    """The network with a move at another stop."""
+    mine = network.sightings
+    after = mine.stops >= stop
+    sightings = mine.renamed(move.frame, move.twin, after).renamed(move.twin, move.frame, ~after)
+    return (
+        replace(network, sightings=sightings),
+        [replace(it, stop=stop) if it is move else it for it in moves],
     )
 
 
@@ -144,9 +184,7 @@ def gross_move(
 def _move(
     network: Network, frame: str, stop: int, change: FloatArray, rivals: tuple[str, ...] = ()
 ) -> Move:
-    mine = network.sightings.stops[network.sightings.involves(frame)]
-    before = int(mine[mine < stop].max(initial=-1))
-    return Move(frame, twin_name(network, frame), stop, before, change, rivals)
+    return Move(frame, twin_name(network, frame), stop, change, rivals)
 
 
 def _best_step(
@@ -172,7 +210,7 @@ def _best_step(
     enough = (
         len(np.unique(stops[after])) >= _FEWEST
         and len(np.unique(stops[explained & (stops < stops[begin])])) >= _FEWEST
-        and 2 * after.sum() > len(stops) - begin
+        and after.sum() > _LEAST_SHARE * (len(stops) - begin)
     )
     if not enough:
         return 0, 0, np.eye(4)

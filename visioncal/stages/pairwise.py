@@ -19,6 +19,8 @@ FEWEST = 3
 # Below this scaled eigenvalue ratio the motion leaves a direction open; an edge that is known worse
 # than this [m, with rotations on a lever] is no start.
 _NULL_RATIO, _WORST_M = 1e-8, 0.1
+# Views that agree do so to this, on average, rotations on a lever [m].
+_AGREE_M = 0.02
 # Noise by which pairs are weighed against each other [rad, m].
 _USUAL = Noise(5e-4, 5e-4)
 
@@ -69,7 +71,7 @@ def hand_eye(
 
     Returns:
         (4, 4) x and z, and what each is known to, rotations on a lever [m]; None where the motion
-        leaves a direction open.
+        leaves a direction open, or no half of the views agrees.
     """
     half = len(robot) // 2 + 1
     found = []
@@ -78,7 +80,9 @@ def hand_eye(
         found.append((_trimmed(away, half), away))
     found.sort(key=lambda it: it[0])
     settled = [_concentrated(robot, candidates, away, half) for _, away in found[:_REFINED]]
-    _, chosen, picks, edges = min(settled, key=lambda it: it[0])
+    trimmed, chosen, picks, edges = min(settled, key=lambda it: it[0])
+    if trimmed > _AGREE_M * half:
+        return None
     picked = candidates.poses[chosen, picks[chosen]]
     data = Closure(mount, robot[chosen], picked, np.zeros((len(chosen), 6, 6)))
     information = closure_information(data, Edges(*edges, np.zeros(0)), _USUAL)
@@ -87,7 +91,9 @@ def hand_eye(
     spread = covariance(information)
     variances = np.diag(spread).reshape(4, 3).sum(axis=1)
     x, z = np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])
-    return None if max(x, z) > _WORST_M else (edges, (float(x), float(z)))
+    # Views that agree badly tell less than their motion would.
+    worse = max(trimmed / half / _USUAL.sigma_m, 1.0)
+    return None if max(x, z) > _WORST_M else (edges, (worse * float(x), worse * float(z)))
 
 
 def _trimmed(away: FloatArray, half: int) -> float:

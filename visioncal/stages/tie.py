@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.networktree import Tree
+from visioncal.estimator.networktree import Step, Tree
 from visioncal.stages.grow import Growth, Pair, Relation, Sighted, grow
 from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
 from visioncal.transforms import invert
@@ -87,17 +87,28 @@ def _solved(
         matrix, sigma_m = consensus(some(sighted.candidates, rows), sighted.turns[rows])
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, turns)
         return
-    if len(pair.robots) > 1 or len(rows) < FEWEST:
+    if len(pair.robots) > 1:
         return
     (step,) = pair.robots
     flange, base = step.frame, tree.branches[step.frame].parent
+    near, far = (flange, base) if step.is_up else (base, flange)
+    # Where the earliest views do not agree by half, perhaps all do.
+    for mine in (rows, pair.rows) if len(rows) < len(pair.rows) else (rows,):
+        found = _parted(poses, sighted, step, mine)
+        if found is not None:
+            (x, z), (sigma_x, sigma_z) = found
+            yield Relation(near, pair.seer, x, sigma_x, np.eye(4)[None])
+            yield Relation(far, pair.seen, z, sigma_z, turns)
+            return
+
+
+def _parted(
+    poses: Mapping[str, FloatArray], sighted: Sighted, step: Step, rows: IntArray
+) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]] | None:
+    """Both transforms beside a robot, by some views, and what each is known to [m]."""
+    if len(rows) < FEWEST:
+        return None
     robot = poses[step.robot][sighted.stops[rows]]
     mount: Mount = "eye-in-hand" if step.is_up else "eye-to-hand"
     robot = robot if step.is_up else invert(robot)
-    found = hand_eye(robot, some(sighted.candidates, rows), sighted.turns[rows], mount)
-    if found is None:
-        return
-    (x, z), (sigma_x, sigma_z) = found
-    near, far = (flange, base) if step.is_up else (base, flange)
-    yield Relation(near, pair.seer, x, sigma_x, np.eye(4)[None])
-    yield Relation(far, pair.seen, z, sigma_z, turns)
+    return hand_eye(robot, some(sighted.candidates, rows), sighted.turns[rows], mount)
