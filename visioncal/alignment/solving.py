@@ -18,7 +18,7 @@ from visioncal.stages.choose import chosen, padded
 from visioncal.stages.grow import Sighted
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.tie import pick, tie
-from visioncal.targets import rotation_transforms
+from visioncal.targets import first_corners, rotation_transforms
 from visioncal.types import Corners, FloatArray, IntArray, Target
 
 # Values that move by less than this share of their sigma have settled.
@@ -113,8 +113,9 @@ def _started(
     state = State(edges, np.zeros(0))
     rough = _network(cell, [chosen(it, 0, None) for it in views])
     picks = pick(rough.predicted(state), _sighted(cell, views, targets))
+    firsts = dict(zip(targets, first_corners(tuple(targets.values())).tolist(), strict=True))
     views = [
-        chosen(view, at, targets.get(row.seen))
+        chosen(view, at, targets.get(row.seen), firsts.get(row.seen, 0))
         for view, at, row in zip(views, picks.tolist(), cell.rows, strict=True)
     ]
     return cell, views, _network(cell, views), state, tied.untied
