@@ -14,6 +14,7 @@ from matplotlib.typing import RcKeyType
 # Drawn with these stand-ins, figures get the page's own colours, in light, dark and print alike.
 INK, MUTED, LINE = "#010101", "#020202", "#030303"
 ACCENT, GOOD, BAD, CHECK = "#040404", "#050505", "#060606", "#070707"
+CARD = "#080808"
 _THEME = {
     INK: "var(--ink)",
     MUTED: "var(--muted)",
@@ -22,6 +23,7 @@ _THEME = {
     GOOD: "var(--good)",
     BAD: "var(--bad)",
     CHECK: "var(--check)",
+    CARD: "var(--card)",
 }
 
 _STYLE: dict[RcKeyType, Any] = {
