@@ -7,9 +7,9 @@ import numpy as np
 from aligned_cells import made_up_cell
 
 from visioncal.calibration import Moved, Sight, Untied
+from visioncal.recording.cellmap import pairs, weakest_frame
 from visioncal.recording.numbers import significant
 from visioncal.report.cells import pair_table, render_cell, write_cell_report
-from visioncal.report.network import pairs, weakest_frame
 
 CELL = made_up_cell(5)
 

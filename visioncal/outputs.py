@@ -1,4 +1,4 @@
-"""What `visioncal calibrate`, `visioncal verify` and `visioncal plan` write into a folder."""
+"""What `visioncal calibrate`, `align`, `verify` and `plan` write into a folder."""
 
 import json
 import tempfile
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from visioncal.calibration import Alignment
 from visioncal.errors import DataError
 from visioncal.files import named_errors, write_atomically
 from visioncal.pipeline import Run
@@ -16,6 +17,7 @@ from visioncal.verification import Check, Outcome
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 VERIFY = "verify.json"
+ALIGNMENT = "alignment.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 
 
@@ -90,6 +92,33 @@ def refuse_calibration(folder: Path) -> None:
             culprits=[str(folder)],
             next_step="Name another folder with -o.",
         )
+
+
+def write_alignment(folder: Path, session: Session, found: Alignment) -> tuple[Path, ...]:
+    """Writes the alignment of a cell, its report and its recording into a folder, or none of them.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        session: What was aligned.
+        found: The result.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.recording import write_cell_recording
+    from visioncal.report.cells import write_cell_report
+    from visioncal.viewer.cells import cell_blueprint
+
+    def write(aside: Path) -> None:
+        found.save(aside / ALIGNMENT)
+        write_cell_report(aside / REPORT, found)
+        layout = cell_blueprint(session, found)
+        write_cell_recording(aside / RECORDING, session, found, layout)
+
+    return _write_together(folder, (RECORDING, REPORT, ALIGNMENT), write)
 
 
 def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[Path, ...]:

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.calibration import Alignment, Calibration, FrameFile, to_document
-from visioncal.calibration.alignment import FILE as ALIGNMENT
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import read_bytes
-from visioncal.outputs import CALIBRATION, RECORDING
+from visioncal.outputs import ALIGNMENT, CALIBRATION, RECORDING
 from visioncal.session import Session
 
 # What tells the folder of a session.
@@ -80,12 +79,16 @@ def load_exportable(path: Path) -> Calibration | FrameFile | Alignment:
     """Loads what `load_placed` does, or the alignment of a whole cell.
 
     Args:
-        path: As there, or an alignment.json, which its content tells, or a folder with one and no
-            calibration.json.
+        path: As there, or an alignment.json, which its content tells, a folder with one and no
+            calibration.json, or the recording of a cell.
 
     Raises:
         DataError: There is none of them, or it cannot be read.
     """
+    if path.suffix.lower() == ".rrd":
+        from visioncal.recording import read_alignment
+
+        return read_alignment(path) or load_placed(path)
     cell = path.is_dir() and not (path / CALIBRATION).exists() and (path / ALIGNMENT).is_file()
     return Alignment.load(path) if cell or _holds_cell(path) else load_placed(path)
 

@@ -227,14 +227,27 @@ class Alignment:
         """
         file = Path(path)
         file = file / FILE if file.is_dir() else file
+        return cls.from_json(read_bytes(file), str(file))
+
+    @classmethod
+    def from_json(cls, text: bytes | str, label: str) -> Self:
+        """Reads the content of an alignment.json.
+
+        Args:
+            text: The content.
+            label: What it came from, for messages.
+
+        Raises:
+            DataError: It is not an alignment of a known schema.
+        """
         try:
-            return cls(**_fields(json.loads(read_bytes(file))))
+            return cls(**_fields(json.loads(text)))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise DataError(f"{file}: not JSON: {error}.", culprits=[str(file)]) from error
+            raise DataError(f"{label}: not JSON: {error}.", culprits=[label]) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
-                f"{file}: not an alignment that this version can read: {error!r}.",
-                culprits=[str(file)],
+                f"{label}: not an alignment that this version can read: {error!r}.",
+                culprits=[label],
                 next_step="Run visioncal align again.",
             ) from error
 

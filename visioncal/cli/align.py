@@ -9,9 +9,9 @@ from rich.markup import escape
 
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
-from visioncal.calibration.alignment import FILE
 from visioncal.cli.console import messages, print_verdict, shown_progress
 from visioncal.figures import figure
+from visioncal.outputs import write_alignment
 from visioncal.session import Session
 
 
@@ -24,9 +24,10 @@ def align_command(
 ) -> None:
     """Put a whole cell in one frame: several robots, cameras and boards, adjusted together.
 
-    Writes alignment.json: every frame with its covariance, each robot's and camera's noise, what
-    moved, and every observation that disagrees. Exit status 0: there is a result, with a verdict;
-    2: nothing ties a robot to the rest, or the observations leave a frame open.
+    Writes alignment.json (every frame with its covariance, each robot's and camera's noise, what
+    moved, and every observation that disagrees), report.html and recording.rrd. Exit status 0:
+    there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
+    leave a frame open.
     """
     align_into(Session.load(session), out, as_json=as_json)
 
@@ -35,13 +36,12 @@ def align_into(session: Session, out: Path, *, as_json: bool) -> None:
     """Aligns a session's cell, writes the result into a folder and tells of it."""
     with shown_progress(quiet=as_json) as told:
         result = align(session, progress=told)
-    out.mkdir(parents=True, exist_ok=True)
-    result.save(out / FILE)
+    written = write_alignment(out, session, result)
     if as_json:
         typer.echo(json.dumps(result.document(), indent=2))
         return
     _tell(result)
-    messages().print(escape(f"wrote {out / FILE}"))
+    messages().print(escape("wrote " + ", ".join(map(str, written))))
 
 
 def _tell(result: Alignment) -> None:

@@ -4,15 +4,18 @@ The facts of the session lie in it without loss, beside what is drawn of them; s
 changed or cut off after it was written is noticed; see `frames`.
 """
 
+from visioncal.recording.cells import read_alignment
 from visioncal.recording.reader import read_session
 from visioncal.recording.results import append_results, read_calibration, read_evidence
-from visioncal.recording.writer import RecordingWriter, write_recording
+from visioncal.recording.writer import RecordingWriter, write_cell_recording, write_recording
 
 __all__ = [
     "RecordingWriter",
     "append_results",
+    "read_alignment",
     "read_calibration",
     "read_evidence",
     "read_session",
+    "write_cell_recording",
     "write_recording",
 ]

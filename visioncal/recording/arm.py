@@ -12,12 +12,13 @@ _BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
 _JOINT_RADIUS = 1.2
 
 
-def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
+def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = paths.ROBOT) -> None:
     """Draws an arm at the stream's current time.
 
     Args:
         stream: Where to.
         link_frames: (n, 4, 4) the frames of its joints and its flange in the base [m].
+        entity: Under which entity.
     """
     origins = np.vstack([np.zeros(3), link_frames[:, :3, 3]])
     links = np.diff(origins, axis=0)
@@ -31,7 +32,7 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
         colors=colours.LINK,
         fill_mode="solid",
     )
-    stream.log(f"{paths.ROBOT}/links", capsules)
+    stream.log(f"{entity}/links", capsules)
     # Neither the base nor the flange is a joint.
     balls = rr.Ellipsoids3D(
         centers=origins[1:-1],
@@ -39,7 +40,7 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
         colors=colours.JOINT,
         fill_mode="solid",
     )
-    stream.log(f"{paths.ROBOT}/joints", balls)
+    stream.log(f"{entity}/joints", balls)
 
 
 def _from_z_to(directions: FloatArray) -> FloatArray:

@@ -55,6 +55,14 @@ ARM_NOTE = "/notes/arm"
 DRIFT_MM = "/arm/warming/drift_mm"
 RISE_K = "/arm/warming/rise_k"
 
+# A whole cell of several robots: its result's text, its frames, and who saw whom.
+ALIGNMENT = "/results/alignment"
+CELL_FRAME = "cell"
+CELL = "/cell"
+ROBOTS = "/robots"
+SIGHT_LINE = "/sight"
+NETWORK = "/network"
+
 # A plan: what is in the way, and how far the joints go.
 OBSTACLES = "/obstacles"
 WAY = "/way"

@@ -1,17 +1,19 @@
 """Writes a session to a recording: view by view as it is captured, or as a whole."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from rerun.blueprint import BlueprintLike
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Alignment, Calibration
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import named_errors, sha256
 from visioncal.recording import codec
+from visioncal.recording.cells import log_cell
 from visioncal.recording.recorder import Recorder, beside
 from visioncal.recording.results import log_results
 from visioncal.session import Session
@@ -104,6 +106,19 @@ class RecordingWriter:
         with named_errors(self._label):
             log_results(self._recorder, session, calibration, evidence)
 
+    def add_alignment(self, session: Session, found: Alignment) -> None:
+        """Adds the result of aligning the cell, drawn and exact.
+
+        Args:
+            session: The session with all of its views.
+            found: Its result.
+
+        Raises:
+            DataError: The file cannot be written.
+        """
+        with named_errors(self._label):
+            log_cell(self._recorder, session, found)
+
     def _checked(self, cells: Sequence[str], image: bytes | None) -> View:
         """Refuses what could be written but not be read again."""
         where = f"row {len(self._numbers) + 1}"
@@ -166,6 +181,33 @@ def write_recording(
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
+    with _whole(path, session, blueprint) as writer:
+        writer.add_results(session, calibration, evidence)
+
+
+def write_cell_recording(
+    path: Path, session: Session, found: Alignment, blueprint: BlueprintLike | None
+) -> None:
+    """Writes a session and the alignment of its cell as one recording.
+
+    Args:
+        path: The `.rrd` to write; it appears whole or not at all.
+        session: What was recorded; `read_session` gives it back.
+        found: Its result.
+        blueprint: The layout to open it in.
+
+    Raises:
+        DataError: The file cannot be written, or an image of the session cannot be read.
+    """
+    with _whole(path, session, blueprint) as writer:
+        writer.add_alignment(session, found)
+
+
+@contextmanager
+def _whole(
+    path: Path, session: Session, blueprint: BlueprintLike | None
+) -> Iterator[RecordingWriter]:
+    """A writer that has a session's views; the file appears once nothing went wrong."""
     with beside(path) as aside:
         with RecordingWriter(
             aside, session, announced=len(session.views), blueprint=blueprint, label=path
@@ -174,5 +216,5 @@ def write_recording(
                 known = bool(view.image) and session.images.exists(view.image)
                 cells = [view.cell(column) for column in session.columns]
                 writer.add_view(cells, session.images.read(view.image) if known else None)
-            writer.add_results(session, calibration, evidence)
+            yield writer
         aside.replace(path)

@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from visioncal.calibration import Alignment, CameraResult, Sight
 from visioncal.files import write_atomically
+from visioncal.recording import cellmap
 from visioncal.recording.numbers import significant
 from visioncal.report import bars, content, network, svg
 from visioncal.report.bars import Bar
@@ -72,7 +73,7 @@ def render_cell(found: Alignment) -> str:
         created=content.readable_time(found.created),
         key_figures=_key_figures(found),
         graph=network.graph(found),
-        links=[_link_row(it) for it in network.pairs(found)],
+        links=[_link_row(it) for it in cellmap.pairs(found)],
         tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
         edges=cards,
         noise=_noise_facts(found),
@@ -95,13 +96,13 @@ def _key_figures(found: Alignment) -> list[Fact]:
         facts.append(
             Fact(f"{base} in {bases[0]}, sigma", worth, f"{significant(edge.sigma_deg)}{_DEG}")
         )
-    worst = network.weakest_frame(found)
+    worst = cellmap.weakest_frame(found)
     if worst:
         facts.append(Fact("least known", worst, f"{significant(found.edge_of(worst).sigma_mm)} mm"))
     return facts
 
 
-def _link_row(pair: network.Pair) -> dict[str, str | int]:
+def _link_row(pair: cellmap.Pair) -> dict[str, str | int]:
     return {
         "seer": pair.seer,
         "seen": pair.seen,

@@ -86,6 +86,14 @@ def observations_of(
     return tuple(sorted(found, key=lambda it: place_of[it.view.number]))
 
 
+def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mapping[str, View]]:
+    """Of each row, by its view: the rows that tell where the robots stood at its stop, by robot."""
+    found: dict[int, Mapping[str, View]] = {}
+    for stop in _stops(declaration, views):
+        found |= dict.fromkeys((it.number for it in stop.rows), stop.told)
+    return found
+
+
 def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
     """Words rows that tell another pose of a robot than the rest of their stop."""
     for stop in _stops(declaration, views):
