@@ -1,0 +1,240 @@
+"""Whole cells from sessions: frames, faults, symmetric boards, lenses, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import visioncal
+
+from visioncal.alignment import align
+from visioncal.calibration import Alignment
+from visioncal.errors import DataError, DegenerateError
+from visioncal.simulation.layout import BoardAt, CameraAt, Moved, NetworkOptions, RobotAt
+from visioncal.simulation.network import simulate_network
+from visioncal.simulation.network_records import network_session
+from visioncal.simulation.optics import fine_camera
+from visioncal.transforms import exp, invert, log
+from visioncal.types import Target
+
+STOPS = 20
+# Looks the same after half a turn: both counts are even.
+ALIKE = Target("checkerboard_8x6_25mm", "checkerboard", 8, 6, 0.025, 2.5e-5)
+FLOOR = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
+LEFT = CameraAt("left", place_m=(0.0, -1.0, 1.1))
+RIGHT = CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
+
+
+def aligned(cell):
+    session = network_session(cell, "cell", seen="names")
+    return align(session, corners={it.view: it for it in cell.corners})
+
+
+@pytest.fixture(scope="module")
+def clean():
+    cell = simulate_network(NetworkOptions(stops=STOPS))
+    return cell, aligned(cell)
+
+
+def off(cell, found, first, second):
+    """(6,) by which a frame is off from another's, and its squared length in sigmas."""
+    edge = found.between(first, second)
+    away = log(invert(cell.between(first, second)) @ edge.matrix)
+    return away, float(away @ np.linalg.solve(edge.covariance, away))
+
+
+def test_bases_are_as_near_as_their_covariance_says(clean):
+    cell, found = clean
+    away, squared = off(cell, found, "base_a", "base_b")
+    # 2e-4 m: four sigma of what twenty stops tell at a metre; chi-square of 6 beyond 22 is 0.1 %.
+    assert np.linalg.norm(away[3:]) < 2e-4
+    assert squared < 22.0
+    assert found.edge_of("base_b").sigma_mm < 0.1
+    assert found.verdict.status == "good"
+    assert all(it.used for it in found.sights)
+    assert not found.moved
+    assert found.reference == "base_a"
+
+
+def test_noise_is_told_apart_by_robot_and_camera(clean):
+    cell, found = clean
+    assert found.noise["cam_left"]["pixel_px"] == pytest.approx(
+        cell.options.pixel_sigma_px, rel=0.1
+    )
+    # Twenty stops tell a robot's to some 15 %.
+    assert found.noise["a"]["translation_mm"] == pytest.approx(0.03, rel=0.5)
+    assert found.noise["b"]["translation_mm"] == pytest.approx(0.03, rel=0.5)
+
+
+def test_any_frame_is_placed_in_any_other(clean):
+    cell, found = clean
+    _, squared = off(cell, found, "cam_left", "cam_right")
+    assert squared < 22.0
+    there, back = found.between("cam_left", "base_b"), found.between("base_b", "cam_left")
+    np.testing.assert_allclose(there.matrix @ back.matrix, np.eye(4), atol=1e-12)
+    direct = found.between("base_a", "base_b")
+    np.testing.assert_allclose(direct.covariance, found.edge_of("base_b").covariance)
+    assert not found.between("base_a", "base_a").covariance.any()
+
+
+def test_the_covariance_of_a_chain_is_that_of_its_edges(clean):
+    _, found = clean
+    edges = list(found.edges)
+    flange = exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, 0.6]))
+    poses = {"b": flange}
+    chain = found.between("cam_left", "target_plate_b", poses)
+    step, slopes = 1e-6, np.zeros((6, 6 * len(edges)))
+    for at in range(6 * len(edges)):
+        twist = np.zeros(6)
+        twist[at % 6] = step
+        name = edges[at // 6]
+        moved = replace(found.edges[name], matrix=found.edges[name].matrix @ exp(twist))
+        other = replace(found, edges={**found.edges, name: moved})
+        there = other.between("cam_left", "target_plate_b", poses).matrix
+        slopes[:, at] = log(invert(chain.matrix) @ there) / step
+    expected = slopes @ found.joint_covariance @ slopes.T
+    # Forward differences of 1e-6 are exact to 1e-6 of themselves.
+    np.testing.assert_allclose(chain.covariance, expected, rtol=1e-4, atol=1e-13)
+
+
+def test_a_frame_that_moves_with_a_robot_asks_for_its_pose(clean):
+    _, found = clean
+    with pytest.raises(DataError, match="moves with robot 'b': its pose is needed"):
+        found.between("cam_left", "target_plate_b")
+    with pytest.raises(DataError, match="no frame 'cam_lft'"):
+        found.between("cam_lft", "base_a")
+
+
+def test_it_is_the_same_after_it_was_saved(clean, tmp_path):
+    _, found = clean
+    found.save(tmp_path / "alignment.json")
+    again = Alignment.load(tmp_path)
+    assert again.document() == found.document()
+    (tmp_path / "alignment.json").write_text(json.dumps({"schema": 9}))
+    with pytest.raises(DataError, match="not an alignment that this version can read"):
+        Alignment.load(tmp_path)
+
+
+def test_the_weakest_link_is_the_frame_that_is_known_worst(clean):
+    _, found = clean
+    worst = max(found.edges, key=lambda it: found.edges[it].sigma_mm).partition("_from_")[2]
+    assert found.weakest.startswith(f"The weakest link is {worst}: sigma ")
+
+
+def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
+    pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
+    options = NetworkOptions(stops=STOPS, moved=pushes, swapped_rows=1, stray_images=3, seed=3)
+    cell = simulate_network(options)
+    found = aligned(cell)
+    assert [(it.frame, it.first_stop) for it in found.moved] == [
+        ("target_floor", 9),
+        ("cam_right", 12),
+    ]
+    for it in found.moved:
+        # A pushed frame's own place is known to 0.1 mm.
+        assert it.shift_mm == pytest.approx(5.0, abs=0.4)
+    reasons = {it.view: it.reason for it in found.sights if not it.used}
+    assert sorted(reasons) == list(cell.wrong_views)
+    assert sum("exchanged" in it for it in reasons.values()) == 2
+    assert sum("its image is of stop" in it for it in reasons.values()) == 3
+    assert found.verdict.status == "check"
+    assert any("cam_right was bumped between stops 11 and 12" in it for it in found.verdict.reasons)
+    away, squared = off(cell, found, "base_a", "base_b")
+    assert squared < 22.0
+    assert np.linalg.norm(away[3:]) < 2.5e-4
+
+
+def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
+    boards = (
+        replace(FLOOR, target=ALIKE),
+        BoardAt("plate_a", "a", target=ALIKE),
+        BoardAt("plate_b", "b", target=ALIKE),
+    )
+    cell = simulate_network(NetworkOptions(boards=boards, stops=STOPS))
+    found = aligned(cell)
+    assert all(it.used for it in found.sights)
+    for frames in (("base_a", "base_b"), ("cam_left", "cam_right")):
+        assert off(cell, found, *frames)[1] < 22.0
+
+
+def test_lenses_come_from_images_of_their_own():
+    cameras = (replace(LEFT, state_intrinsics=False), replace(RIGHT, state_intrinsics=False))
+    cell = simulate_network(NetworkOptions(cameras=cameras, lens_views=12, stops=STOPS))
+    assert LEFT.camera.resolution != RIGHT.camera.resolution
+    found = aligned(cell)
+    assert off(cell, found, "base_a", "base_b")[1] < 22.0
+    for camera in cameras:
+        got = found.cameras[f"cam_{camera.name}"]
+        assert got.estimated
+        assert got.camera.resolution == camera.camera.resolution
+        sigma = np.sqrt(np.diag(got.covariance))[:4]
+        # Five sigma of each: the distortion's own errors go with them.
+        assert np.all(np.abs(got.camera.matrix - camera.camera.matrix) < 5 * sigma)
+    # Images of the lens alone are no observations of the cell.
+    assert len(found.sights) == len(cell.sights) - 24
+
+
+def test_cameras_in_the_hand_and_poses_that_are_given():
+    cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
+    cell = simulate_network(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))
+    found = align(network_session(cell, "cell", seen="poses"))
+    away, squared = off(cell, found, "base_a", "base_b")
+    assert np.linalg.norm(away[3:]) < 1e-3
+    # The noise of the given poses is estimated, too: fewer are told than they are.
+    assert squared < 40.0
+
+
+def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
+    boards = (FLOOR, BoardAt("plate_a", "a"))
+    cell = simulate_network(NetworkOptions(boards=boards, stops=8))
+    with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
+        aligned(cell)
+    assert "put a board on flange_b and let cam_left, cam_right see it" in caught.value.next_step
+
+
+def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
+    wall = BoardAt("wall", place_m=(3.0, 0.0, 0.05))
+    apart = CameraAt("apart", place_m=(3.0, -1.0, 1.1), looks_at_m=(3.0, 0.0, 0.05))
+    boards = (FLOOR, BoardAt("plate_a", "a"), BoardAt("plate_b", "b"), wall)
+    cell = simulate_network(NetworkOptions(cameras=(LEFT, RIGHT, apart), boards=boards, stops=12))
+    found = aligned(cell)
+    assert {it.frame for it in found.untied} == {"cam_apart", "target_wall"}
+    assert found.verdict.status == "check"
+    assert all(not it.used for it in found.sights if it.seer == "cam_apart")
+    (reason,) = {it.reason for it in found.sights if it.seer == "cam_apart"}
+    assert reason == "nothing ties cam_apart to the rest of the cell"
+
+
+def test_a_camera_that_a_board_ties_either_way_round_is_refused():
+    beside = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
+    boards = (replace(FLOOR, target=ALIKE), BoardAt("plate_a", "a"))
+    cell = simulate_network(
+        NetworkOptions(
+            robots=(RobotAt("a", (-0.6, 0.0, 0.0)),),
+            cameras=(LEFT, beside),
+            boards=boards,
+            stops=12,
+        )
+    )
+    kept = [it for it in cell.sights if not (it.camera == "right" and it.board == "plate_a")]
+    cell = replace(cell, sights=tuple(kept))
+    with pytest.raises(DegenerateError, match="cam_right may be in two places: target_floor looks"):
+        aligned(cell)
+
+
+def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path):
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate_a", "a"),), stops=STOPS
+    )
+    session = network_session(simulate_network(options), "cell", seen="poses")
+    session.save(tmp_path / "session")
+    out = tmp_path / "out"
+    done = visioncal("calibrate", tmp_path / "session", "-o", out, "--json")
+    assert done.status == 0
+    written = json.loads((out / "alignment.json").read_text())
+    assert written == json.loads(done.out)
+    assert set(written["transforms"]) == {
+        "cell_from_cam_left",
+        "cell_from_cam_right",
+        "flange_a_from_target_plate_a",
+    }
