@@ -10,6 +10,7 @@ from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
 from visioncal.chance import chi2_limit
 from visioncal.estimator.network import Network
+from visioncal.estimator.networkfit import by_noise_alone
 from visioncal.figures import figure
 from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
@@ -180,9 +181,7 @@ def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
         if not known.any():
             continue
         part = there.subset(known)
-        linear = part.linear(fit.state)
-        white = np.linalg.solve(part.total(linear, fit.noise), linear.residuals[:, :, None])
-        squares = np.sum(linear.residuals * white[:, :, 0], axis=1)
+        squares = by_noise_alone(part, fit)
         at_station = np.flatnonzero(known)
         near = (squares < chi2_limit(_CHANCE, 6)) & (at_station != row.station)
         order = np.argsort(squares[near])

@@ -5,10 +5,6 @@ point's). Its residual is `log(predicted^-1 * measured)`, in the frame that was 
 of the observation itself, whose covariance is known up to its sensor's level, and one small error
 of each robot's flange at each of its stops, which all that was seen by way of that flange shares
 (Strobl and Hirzinger 2006; Ulrich and Hillemann 2021, for one robot).
-
-The flanges' errors are taken out stop by stop (Schur complement; Triggs et al. 2000, section 6.1):
-what all observations of a stop together say of them is one 6-vector a robot, and what is left says
-something of the unknowns whatever the robots do.
 """
 
 from collections.abc import Mapping
@@ -19,17 +15,14 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from visioncal.estimator.linalg import gram
 from visioncal.estimator.networktree import Step, Tree
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
 _UNTOLD = 1.0
-# Eigenvalues of the information on a flange below this share of the largest are none.
-_NULL = 1e-9
 # What a flange's error may be where nothing was seen of it [rad^2 and m^2]: nothing is known.
-_ANYTHING = 1e4
+ANYTHING = 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,7 +353,7 @@ class Network:
         """Variances (u, 6 w) of the flanges' errors of each unit."""
         _, members = self.units
         levels = np.repeat(noise.robots, 3, axis=1) ** 2
-        spread = np.where(members[:, :, None] >= 0, levels[members], _ANYTHING)
+        spread = np.where(members[:, :, None] >= 0, levels[members], ANYTHING)
         return spread.reshape(len(members), -1) if len(members) else np.zeros((0, 0))
 
 
@@ -374,69 +367,3 @@ def _place_slope(error: FloatArray) -> FloatArray:
     slope = np.zeros((len(error), 6, 6))
     slope[:, 3:, 3:] = error[:, :3, :3]
     return slope
-
-
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """The observations once the flanges' errors have been taken out, unit by unit.
-
-    Attributes:
-        information: (p, p) on the unknowns, whatever the robots do.
-        pull: (p,) half its gradient.
-        cost: Its squared error.
-        flanges: (u, 6 w) what each unit says of its flanges' errors.
-        slopes: (u, 6 w, p) how that moves with the unknowns.
-        spread: (u, 6 w, 6 w) its covariance, by the observations alone.
-    """
-
-    information: FloatArray
-    pull: FloatArray
-    cost: float
-    flanges: FloatArray
-    slopes: FloatArray
-    spread: FloatArray
-
-
-def reduce(network: Network, state: State, linear: Linear, weights: FloatArray) -> Reduced:
-    """Takes the flanges' errors out.
-
-    Args:
-        network: The network.
-        state: Where it was linearised.
-        linear: The residuals there.
-        weights: (n, 6, 6) inverse covariances of the observations' own noise.
-    """
-    of, members = network.units
-    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
-    weighted = weights @ every
-    total = gram(every, weighted)
-    width, size = linear.slack.shape[2], len(total) - 1
-    own, cross = np.zeros((len(members), width, width)), np.zeros((len(members), width, size + 1))
-    rows = of >= 0
-    slack = np.swapaxes(linear.slack[rows], 1, 2)
-    np.add.at(own, of[rows], slack @ weights[rows] @ linear.slack[rows])
-    np.add.at(cross, of[rows], slack @ weighted[rows])
-    inverse, blind = _pseudo_inverse(own)
-    answer = inverse @ cross
-    total = total - gram(cross, answer)
-    known, shared = network.common, state.shared
-    edges = 6 * len(state.edges)
-    total[edges:size, edges:size] += known.information
-    pull = known.information @ shared + known.pull
-    total[edges:size, -1] += pull
-    cost = float(total[-1, -1] + shared @ (known.pull + pull))
-    # A residual is what the flange's error made of it: the error itself has the other sign.
-    return Reduced(
-        total[:-1, :-1], total[:-1, -1], cost, answer[:, :, -1], answer[:, :, :-1], inverse + blind
-    )
-
-
-def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses (u, w, w) where there is information, and what is open where there is none."""
-    values, vectors = np.linalg.eigh(information)
-    most = values[:, -1:] if values.shape[1] else values
-    told = values > _NULL * np.maximum(most, np.finfo(float).tiny)
-    inverse = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
-    turned = np.swapaxes(vectors, 1, 2)
-    blind = np.where(told, 0.0, _ANYTHING)
-    return (vectors * inverse[:, None, :]) @ turned, (vectors * blind[:, None, :]) @ turned

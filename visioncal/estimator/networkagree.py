@@ -25,9 +25,10 @@ from visioncal.estimator.networkfit import (
 from visioncal.estimator.networkmoves import (
     Move,
     better_stop,
+    explained_by_noise,
     gross_move,
+    moved,
     moved_earlier_or_later,
-    moved_network,
     needless_move,
     slight_move,
     unmoved,
@@ -88,11 +89,11 @@ def agree(network: Network, state: State, movable: Sequence[str]) -> Agreed:
         move = gross_move(network, fit, beyond < 1.0, movable)
         if move is None:
             break
-        network, fit = _with(network, fit, move)
+        network, fit = moved(network, fit, move)
         movable = (*movable, move.twin)
         moves.append(move)
-        used |= network.sightings.involves(move.twin)
-        used &= _beyond(network, used, fit) < 1.0
+        mine = network.sightings.involves(move.twin)
+        used = np.where(mine, explained_by_noise(network, fit, len(network)), used)
         used, fit = _widened(network, used, fit)
     used, fit = _widened(network, used, fit)
     return _without_needless(_timed(_agreed(network, used, fit, moves)))
@@ -127,7 +128,7 @@ def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
         slight = slight_move(network.subset(used), fit, movable)
         if slight is None:
             break
-        network, fit = _with(network, fit, slight)
+        network, fit = moved(network, fit, slight)
         movable = (*movable, slight.twin)
         moves.append(slight)
         used, fit = _settled(network, *_widened(network, used, fit))
@@ -137,16 +138,6 @@ def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
 def _agreed(network: Network, used: Mask, fit: NetworkFit, moves: Sequence[Move]) -> Agreed:
     squares, directions = surprises(network, used, fit)
     return Agreed(network, fit, used, squares, _limit(network, used, directions), tuple(moves))
-
-
-def _with(network: Network, fit: NetworkFit, move: Move) -> tuple[Network, NetworkFit]:
-    """The network and the state with what moved as two frames."""
-    moved = moved_network(network, move)
-    at = network.unknown[move.frame]
-    there = dict(zip(network.unknown, fit.state.edges, strict=True))
-    there[move.twin] = fit.state.edges[at] @ move.change
-    edges = np.array([there[name] for name in moved.unknown])
-    return moved, replace(fit, state=State(edges, fit.state.shared))
 
 
 def _limit(network: Network, used: Mask, directions: FloatArray) -> FloatArray:
@@ -199,7 +190,9 @@ def _widened(
         fit = fit_network(network.subset(used), fit.state, noise)
         noise = replace(fit.noise, robots=np.minimum(fit.noise.robots, _MOST_NOISE))
         fit = replace(fit, noise=noise)
-        before, used = used, _beyond(network, used, fit) < 1.0
+        before = used
+        # What is far away is wrong, however little is known of where it should be.
+        used = (_beyond(network, used, fit) < 1.0) & _near(network, fit.state, used)
         if among is not None:
             used &= among
         if np.array_equal(before, used):

@@ -7,7 +7,8 @@ import numpy as np
 from visioncal.estimator.closure import RATIO_PRIOR
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance, damped_step, gram, squared_lengths
-from visioncal.estimator.network import Linear, Network, Noise, Reduced, State, reduce
+from visioncal.estimator.network import Linear, Network, Noise, State
+from visioncal.estimator.networkreduce import Reduced, reduce
 from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
 from visioncal.types import FloatArray, Mask
 
@@ -223,6 +224,14 @@ def surprises(network: Network, used: Mask, fit: NetworkFit) -> tuple[FloatArray
     left = spread + np.where(used, -1.0, 1.0)[:, None, None] * taken
     squares, directions = squared_lengths(linear.residuals, left, spread)
     return squares, np.asarray(directions - np.where(network.sightings.turned, 0, 3), dtype=float)
+
+
+def by_noise_alone(network: Network, fit: NetworkFit) -> FloatArray:
+    """Squared distances (n,) from what is predicted, the unknowns being as they are."""
+    linear = network.linear(fit.state)
+    spread = network.total(linear, fit.noise)
+    white = np.linalg.solve(spread, linear.residuals[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(linear.residuals * white, axis=1))
 
 
 def equations_by_stop(network: Network, fit: NetworkFit) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,12 @@ import numpy as np
 from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.linalg import covariance, spectrum
 from visioncal.estimator.network import Network, State
-from visioncal.estimator.networkfit import NetworkFit, equations_by_stop, normal_equations
+from visioncal.estimator.networkfit import (
+    NetworkFit,
+    by_noise_alone,
+    equations_by_stop,
+    normal_equations,
+)
 from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -28,6 +33,9 @@ _FALSE_ALARM, _FALSE_MOVE = 1e-3, 1e-4
 _MARGIN = 2.0
 # Another frame that explains so many as well may be the one that moved.
 _RIVAL_SHARE = 0.9
+# Moves that explain such a share of the most are followed up by one more, not more than so many;
+# of each frame so many different ones.
+_WORTH_TRYING, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 # A step that the other unknowns take up to this share of its information is no step of its own.
 _TAKEN = 1e-6
 
@@ -51,14 +59,24 @@ class Move:
     rivals: tuple[str, ...] = ()
 
 
-def moved_network(network: Network, move: Move) -> Network:
-    """The network in which what moved is two frames."""
+def moved(network: Network, fit: NetworkFit, move: Move) -> tuple[Network, NetworkFit]:
+    """The network in which what moved is two frames, and its state."""
     rows = network.sightings.stops >= move.stop
-    return replace(
+    wider = replace(
         network,
         tree=network.tree.with_twin(move.frame, move.twin),
         sightings=network.sightings.renamed(move.frame, move.twin, rows),
     )
+    there = dict(zip(network.unknown, fit.state.edges, strict=True))
+    there[move.twin] = there[move.frame] @ move.change
+    edges = np.array([there[name] for name in wider.unknown])
+    return wider, replace(fit, state=State(edges, fit.state.shared))
+
+
+def explained_by_noise(network: Network, fit: NetworkFit, among: int) -> Mask:
+    """(n,) whether noise explains observations as the unknowns are, out of so many in all."""
+    limit = _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / among, 6))
+    return np.asarray(by_noise_alone(network, fit) < limit)
 
 
 def better_stop(network: Network, fit: NetworkFit, move: Move) -> int:
@@ -75,10 +93,7 @@ def better_stop(network: Network, fit: NetworkFit, move: Move) -> int:
     explained = []
     for old, new in ((move.twin, move.frame), (move.frame, move.twin)):
         there = replace(part, sightings=part.sightings.renamed(old, new, every))
-        linear = there.linear(fit.state)
-        white = np.linalg.solve(there.total(linear, fit.noise), linear.residuals[:, :, None])
-        squares = np.sum(linear.residuals * white[:, :, 0], axis=1)
-        explained.append(squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(network), 6))
+        explained.append(explained_by_noise(there, fit, len(network)))
     stops = part.sightings.stops
     choices = np.unique(stops)
     counts = [np.sum(np.where(stops < it, *explained)) for it in choices]
@@ -160,64 +175,115 @@ def gross_move(
 ) -> Move | None:
     """The move that explains most of what is not explained yet; None where none explains enough.
 
+    Two things that moved at once look like one from where both are seen: of moves that explain
+    about as much, the one counts that leaves most to the next.
+
     Args:
         network: All n observations.
         fit: The unknowns and the noise, by those that agree.
         agrees: (n,) what is explained.
         movable: Frames that may have moved.
     """
-    found = []
+    steps = _steps(network, fit, agrees, movable)
+    if not steps:
+        return None
+    rivals = [it for it in steps if it.gain >= _WORTH_TRYING * steps[0].gain][:_MOST_TRIED]
+    moves = [_move(network, it) for it in rivals]
+    if len(rivals) == 1:
+        return moves[0]
+    followed = [_followed(network, fit, agrees, movable, it) for it in moves]
+    totals = [it.gain + gain for it, (gain, _) in zip(rivals, followed, strict=True)]
+    best = int(np.argmax(totals))
+    # What goes next is no rival: it moved as well.
+    own = {moves[best].frame, followed[best][1]}
+    others = [
+        it.frame
+        for it, total in zip(rivals, totals, strict=True)
+        if total >= _RIVAL_SHARE * totals[best] and it.frame not in own
+    ]
+    return replace(moves[best], rivals=tuple(dict.fromkeys(others)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step of a frame, from a stop on, and how many more observations it explains."""
+
+    gain: int
+    frame: str
+    stop: int
+    change: FloatArray
+
+
+def _steps(network: Network, fit: NetworkFit, agrees: Mask, movable: Sequence[str]) -> list[_Step]:
+    """The steps that explain enough, those that explain most first."""
+    found: list[_Step] = []
     for frame in movable:
         rows = np.flatnonzero(network.sightings.involves(frame))
-        unexplained = rows[~agrees[rows]]
-        if len(unexplained) < _FEWEST:
-            continue
-        found.append((*_best_step(network, fit, agrees, frame, rows), frame))
-    found = [it for it in found if it[0] >= _FEWEST]
-    if not found:
-        return None
-    gain, stop, change, frame = max(found, key=lambda it: it[0])
-    rivals = [name for other, _, _, name in found if other >= _RIVAL_SHARE * gain and name != frame]
-    return _move(network, frame, stop, change, tuple(rivals))
+        if np.sum(~agrees[rows]) >= _FEWEST:
+            found += _best_steps(network, fit, agrees, frame, rows)
+    return sorted(found, key=lambda it: -it.gain)
 
 
-def _move(
-    network: Network, frame: str, stop: int, change: FloatArray, rivals: tuple[str, ...] = ()
-) -> Move:
-    return Move(frame, twin_name(network, frame), stop, change, rivals)
+def _followed(
+    network: Network, fit: NetworkFit, agrees: Mask, movable: Sequence[str], move: Move
+) -> tuple[int, str]:
+    """How many more observations the best next move explains, and the frame that it is of."""
+    wider, there = moved(network, fit, move)
+    mine = wider.sightings.involves(move.twin)
+    agrees = np.where(mine, explained_by_noise(wider, there, len(network)), agrees)
+    steps = _steps(wider, there, agrees, (*movable, move.twin))
+    return (steps[0].gain, steps[0].frame) if steps else (0, "")
 
 
-def _best_step(
+def _move(network: Network, step: _Step) -> Move:
+    return Move(step.frame, twin_name(network, step.frame), step.stop, step.change)
+
+
+def _best_steps(
     network: Network, fit: NetworkFit, agrees: Mask, frame: str, rows: IntArray
-) -> tuple[int, int, FloatArray]:
-    """How many more observations a step of a frame explains, from which stop on, and the step."""
+) -> list[_Step]:
+    """The step of a frame that explains most, and the best that is another one."""
     part = network.subset(np.isin(np.arange(len(network)), rows))
     order = np.argsort(part.sightings.stops, kind="stable")
-    asked, spread = part.change_of(frame, fit.state), _asked_spread(part, fit, frame)
+    asked = part.change_of(frame, fit.state)[order]
+    spread = _asked_spread(part, fit, frame)[order]
     stops, explained = part.sightings.stops[order], agrees[rows][order]
     open_rows = np.flatnonzero(~explained)
     some = open_rows[np.linspace(0, len(open_rows) - 1, min(_ASKED, len(open_rows))).astype(int)]
-    apart = log(invert(asked[order][some])[:, None] @ asked[order][None])
-    both = spread[order][some][:, None] + spread[order][None]
+    apart = log(invert(asked[some])[:, None] @ asked[None])
+    both = spread[some][:, None] + spread[None]
     squares = np.einsum("abi,abi->ab", apart, np.linalg.solve(both, apart[..., None])[..., 0])
     alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(network), 6)
     gains = np.cumsum((alike.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
     # Of stops that explain as much the last: between them nothing speaks for either.
     first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)[::-1]
-    at, place = np.unravel_index(gains[:, first].argmax(), (len(some), len(first)))
-    begin = first[place]
-    after = alike[at] & (stops >= stops[begin])
-    enough = (
+    found, left = [], np.ones(len(some), dtype=bool)
+    for _ in range(_STEPS_EACH):
+        at, place = np.unravel_index(
+            np.where(left[:, None], gains[:, first], -1).argmax(), (len(some), len(first))
+        )
+        begin = int(first[place])
+        after = alike[at] & (stops >= stops[begin])
+        gain = int(gains[at, begin]) if left[at] else 0
+        if gain >= _FEWEST and _is_enough(after, explained, stops, begin):
+            # The mean of all that ask for this step, each with its own information.
+            weights = np.linalg.inv(spread[after])
+            pulls = np.einsum("nij,nj->i", weights, apart[at, after])
+            mean = np.linalg.solve(weights.sum(axis=0), pulls)
+            change = asked[some[at]] @ exp(mean)
+            found.append(_Step(gain, frame, int(stops[begin]), change))
+        left &= ~alike[at][some]
+        left[at] = False
+    return found
+
+
+def _is_enough(after: Mask, explained: Mask, stops: IntArray, begin: int) -> bool:
+    """Whether a step from a row on is seen at enough stops, before it and after."""
+    return bool(
         len(np.unique(stops[after])) >= _FEWEST
         and len(np.unique(stops[explained & (stops < stops[begin])])) >= _FEWEST
         and after.sum() > _LEAST_SHARE * (len(stops) - begin)
     )
-    if not enough:
-        return 0, 0, np.eye(4)
-    # The mean of all that ask for this step, each with its own information.
-    weights = np.linalg.inv(spread[order][after])
-    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, apart[at, after]))
-    return int(gains[at, begin]), int(stops[begin]), asked[order][some[at]] @ exp(mean)
 
 
 def _asked_spread(network: Network, fit: NetworkFit, frame: str) -> FloatArray:
@@ -257,7 +323,7 @@ def slight_move(network: Network, fit: NetworkFit, movable: Sequence[str]) -> Mo
     if best is None:
         return None
     frame, stop, step = best
-    return _move(network, frame, stop, exp(step))
+    return _move(network, _Step(0, frame, stop, exp(step)))
 
 
 def _move_limit(network: Network, tried: int) -> float:
