@@ -10,7 +10,15 @@ from commands import visioncal
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.errors import DataError, DegenerateError
-from visioncal.simulation.layout import BoardAt, CameraAt, Moved, NetworkOptions, RobotAt
+from visioncal.simulation.layout import (
+    BoardAt,
+    CameraAt,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    PointAt,
+    RobotAt,
+)
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
@@ -182,6 +190,41 @@ def test_cameras_in_the_hand_and_poses_that_are_given():
     assert np.linalg.norm(away[3:]) < 1e-3
     # The noise of the given poses is estimated, too: fewer are told than they are.
     assert squared < 40.0
+
+
+POINTS = (
+    PointAt("n1", "cell", (0.2, 0.3, 0.1)),
+    PointAt("n2", "cell", (-0.2, 0.35, 0.2)),
+    PointAt("n3", "cell", (0.1, -0.4, 0.15)),
+    PointAt("fa", "a", (0.05, 0.02, 0.08)),
+    PointAt("fb", "b", (0.03, -0.04, 0.09)),
+)
+TRACKERS = (InstrumentAt("t1", (0.0, -3.0, 1.2)), InstrumentAt("t2", (0.5, 3.0, 1.2), 2.5))
+
+
+def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera():
+    cell = simulate_network(
+        NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12)
+    )
+    # The second stands alone but for the points in the cell.
+    kept = [it for it in cell.readings if it.instrument == "t1" or it.point.startswith("n")]
+    found = aligned(replace(cell, readings=tuple(kept)))
+    for frames in (("base_a", "base_b"), ("instrument_t1", "instrument_t2")):
+        assert off(cell, found, *frames)[1] < 22.0
+    # Places alone were read: a point's axes are its parent's by choice.
+    assert not found.edge_of("point_n1").oriented
+    assert all(it.residual_deg is None for it in found.sights)
+    # Some 250 coordinates tell what a tracker's noise is of what is said of it, to 5 %.
+    assert found.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
+
+
+def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
+    cell = simulate_network(
+        NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS)
+    )
+    found = aligned(cell)
+    (remedy,) = {it.remedy for it in found.untied if it.frame == "instrument_t1"}
+    assert "read points on a robot's flange" in remedy
 
 
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():

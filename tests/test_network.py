@@ -17,7 +17,7 @@ from visioncal.estimator.networkfit import (
     posterior,
 )
 from visioncal.stages.choose import Candidates
-from visioncal.stages.grow import Sighted
+from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import tie
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
@@ -40,6 +40,7 @@ def sighted(network, **turned):
         Candidates(seen.measured[:, None], np.ones((count, 1), dtype=bool)),
         np.zeros((count, 1), dtype=np.int64),
         turned,
+        ~seen.turned,
     )
 
 

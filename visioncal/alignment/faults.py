@@ -124,7 +124,9 @@ def reasons(solved: Solved) -> dict[int, str]:
     robots = _exchanged_robots(solved, mutual)
     found = {}
     for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
-        words = f"disagrees with the rest of the cell by {figure(mm)} mm and {figure(deg)} deg"
+        words = f"disagrees with the rest of the cell by {figure(mm)} mm"
+        if solved.agreed.network.sightings.turned[at]:
+            words += f" and {figure(deg)} deg"
         if at in robots:
             words += f": {robots[at]}"
         elif at in mutual:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.alignment.cell import Cell
+from visioncal.alignment.reading import readings
 from visioncal.errors import DataError, VisioncalError
 from visioncal.session import Session, View, frame_name
 from visioncal.session.tables import CameraTable
@@ -13,7 +14,7 @@ from visioncal.stages.detect import detect
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses
 from visioncal.targets import first_corners
-from visioncal.types import Camera, Corners, FloatArray, Progress
+from visioncal.types import Camera, Corners, Progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,8 @@ class Looked:
 
     Attributes:
         cameras: By the camera's frame.
-        poses: The poses of all views, those that the session gives itself among them.
+        poses: The poses of all views, with those that the session gives itself and what
+            instruments read.
         reasons: Why views cannot be used.
         warnings: What the images do not determine, in words.
     """
@@ -64,7 +66,7 @@ def look_around(
         DataError: A camera's images are of another size, or too few to estimate its lens.
     """
     session = cell.session
-    looked = Looked({}, given_poses(session))
+    looked = Looked({}, {**given_poses(session), **readings(cell)})
     for name, table in session.cameras.items():
         frame = frame_name("camera", name)
         mine = _images_of(session, frame)
@@ -149,8 +151,3 @@ def _check_resolution(frame: str, stated: tuple[int, int] | None, found: tuple[i
             culprits=[f"session.toml: cameras, {frame}: resolution"],
             next_step="Correct the resolution, or the column camera of these rows.",
         )
-
-
-def nominal_spread() -> FloatArray:
-    """Covariance (6, 6) of a pose that was given without one, but for its level [rad^2, m^2]."""
-    return np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)

@@ -103,13 +103,13 @@ def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:
 
 def _edges(solved: Solved, named: Mapping[str, Version], spread: FloatArray) -> dict[str, Edge]:
     """The estimated transforms by the frames that they place."""
-    network = solved.agreed.network
-    return {
-        named[key].name: Edge(
-            solved.agreed.fit.state.edges[at], spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6]
-        )
-        for key, at in network.unknown.items()
-    }
+    network, found = solved.agreed.network, {}
+    for key, at in network.unknown.items():
+        block = spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6].copy()
+        if key in network.points:
+            block[:3] = block[:, :3] = 0.0
+        found[named[key].name] = Edge(solved.agreed.fit.state.edges[at], block)
+    return found
 
 
 def _noise(solved: Solved) -> dict[str, dict[str, float]]:
@@ -159,9 +159,15 @@ def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
             bool(used),
             why.get(row.view, ""),
             float(mm),
-            float(deg),
+            float(deg) if turned else None,
         )
-        for row, used, (mm, deg) in zip(solved.cell.rows, solved.agreed.used, away, strict=True)
+        for row, used, turned, (mm, deg) in zip(
+            solved.cell.rows,
+            solved.agreed.used,
+            solved.agreed.network.sightings.turned,
+            away,
+            strict=True,
+        )
     }
     lost = solved.cell.reasons
     for it in cell.session.observations:

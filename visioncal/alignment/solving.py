@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.alignment.cell import Cell
-from visioncal.alignment.looking import CameraLook, Looked, nominal_spread
+from visioncal.alignment.looking import CameraLook, Looked
+from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimator.joint import Problem, Scene, chance_limit
 from visioncal.estimator.linalg import covariance
@@ -15,11 +16,11 @@ from visioncal.estimator.networkagree import Agreed, agree, settle
 from visioncal.estimator.networkfit import fit_network, normal_equations
 from visioncal.estimator.networklooks import Looks, Seen
 from visioncal.stages.choose import chosen, padded
-from visioncal.stages.grow import Sighted
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
 from visioncal.targets import first_corners, rotation_transforms
-from visioncal.types import Corners, FloatArray, IntArray, Target
+from visioncal.types import Corners, FloatArray, IntArray, Mask, Target
 
 # Values that move by less than this share of their sigma have settled.
 _SETTLED, _ROUNDS = 0.02, 6
@@ -142,15 +143,27 @@ def _sighted(cell: Cell, views: Sequence[ViewPoses], targets: Mapping[str, Targe
             for frame, it in targets.items()
             if len(turned := rotation_transforms(it)) > 1
         },
+        _places(cell),
     )
+
+
+def _places(cell: Cell) -> Mask:
+    """(n,) whether each observation tells a place alone."""
+    alone = places_alone(cell)
+    return np.array([alone[it.view] for it in cell.rows], dtype=bool)
 
 
 def _network(cell: Cell, views: Sequence[ViewPoses]) -> Network:
     """The network of views with one pose each, lenses and boards as they are taken to be."""
     given = np.array([not it.covariance.any() for it in views])
-    sensors = {it: at for at, it in enumerate(sensors_of(cell, views))}
-    spread = np.array([it.covariance[0] for it in views])
+    levels = {it: at for at, it in enumerate(sensors_of(cell, views))}
+    sensors = [
+        levels[row.seer] if is_sensed(row.seer, view) else -1
+        for row, view in zip(cell.rows, views, strict=True)
+    ]
+    spread, places = np.array([it.covariance[0] for it in views]), _places(cell)
     spread[given] = nominal_spread()
+    turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
     return Network(
         cell.tree,
         cell.poses,
@@ -158,28 +171,26 @@ def _network(cell: Cell, views: Sequence[ViewPoses]) -> Network:
             tuple(it.seer for it in cell.rows),
             tuple(it.seen for it in cell.rows),
             np.array([it.station for it in cell.rows]),
-            np.array(
-                [
-                    sensors[row.seer] if is_given else -1
-                    for row, is_given in zip(cell.rows, given.tolist(), strict=True)
-                ],
-                dtype=np.int64,
-            ),
+            np.array(sensors, dtype=np.int64),
             np.array([it.cam_from_target[0] for it in views]),
             spread,
-            np.ones(len(views), dtype=bool),
+            ~places,
             np.zeros((len(views), 6, 0)),
         ),
         Common.none(),
+        frozenset(it.seen for it in cell.rows) - turned,
     )
+
+
+def is_sensed(seer: str, view: ViewPoses) -> bool:
+    """Whether an observation's noise is known up to a level: those of corners is known."""
+    return seer.startswith("instrument") or not view.covariance.any()
 
 
 def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
     """The frames whose observations have a noise level of their own."""
-    seers = [
-        row.seer for row, view in zip(cell.rows, views, strict=True) if not view.covariance.any()
-    ]
-    return tuple(dict.fromkeys(seers))
+    pairs = zip(cell.rows, views, strict=True)
+    return tuple(dict.fromkeys(row.seer for row, view in pairs if is_sensed(row.seer, view)))
 
 
 def _with_looks(
@@ -292,9 +303,3 @@ class _Scores:
         at = np.concatenate([np.arange(edges), edges + np.searchsorted(self.free, free)])
         gradient = self.gradient[at]
         return float(gradient @ covariance(self.information[np.ix_(at, at)]) @ gradient)
-
-
-def edges_spread(solved: Solved, spread: FloatArray) -> FloatArray:
-    """The part of a covariance of all unknowns that is of the edges."""
-    count = 6 * len(solved.agreed.network.unknown)
-    return spread[:count, :count]

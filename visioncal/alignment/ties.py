@@ -47,6 +47,11 @@ def untied_words(cell: Cell, frame: str) -> str:
         ways.append(f"put a board on {flange} and let {some_of(seeing)} see it at 5 stops or more")
     if not ways and flange and lying:
         ways.append(f"put a camera on {flange} that sees {some_of(lying)} at 5 stops or more")
+    if frame.startswith(("instrument", "point")):
+        ways = [
+            "let an instrument read points on a robot's flange at 5 stops or more, or three points "
+            "that an instrument reads which is tied"
+        ]
     if not ways:
         ways.append("let a camera that is tied see a board that hangs on it")
     return f"To tie {frame}: {', or '.join(ways)}."

@@ -21,6 +21,8 @@ from visioncal.types import FloatArray, IntArray, Mask
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
 _UNTOLD = 1.0
+# Information that keeps a rotation that is a matter of choice [1 / rad^2].
+_CHOSEN = 1e12
 # What a flange's error may be where nothing was seen of it [rad^2 and m^2]: nothing is known.
 ANYTHING = 1e4
 
@@ -157,12 +159,14 @@ class Network:
         poses: (s, 4, 4) `base_from_flange` by robot and stop; not a number where unknown.
         sightings: What was seen.
         common: What is known of the values that are shared.
+        points: Frames of which only the place is asked for: their rotation is a matter of choice.
     """
 
     tree: Tree
     poses: Mapping[str, FloatArray]
     sightings: Sightings
     common: Common
+    points: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         return len(self.sightings)
@@ -175,6 +179,15 @@ class Network:
     def unknown(self) -> Mapping[str, int]:
         """Places of the unknown frames among the edges."""
         return {name: at for at, name in enumerate(self.tree.unknown)}
+
+    @cached_property
+    def chosen(self) -> FloatArray:
+        """(p,) information that keeps what is a matter of choice: rotations of points."""
+        kept = np.zeros(self.size)
+        for name, at in self.unknown.items():
+            if name in self.points:
+                kept[6 * at : 6 * at + 3] = _CHOSEN
+        return kept
 
     @property
     def size(self) -> int:

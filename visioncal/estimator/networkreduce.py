@@ -63,6 +63,7 @@ def reduce(network: Network, state: State, linear: Linear, weights: FloatArray) 
     known, shared = network.common, state.shared
     edges = 6 * len(state.edges)
     total[edges:size, edges:size] += known.information
+    total[np.arange(size), np.arange(size)] += network.chosen
     pull = known.information @ shared + known.pull
     total[edges:size, -1] += pull
     cost = float(total[-1, -1] + shared @ (known.pull + pull))

@@ -12,110 +12,18 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from visioncal.estimator.networktree import Step, Tree
 from visioncal.stages.choose import CLEAR_RATIO, Candidates
 from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
+from visioncal.stages.placing import placed_by_points
+from visioncal.stages.sighted import Growth, Pair
 from visioncal.stages.twoarms import between_arms
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray
 
-# The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
-_EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 # A view that is farther off than this says nothing more about which start is right [m].
 _FAR_M = 0.1
 # So many starts are tried, by turns of boards, and not more.
 _MOST_TRIED = 256
-
-
-@dataclass(frozen=True, eq=False)
-class Sighted:
-    """What n observations may have seen.
-
-    Attributes:
-        seers: (n,) the frame that saw.
-        seen: (n,) the frame that was seen.
-        stops: (n,) the stop, numbered from 0 in the order of time.
-        candidates: Padded (n, c, 4, 4) poses `seer_from_seen`, and their validity.
-        turns: (n, c) which turn of the target's own each candidate has applied.
-        turned: By the frame of a target that looks the same turned: (t, 4, 4) its turns.
-    """
-
-    seers: tuple[str, ...]
-    seen: tuple[str, ...]
-    stops: IntArray
-    candidates: Candidates
-    turns: IntArray
-    turned: Mapping[str, FloatArray]
-
-    def turns_of(self, frame: str) -> FloatArray:
-        """The turns (t, 4, 4) after which a frame looks the same; the identity comes first."""
-        return self.turned.get(frame, np.eye(4)[None])
-
-    def early(self, rows: IntArray) -> IntArray:
-        """The earliest of a pair's rows, which are in the order of time."""
-        last = _EARLY_SHARE * float(self.stops.max())
-        count = int(np.searchsorted(self.stops[rows], last, side="right"))
-        return rows[: max(count, _FEWEST_EARLY)]
-
-
-@dataclass(frozen=True, eq=False)
-class Relation:
-    """A transform between two frames of one body.
-
-    Attributes:
-        first: The one.
-        second: The other.
-        matrix: (4, 4) `first_from_second`.
-        sigma_m: What it is known to, rotations on a lever [m].
-        turns: (t, 4, 4) those by which the second may have been seen turned.
-    """
-
-    first: str
-    second: str
-    matrix: FloatArray
-    sigma_m: float
-    turns: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """The observations of one pair of frames.
-
-    Attributes:
-        seer: The frame that saw.
-        seen: The frame that was seen.
-        rows: The observations, in the order of time.
-        way: The way from the one to the other.
-    """
-
-    seer: str
-    seen: str
-    rows: IntArray
-    way: tuple[Step, ...]
-
-    @property
-    def robots(self) -> tuple[Step, ...]:
-        """The robots in the way."""
-        return tuple(it for it in self.way if it.robot)
-
-
-@dataclass(frozen=True, eq=False)
-class Growth:
-    """All that the tree may grow by.
-
-    Attributes:
-        tree: The frames.
-        poses: (s, 4, 4) `base_from_flange` by robot and stop.
-        sighted: What was seen.
-        pairs: The same by pairs of frames.
-        relations: What pairs say by themselves.
-    """
-
-    tree: Tree
-    poses: Mapping[str, FloatArray]
-    sighted: Sighted
-    pairs: Sequence[Pair]
-    relations: Sequence[Relation]
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +75,10 @@ def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
     by_turn: list[str] = []
     counts: list[int] = []
     while options := (
-        [*_related(growth, placed)] or [*_implied(growth, placed)] or [*_parted(growth, placed)]
+        [*_related(growth, placed)]
+        or [*_implied(growth, placed)]
+        or [*placed_by_points(growth, placed)]
+        or [*_parted(growth, placed)]
     ):
         # What a turned board places comes last: others may come by a way that is certain.
         name, matrices, _ = min(options, key=lambda it: (len(it[1]), it[2]))
@@ -195,7 +106,7 @@ def _implied(
     growth: Growth, placed: Mapping[str, FloatArray]
 ) -> Iterator[tuple[str, FloatArray, float]]:
     """Frames that are all that is not placed of what some views have to do with."""
-    for pair in growth.pairs:
+    for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = _factors(growth, pair, rows)
         missing = [it for it in factors if it.frame and it.frame not in placed]
@@ -221,7 +132,7 @@ def _parted(
     Views say `before * u * between * v * after = seen`, u and v being unknown: a hand-eye
     calibration with `between^-1` for its robot. Where three are unknown, two arms part them.
     """
-    for pair in growth.pairs:
+    for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = _factors(growth, pair, rows)
         open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
@@ -284,7 +195,7 @@ def _product(factors: Sequence[_Factor], placed: Mapping[str, FloatArray]) -> Fl
 def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
     """Mean distance [m] of the early views from what the placed frames predict."""
     away = []
-    for pair in growth.pairs:
+    for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
         factors = _factors(growth, pair, rows)
         if all(it.frame in placed for it in factors if it.frame):

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.networktree import Step, Tree
-from visioncal.stages.grow import Growth, Pair, Relation, Sighted, grow
+from visioncal.stages.grow import grow
 from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
+from visioncal.stages.placing import mounted_points
+from visioncal.stages.sighted import Growth, Pair, Relation, Sighted
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray, Mount
 
@@ -44,9 +46,11 @@ def tie(tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted) -> Tied:
     """
     pairs = _pairs(tree, sighted)
     relations = [*_known(tree)]
-    for pair in pairs:
+    growth = Growth(tree, poses, sighted, pairs, relations)
+    for pair in growth.oriented:
         relations += _solved(tree, poses, sighted, pair)
-    placed, ambiguous = grow(Growth(tree, poses, sighted, pairs, relations))
+    relations += mounted_points(growth)
+    placed, ambiguous = grow(growth)
     edges = {
         name: invert(placed[tree.branches[name].parent]) @ placed[name]
         for name in tree.unknown

@@ -1,0 +1,116 @@
+"""What was seen of a whole cell, as its start is found from it: by pairs of frames."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.estimator.networktree import Step, Tree
+from visioncal.stages.choose import Candidates
+from visioncal.types import FloatArray, IntArray, Mask
+
+# The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
+_EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
+
+
+@dataclass(frozen=True, eq=False)
+class Sighted:
+    """What n observations may have seen.
+
+    Attributes:
+        seers: (n,) the frame that saw.
+        seen: (n,) the frame that was seen.
+        stops: (n,) the stop, numbered from 0 in the order of time.
+        candidates: Padded (n, c, 4, 4) poses `seer_from_seen`, and their validity.
+        turns: (n, c) which turn of the target's own each candidate has applied.
+        turned: By the frame of a target that looks the same turned: (t, 4, 4) its turns.
+        places: (n,) whether a place alone was read; its rotation then says nothing.
+    """
+
+    seers: tuple[str, ...]
+    seen: tuple[str, ...]
+    stops: IntArray
+    candidates: Candidates
+    turns: IntArray
+    turned: Mapping[str, FloatArray]
+    places: Mask
+
+    def turns_of(self, frame: str) -> FloatArray:
+        """The turns (t, 4, 4) after which a frame looks the same; the identity comes first."""
+        return self.turned.get(frame, np.eye(4)[None])
+
+    def early(self, rows: IntArray) -> IntArray:
+        """The earliest of a pair's rows, which are in the order of time."""
+        last = _EARLY_SHARE * float(self.stops.max())
+        count = int(np.searchsorted(self.stops[rows], last, side="right"))
+        return rows[: max(count, _FEWEST_EARLY)]
+
+
+@dataclass(frozen=True, eq=False)
+class Relation:
+    """A transform between two frames of one body.
+
+    Attributes:
+        first: The one.
+        second: The other.
+        matrix: (4, 4) `first_from_second`.
+        sigma_m: What it is known to, rotations on a lever [m].
+        turns: (t, 4, 4) those by which the second may have been seen turned.
+    """
+
+    first: str
+    second: str
+    matrix: FloatArray
+    sigma_m: float
+    turns: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """The observations of one pair of frames.
+
+    Attributes:
+        seer: The frame that saw.
+        seen: The frame that was seen.
+        rows: The observations, in the order of time.
+        way: The way from the one to the other.
+    """
+
+    seer: str
+    seen: str
+    rows: IntArray
+    way: tuple[Step, ...]
+
+    @property
+    def robots(self) -> tuple[Step, ...]:
+        """The robots in the way."""
+        return tuple(it for it in self.way if it.robot)
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """All that the tree may grow by.
+
+    Attributes:
+        tree: The frames.
+        poses: (s, 4, 4) `base_from_flange` by robot and stop.
+        sighted: What was seen.
+        pairs: The same by pairs of frames.
+        relations: What pairs say by themselves.
+    """
+
+    tree: Tree
+    poses: Mapping[str, FloatArray]
+    sighted: Sighted
+    pairs: Sequence[Pair]
+    relations: Sequence[Relation]
+
+    @property
+    def oriented(self) -> tuple[Pair, ...]:
+        """The pairs of which rotations were measured, too."""
+        return tuple(it for it in self.pairs if not self.sighted.places[it.rows[0]])
+
+    @property
+    def pointed(self) -> tuple[Pair, ...]:
+        """The pairs of which places alone were read."""
+        return tuple(it for it in self.pairs if self.sighted.places[it.rows[0]])
