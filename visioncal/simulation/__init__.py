@@ -15,7 +15,7 @@ from visioncal.simulation.layout import (
     PointAt,
     RobotAt,
 )
-from visioncal.simulation.network import Network, Sight, simulate_network
+from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session, write_network
 from visioncal.simulation.optics import fine_camera, fisheye_camera, project, rays, wide_camera
 from visioncal.simulation.options import (
@@ -37,6 +37,7 @@ from visioncal.simulation.records import (
 )
 from visioncal.simulation.render import Scene, prepare_scene, render, render_view
 from visioncal.simulation.sag import Payload
+from visioncal.simulation.seen import Network, Sight
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
 from visioncal.simulation.warmup import (
     Heat,

@@ -13,14 +13,7 @@ from visioncal.session import MemoryImages, Session, View, frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell
 from visioncal.simulation.layout import CameraAt
-from visioncal.simulation.network import (
-    Network,
-    Sight,
-    board_named,
-    camera_named,
-    first_pushed,
-    sheet_named,
-)
+from visioncal.simulation.network import first_pushed
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import (
     noisy_pose,
@@ -31,6 +24,7 @@ from visioncal.simulation.records import (
 )
 from visioncal.simulation.render import Scene, encode, prepare_scene, render
 from visioncal.simulation.second import Shown
+from visioncal.simulation.seen import Network, Sight, board_named, camera_named, sheet_named
 from visioncal.simulation.standing import Stream, stream
 from visioncal.types import FloatArray
 
