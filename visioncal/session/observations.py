@@ -13,7 +13,7 @@ from visioncal.session.table import View
 from visioncal.transforms import pose_difference
 
 # Reports of one robot at one stop that are farther apart are of two poses [mm, deg, rad].
-_APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.3, 5e-3
+_APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.1, 2e-3
 
 
 @dataclass(frozen=True, eq=False)
