@@ -94,6 +94,28 @@ class CellScene:
             return None
         return np.asarray(robot.base_from_flange(q[None])[0])
 
+    @cached_property
+    def shown(self) -> Mapping[int, Mapping[str, int]]:
+        """By view and by flange, the view by which it is drawn: its own stop's, or the last before.
+
+        A robot that is not told of yet is drawn as it is told of first.
+        """
+        drawn: dict[int, dict[str, int]] = {}
+        last: dict[str, int] = {}
+        for view in reversed(self.session.views):
+            last |= self._telling(view.number)
+        for view in self.session.views:
+            last |= self._telling(view.number)
+            drawn[view.number] = dict(last)
+        return drawn
+
+    def _telling(self, view: int) -> dict[str, int]:
+        return {it: view for it in self.found.robots if self.flange(it, view) is not None}
+
+    def untold(self, view: int) -> list[str]:
+        """The robots of which nothing tells where they stood at the stop of a view."""
+        return [it for flange, it in self.found.robots.items() if self.flange(flange, view) is None]
+
     def in_cell(self, frame: str, view: int) -> FloatArray | None:
         """(4, 4) where a frame is in the cell at the stop of a view; None where that is unknown."""
         matrix = np.eye(4)
@@ -291,7 +313,8 @@ def _log_view(
     # Without a strip, this takes that of the view before off the screen.
     size_m = 2.0 * scene.size_m
     _log_lines(stream, paths.SIGHT_LINE, paths.CELL_FRAME, strips, colour, size_m, static=False)
-    stream.log(paths.VIEW_NOTE, _markdown(sight_markdown(view, sight)))
+    note = sight_markdown(view, sight, scene.untold(view.number))
+    stream.log(paths.VIEW_NOTE, _markdown(note))
 
 
 def _middle(scene: CellScene, frame: str, cell_from_frame: FloatArray) -> FloatArray:
@@ -302,8 +325,9 @@ def _middle(scene: CellScene, frame: str, cell_from_frame: FloatArray) -> FloatA
 
 
 def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: View) -> None:
-    """Places a flange and draws its arm; where nothing tells the pose, both are gone."""
-    pose, base = scene.flange(flange, view.number), scene.found.frames[flange]
+    """Places a flange and draws its arm, as its stop tells it or the last one that did."""
+    by = scene.shown[view.number].get(flange, view.number)
+    pose, base = scene.flange(flange, by), scene.found.frames[flange]
     if pose is None:
         stream.log(frame_entity(flange), rr.Clear(recursive=False))
         stream.log(arm_entity(flange), rr.Clear(recursive=True))
@@ -312,7 +336,7 @@ def _log_robot(stream: rr.RecordingStream, scene: CellScene, flange: str, view: 
         translation=pose[:3, 3], mat3x3=pose[:3, :3], parent_frame=base, child_frame=flange
     )
     stream.log(frame_entity(flange), placed)
-    robot, q = scene.robots.get(flange), scene.told[view.number][flange].joints_rad
+    robot, q = scene.robots.get(flange), scene.told[by][flange].joints_rad
     if robot is not None and q is not None and len(q) == robot.joint_count:
         log_arm(stream, robot.link_frames(q), arm_entity(flange))
         return

@@ -1,5 +1,7 @@
 """What a recording says of an aligned cell, in Markdown."""
 
+from collections.abc import Sequence
+
 from visioncal.calibration import Alignment, Sight
 from visioncal.recording.notes import HEADLINES, edge_line, plain
 from visioncal.recording.numbers import significant
@@ -24,8 +26,14 @@ def verdict_markdown(found: Alignment) -> str:
     return "\n".join(lines)
 
 
-def sight_markdown(view: View, sight: Sight | None) -> str:
-    """One view: who saw whom, and what became of it."""
+def sight_markdown(view: View, sight: Sight | None, untold: Sequence[str]) -> str:
+    """One view: who saw whom, and what became of it.
+
+    Args:
+        view: The view.
+        sight: What it observed; None where it tells of the lens or of a robot alone.
+        untold: The robots of which nothing tells where they stood.
+    """
     if sight is None:
         what = "for the lens alone" if view.is_of_lens else "it tells where a robot stood"
         return f"**View {view.number}**: {what}."
@@ -36,4 +44,7 @@ def sight_markdown(view: View, sight: Sight | None) -> str:
         turned = "" if sight.residual_deg is None else f", {significant(sight.residual_deg)} deg"
         lines.append(f"Off by {significant(sight.residual_mm)} mm{turned}.")
     lines.append("Used." if sight.used else f"Not used: {plain(sight.reason)}")
+    if untold and not view.is_of_lens:
+        names = ", ".join(map(plain, untold))
+        lines.append(f"Where {names} stood is not told at this stop: drawn as it was last.")
     return "\n\n".join(lines)
