@@ -24,7 +24,7 @@ from visioncal.recording.frames import Frame, scan
 from visioncal.recording.numbers import significant
 from visioncal.recording.reader import chunks
 from visioncal.recording.recorder import Recorder
-from visioncal.recording.scene import frustum, log_image_plane
+from visioncal.recording.scene import image_plane
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.observations import standing
@@ -32,7 +32,7 @@ from visioncal.types import FloatArray, Target
 
 _RESULT = "visioncal.Alignment"
 # Sizes of what is drawn, as shares of the cell's size.
-_AXIS, _FRUSTUM, _LINE = 0.08, 0.06, 0.0015
+_AXIS, _LINE = 0.08, 0.0015
 # The network: the height of the bodies' names, and the drawing's units [px].
 _BODY_HEIGHT, _ACROSS_PX, _DOWN_PX = 3.6, 110.0, 120.0
 
@@ -242,8 +242,14 @@ def _log_frame(stream: rr.RecordingStream, scene: CellScene, frame: str, on: str
         sheet = board.sheet(scene.targets[frame])
         stream.log(f"{entity}/sheet", rr.CoordinateFrame(frame), sheet, static=True)
     if frame in scene.found.cameras:
-        rim = frustum(scene.found.cameras[frame].camera, _FRUSTUM * scene.size_m)
-        _log_lines(stream, f"{entity}/frustum", frame, rim, colours.USED, scene.size_m)
+        image = _image_frame(frame)
+        plane = image_plane(scene.found.cameras[frame].camera, 0.5 * scene.size_m, (frame, image))
+        stream.log(f"{entity}/image", rr.CoordinateFrame(image), plane, static=True)
+
+
+def _image_frame(camera: str) -> str:
+    """The frame of a camera's images; the entity of all images goes from one to the other."""
+    return f"{paths.IMAGE_FRAME}_of_{camera}"
 
 
 def _log_lines(
@@ -302,10 +308,8 @@ def _log_view(
         ends = [scene.in_cell(it, view.number) for it in (sight.seer, sight.seen)]
         if ends[0] is not None and ends[1] is not None:
             strips = [np.array([ends[0][:3, 3], _middle(scene, sight.seen, ends[1])])]
-        camera = scene.found.cameras.get(sight.seer)
-        if camera is not None:
-            size_m = 0.5 * scene.size_m
-            log_image_plane(stream, camera.camera, size_m, frame=sight.seer, static=False)
+        if sight.seer in scene.found.cameras:
+            stream.log(paths.IMAGE, rr.CoordinateFrame(_image_frame(sight.seer)))
         if sight.residual_mm is not None:
             name = paths.USED if used else paths.REJECTED
             stream.log(residual_entity(sight.seer, name), rr.Scalars(sight.residual_mm))

@@ -40,10 +40,11 @@ def sight_markdown(view: View, sight: Sight | None, untold: Sequence[str]) -> st
     lines = [
         f"**View {sight.view}**, stop {sight.stop}: {plain(sight.seer)} saw {plain(sight.seen)}"
     ]
+    off = ""
     if sight.residual_mm is not None:
         turned = "" if sight.residual_deg is None else f", {significant(sight.residual_deg)} deg"
-        lines.append(f"Off by {significant(sight.residual_mm)} mm{turned}.")
-    lines.append("Used." if sight.used else f"Not used: {plain(sight.reason)}")
+        off = f"Off by {significant(sight.residual_mm)} mm{turned}. "
+    lines.append(off + ("Used." if sight.used else f"Not used: {plain(sight.reason)}"))
     if untold and not view.is_of_lens:
         names = ", ".join(map(plain, untold))
         lines.append(f"Where {names} stood is not told at this stop: drawn as it was last.")

@@ -262,35 +262,31 @@ class Scene:
         stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
 
 
-def log_image_plane(
-    stream: rr.RecordingStream,
-    camera: Camera,
-    size_m: float,
-    *,
-    frame: str = paths.CAM_FRAME,
-    static: bool = True,
-) -> None:
-    """Hangs the image into a camera's frame, as large as a cell of some size asks for.
+def log_image_plane(stream: rr.RecordingStream, camera: Camera, size_m: float) -> None:
+    """Hangs the image into the camera's frame, as large as a cell of some size [m] asks for."""
+    plane = image_plane(camera, size_m, (paths.CAM_FRAME, paths.IMAGE_FRAME))
+    stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), plane, static=True)
+
+
+def image_plane(camera: Camera, size_m: float, frames: tuple[str, str]) -> rr.Pinhole:
+    """How an image hangs in a camera's frame.
 
     Args:
-        stream: Where to.
-        camera: Its lens.
+        camera: The lens.
         size_m: Of the cell [m].
-        frame: The camera's frame.
-        static: Whether it hangs there for all views, or from the stream's current time on.
+        frames: Of the camera, and of its image.
     """
     matrix = matrix_3x3(camera)
     # Rerun puts the image's corner, not the first pixel's centre, at the origin.
     matrix[:2, 2] += 0.5
-    pinhole = rr.Pinhole(
+    return rr.Pinhole(
         image_from_camera=matrix,
         resolution=camera.resolution,
         camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=_FRUSTUM * size_m,
-        parent_frame=frame,
-        child_frame=paths.IMAGE_FRAME,
+        parent_frame=frames[0],
+        child_frame=frames[1],
     )
-    stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), pinhole, static=static)
 
 
 def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:

@@ -24,7 +24,9 @@ def cell_blueprint(session: Session, found: Alignment) -> rrb.Blueprint:
     has_images = any(view.image for view in session.views)
     verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
     note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
-    image = rrb.Spatial2DView(name="Image", origin=paths.IMAGE, contents=["$origin/**"])
+    image = rrb.Spatial2DView(
+        name="Image", origin=paths.IMAGE, contents=["$origin/**"], visual_bounds=_bounds(found)
+    )
     right = (
         rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.0, 1.4])
         if has_images
@@ -51,6 +53,15 @@ def cell_blueprint(session: Session, found: Alignment) -> rrb.Blueprint:
         rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
         rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
     )
+
+
+def _bounds(found: Alignment) -> rrb.VisualBounds2D | None:
+    """What holds the largest image of all cameras."""
+    sizes = [it.camera.resolution for it in found.cameras.values()]
+    if not sizes:
+        return None
+    width, height = (float(max(it)) for it in zip(*sizes, strict=True))
+    return rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
 
 
 def _cell(found: Alignment) -> rrb.Spatial3DView:
