@@ -13,7 +13,7 @@ from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.exports import Selection, document, export
 from visioncal.simulation import fisheye_camera, wide_camera
-from visioncal.stored import load_exportable
+from visioncal.stored import load_calibration, load_exportable
 from visioncal.transforms import invert
 
 CELL = made_up_cell(4)
@@ -98,3 +98,10 @@ def test_a_bad_verdict_is_warned_of():
     bad = replace(CELL, verdict=replace(CELL.verdict, status="bad"))
     assert document(bad, "ros", Selection("all")).warnings
     assert not document(CELL, "ros", Selection("all")).warnings
+
+
+def test_what_needs_a_calibration_says_what_it_was_given(tmp_path):
+    CELL.save(tmp_path / "alignment.json")
+    for path in (tmp_path, tmp_path / "alignment.json"):
+        with pytest.raises(DataError, match="holds the alignment of a whole cell"):
+            load_calibration(path)

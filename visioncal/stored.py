@@ -50,6 +50,8 @@ def load_calibration(path: Path) -> Calibration:
         except DataError as error:
             if _holds_frames(path):
                 raise _frames_alone(path) from error
+            if _is_cell(path):
+                raise _cell_alone(path) from error
             raise
     # The codec takes half a second to import, which a calibration.json need not wait for.
     from visioncal.recording import read_calibration
@@ -85,12 +87,23 @@ def load_exportable(path: Path) -> Calibration | FrameFile | Alignment:
     Raises:
         DataError: There is none of them, or it cannot be read.
     """
+    return find_alignment(path) or load_placed(path)
+
+
+def find_alignment(path: Path) -> Alignment | None:
+    """Loads the alignment of a whole cell, where a path is of one.
+
+    Args:
+        path: An alignment.json, a folder with one and no calibration.json, or a recording.
+
+    Raises:
+        DataError: It is one that cannot be read.
+    """
     if path.suffix.lower() == ".rrd":
         from visioncal.recording import read_alignment
 
-        return read_alignment(path) or load_placed(path)
-    cell = path.is_dir() and not (path / CALIBRATION).exists() and (path / ALIGNMENT).is_file()
-    return Alignment.load(path) if cell or _holds_cell(path) else load_placed(path)
+        return read_alignment(path)
+    return Alignment.load(path) if _is_cell(path) else None
 
 
 def _holds_frames(path: Path) -> bool:
@@ -102,6 +115,19 @@ def _holds_frames(path: Path) -> bool:
 def _holds_cell(path: Path) -> bool:
     """Tells the alignment of a cell by its content: a calibration has no reference."""
     return {"reference", "transforms"} <= _content(path).keys()
+
+
+def _is_cell(path: Path) -> bool:
+    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / ALIGNMENT).is_file()
+    return alone or _holds_cell(path)
+
+
+def _cell_alone(path: Path) -> DataError:
+    return DataError(
+        f"{path} holds the alignment of a whole cell, and this takes the calibration of one camera.",
+        culprits=[str(path)],
+        next_step="Name the output folder of visioncal calibrate.",
+    )
 
 
 def _content(path: Path) -> dict[str, object]:

@@ -7,13 +7,15 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.stored import load_stored
+from visioncal.stored import find_alignment, load_stored
 
 
 def report_command(
     calibration: Annotated[
         Path,
-        typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd)."),
+        typer.Argument(
+            help="An output folder, its calibration.json or alignment.json, or a recording (.rrd)."
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The file to write.")] = Path(
         "report.html"
@@ -27,6 +29,13 @@ def report_command(
     # Plots take half a second to import, which help need not wait for.
     from visioncal.report import write_report
 
+    cell = find_alignment(calibration)
+    if cell is not None:
+        from visioncal.report.cells import write_cell_report
+
+        write_cell_report(out, cell)
+        messages().print(f"wrote {escape(str(out))}")
+        return
     stored = load_stored(calibration)
     write_report(out, stored.calibration, stored.session, stored.evidence, stored.note)
     if stored.note:

@@ -19,6 +19,13 @@ from visioncal.version import __version__
 
 _DEG = "\N{DEGREE SIGN}"
 _WIDE_IN = 9.2
+_KINDS = {
+    "robot": "flange",
+    "camera": "cam",
+    "board": "target",
+    "instrument": "instrument",
+    "point": "point",
+}
 
 
 @dataclass(frozen=True)
@@ -35,10 +42,12 @@ class PairTable:
 
     Attributes:
         title: What carries them.
-        rows: One a frame.
+        columns: The frames.
+        rows: One for each frame in which the others are told.
     """
 
     title: str
+    columns: tuple[str, ...]
     rows: tuple[PairRow, ...]
 
 
@@ -71,6 +80,7 @@ def render_cell(found: Alignment) -> str:
         found=found,
         headline=content.headline(found.verdict),
         created=content.readable_time(found.created),
+        kinds=_kinds(found),
         key_figures=_key_figures(found),
         graph=network.graph(found),
         links=[_link_row(it) for it in cellmap.pairs(found)],
@@ -84,6 +94,17 @@ def render_cell(found: Alignment) -> str:
         python=platform.python_version(),
         versions=content.dependency_versions(),
     )
+
+
+def _kinds(found: Alignment) -> str:
+    """How many robots, cameras, boards and the like there are, in words."""
+    former = {it.before for it in found.moved}
+    words = []
+    for kind, start in _KINDS.items():
+        count = sum(it.startswith(start) and it not in former for it in found.frames)
+        if count:
+            words.append(f"{count} {kind}{'' if count == 1 else 's'}")
+    return ", ".join(words)
 
 
 def _key_figures(found: Alignment) -> list[Fact]:
@@ -126,16 +147,23 @@ def pair_table(found: Alignment, body: str) -> PairTable | None:
         frames = [body, *frames]
     if len(frames) < 2:
         return None
-    rows = tuple(PairRow(a, tuple(_between(found, a, b) for b in frames)) for a in frames)
-    return PairTable("the cell" if body == "cell" else body, rows)
+    # In the frame of a point alone nothing has a place: its axes are chosen.
+    turned = [it for it in frames if _is_turned(found, it)]
+    rows = tuple(PairRow(a, tuple(_between(found, a, b) for b in frames)) for a in turned)
+    return PairTable("the cell" if body == "cell" else body, tuple(frames), rows)
 
 
 def _between(found: Alignment, first: str, second: str) -> str:
     if first == second:
         return ""
     edge = found.between(first, second)
-    degrees = f", {significant(edge.sigma_deg)}{_DEG}" if edge.oriented else ""
+    degrees = f", {significant(edge.sigma_deg)}{_DEG}" if _is_turned(found, second) else ""
     return f"{significant(edge.sigma_mm)} mm{degrees}"
+
+
+def _is_turned(found: Alignment, frame: str) -> bool:
+    """Whether a frame's rotation was measured, or is what others are told in."""
+    return frame in (*found.robots, found.reference) or found.edge_of(frame).oriented
 
 
 def _noise_facts(found: Alignment) -> list[Fact]:
@@ -174,7 +202,8 @@ def residuals(found: Alignment) -> Markup:
         panels = figure.subplots(len(shown), squeeze=False)[:, 0]
         for axes, (seer, rows) in zip(panels, shown.items(), strict=True):
             bars.draw(axes, [_bar(it) for it in rows], _rms(rows))
-            axes.set_ylabel(f"{seer} [mm]")
+            axes.set_ylabel("mm")
+            axes.set_title(seer, loc="left", fontsize=9)
         panels[-1].set_xlabel("view")
         return svg.inline(figure, "cell-residuals", "Bars: residuals of each observation")
 

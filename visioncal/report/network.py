@@ -13,6 +13,8 @@ from visioncal.report import svg
 
 # Sizes of a frame's box, in the units of the drawing.
 _BOX_W, _BOX_H = 1.36, 0.44
+# The size of a frame's name, and how many letters of it have room.
+_NAME_SIZE, _NAME_LENGTH = 7.5, 15
 _INCHES, _NARROWEST_IN = 0.72, 7.0
 
 
@@ -78,7 +80,8 @@ def _draw_frame(
             zorder=4,
         )
     )
-    axes.text(x, y + 0.1, name, ha="center", va="center", fontsize=7.5, zorder=5)
+    size = min(_NAME_SIZE, _NAME_SIZE * _NAME_LENGTH / len(name))
+    axes.text(x, y + 0.1, name, ha="center", va="center", fontsize=size, zorder=5)
     worth = "the reference"
     if name != found.reference:
         edge = found.edge_of(name)
