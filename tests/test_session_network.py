@@ -268,3 +268,57 @@ def test_boards_on_either_side_of_one_camera_are_for_align(tmp_path):
         DataError, match="and target_floor on cell; this takes boards on the flange"
     ):
         calibrate(session)
+
+
+def test_one_camera_may_have_any_name_but_two_need_tables(tmp_path):
+    (tmp_path / "session.toml").write_text(
+        'schema = 1\nname = "one"\nmount = "eye-in-hand"\ntarget = "charuco_9x6_30mm"\n[camera]\n'
+    )
+    table = f"view,camera,image,x_m,y_m,z_m,qx,qy,qz,qw\n0,any,a.png,{POSE}\n1,{{}},b.png,{POSE}\n"
+    (tmp_path / "views.csv").write_text(table.format("any"))
+    assert list(Session.load(tmp_path).cameras) == [""]
+    (tmp_path / "views.csv").write_text(table.format("other"))
+    with pytest.raises(
+        DataError, match=r"names any, other, but .* the one camera for all"
+    ) as caught:
+        Session.load(tmp_path)
+    assert "[cameras.any], [cameras.other]" in caught.value.next_step
+
+
+def test_robots_of_six_and_of_seven_joints_share_columns(tmp_path):
+    (tmp_path / "session.toml").write_text(
+        'schema = 1\nname = "two"\n[cameras]\ntop = {}\n[robots]\na = "ur5e"\nb = "iiwa"\n'
+        '[targets]\nplate = "charuco_9x6_30mm"\n[frames]\ncam_top = "cell"\n'
+        'target_plate = "flange_b"\n'
+    )
+    header = "view,stop,robot,image," + ",".join(f"q{at}_rad" for at in range(1, 8))
+    rows = "0,0,a,,1,2,3,1,2,3,\n1,0,b,a.png,1,2,3,1,2,3,1\n"
+    (tmp_path / "views.csv").write_text(f"{header}\n{rows}")
+    session = Session.load(tmp_path)
+    assert [len(it.joints_rad) for it in session.views] == [6, 7]
+    # A model that is unknown is a warning until something needs it.
+    assert any("robots.b.model" in it for it in session.warnings)
+    assert list(session.robot_documents) == ["a"]
+    (tmp_path / "views.csv").write_text(f"{header}\n{rows.replace('0,a,,1,2,', '0,a,,1,,')}")
+    with pytest.raises(DataError, match="column q2_rad: it is empty while q1_rad is filled"):
+        Session.load(tmp_path)
+
+
+def test_points_are_on_what_moves_while_they_are_read(tmp_path):
+    (tmp_path / "session.toml").write_text(
+        'schema = 1\nname = "two"\n[robots]\na = "ur5e"\nb = "ur5e"\n'
+        "[instruments.east]\nsigma_m = 1e-5\n[instruments.west]\nsigma_m = 1e-5\n"
+    )
+    (tmp_path / "views.csv").write_text(
+        "view,stop,robot,instrument,point,meas_x_m,meas_y_m,meas_z_m,x_m,y_m,z_m,qx,qy,qz,qw\n"
+        f"0,0,b,east,ball,1,2,3,{POSE}\n1,0,,east,nest,1,2,3,,,,,,,\n2,0,,west,nest,1,2,3,,,,,,,\n"
+    )
+    session = Session.load(tmp_path)
+    assert session.frames["point_ball"] == "flange_b"
+    assert session.frames["point_nest"] == session.frames["instrument_east"] == "cell"
+    found = [(it.seer, it.seen, tuple(it.robots)) for it in session.observations]
+    assert found == [
+        ("instrument_east", "point_ball", ("b",)),
+        ("instrument_east", "point_nest", ()),
+        ("instrument_west", "point_nest", ()),
+    ]

@@ -124,7 +124,7 @@ def _is_cell(path: Path) -> bool:
 
 def _cell_alone(path: Path) -> DataError:
     return DataError(
-        f"{path} holds the alignment of a whole cell, and this takes the calibration of one camera.",
+        f"{path} holds the alignment of a whole cell, and a calibration of one camera is needed.",
         culprits=[str(path)],
         next_step="Name the output folder of visioncal calibrate.",
     )

@@ -218,8 +218,10 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
     yield from _unknown_keys(declaration, "", label)
-    for edge in () if declaration.is_network else declaration.prior:
-        if edge not in _EDGES:
+    for edge in declaration.prior:
+        if declaration.is_network:
+            yield f"{label}: prior.{edge} is for one camera and one robot, and is ignored here."
+        elif edge not in _EDGES:
             hint = did_you_mean(edge, _EDGES)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
     if declaration.camera is not None:
