@@ -23,6 +23,7 @@ from visioncal.formats.wishes import Wishes
 from visioncal.formats.zivid import ZIVID
 from visioncal.guess import Candidate
 from visioncal.session import Session
+from visioncal.session.single import check_one_of_each
 
 OWN_FORMATS: tuple[OwnFormat, ...] = (FOLDER, RECORDING)
 
@@ -93,6 +94,7 @@ def convert(
         session = own.read(source)
     else:
         session = load_in_doubt(source)
+        check_one_of_each(session)
         session = reread_session(session, choose(session))
     write_session(session, dest)
     return session

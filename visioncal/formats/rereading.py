@@ -17,7 +17,6 @@ from visioncal.guess.hypothesis import Hypothesis
 from visioncal.pipeline.guessing import chain_poses, numbers_in, seen_poses, told_or_chained
 from visioncal.session import Session, Stream
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
-from visioncal.session.single import check_one_of_each
 from visioncal.targets import LARGEST_M
 from visioncal.types import MOUNTS, FloatArray, IntArray, Progress
 
@@ -109,7 +108,6 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
     Raises:
         DataError: The session that comes out is wrong; or as `reread`.
     """
-    check_one_of_each(session)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     robot, camera = numbers_in(session, POSE), numbers_in(session, MEASURED_CAM_POSE)
     taken = candidate.hypothesis
