@@ -10,6 +10,7 @@ from commands import visioncal
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.errors import DataError, DegenerateError
+from visioncal.session import Session
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
@@ -225,6 +226,51 @@ def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_
     found = aligned(cell)
     (remedy,) = {it.remedy for it in found.untied if it.frame == "instrument_t1"}
     assert "read points on a robot's flange" in remedy
+
+
+ERRING = (
+    RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
+    RobotAt("b", (0.6, 0.05, 0.02), offset_sigma_rad=1e-3),
+)
+
+
+def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
+    cell = simulate_network(NetworkOptions(robots=ERRING, stops=STOPS))
+    session = network_session(cell, "cell", seen="names")
+    corners = {it.view: it for it in cell.corners}
+    reported = align(session, corners=corners)
+    assert sum("--arms offsets" in it for it in reported.verdict.reasons) == 2
+    found = align(session, corners=corners, arms="offsets")
+    assert not any("--arms" in it for it in found.verdict.reasons)
+    for robot in ("a", "b"):
+        told = found.details["arms"][robot]
+        true = (cell.true_arms[robot].offset - cell.arms[robot].offset)[1:-1]
+        # What the first joint and the last could take is the base's and the flange's.
+        away = np.abs(np.array(told["values"]) - true)
+        assert np.all(away < 5 * np.array(told["sigmas"]))
+        assert np.max(told["sigmas"]) < 2e-4
+        assert found.noise[robot]["translation_mm"] < 0.5 * reported.noise[robot]["translation_mm"]
+    assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
+    assert off(cell, reported, "cam_left", "cam_right")[1] > 22.0
+
+
+def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
+    cell, _ = clean
+    session = network_session(cell, "cell", seen="names")
+    columns = [it for it in session.columns if not it.startswith("q")]
+    columns += ["qx", "qy", "qz", "qw"]
+    bare = Session.assemble(
+        session.document,
+        columns,
+        [[view.cell(it) for it in columns] for view in session.views],
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+    )
+    found = align(bare, corners={it.view: it for it in cell.corners}, arms="offsets")
+    assert sum("stays as it reports itself" in it for it in found.verdict.reasons) == 2
+    with pytest.raises(DataError, match="arms is 'all'"):
+        align(bare, arms="all")
 
 
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():

@@ -178,7 +178,7 @@ def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
         )
         for twin, (frame, stop) in starts.items():
             here = here.renamed(frame, twin, np.arange(stations) >= stop)
-        there = Network(network.tree, network.poses, here, network.common)
+        there = replace(network, sightings=here)
         known = _known(there)
         if not known.any():
             continue

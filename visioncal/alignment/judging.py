@@ -216,9 +216,9 @@ def size_warnings(solved: Solved, spread: FloatArray) -> list[str]:
     if seen is None:
         return []
     looks, names = seen.looks, list(solved.cell.session.boards)
-    first = len(spread) - len(seen.free)
+    first = len(spread) - len(seen.free) - len(solved.arms)
     values = looks.values.copy()
-    values[seen.free] += solved.agreed.fit.state.shared
+    values[seen.free] += solved.agreed.fit.state.shared[: solved.looks_count]
     found = []
     for board, place in enumerate(looks.scales.tolist()):
         at = first + int(np.searchsorted(seen.free, place))

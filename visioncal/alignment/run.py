@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from visioncal.alignment.arms import ARMS_ASKED, ArmsAsked, erring_arms
 from visioncal.alignment.cell import Cell, read_cell
 from visioncal.alignment.faults import Version, movements, reasons, residuals, versions
 from visioncal.alignment.judging import check_determined, judge, size_warnings, weakest_link
@@ -13,6 +15,7 @@ from visioncal.alignment.looking import Looked, look_around
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Untied
+from visioncal.errors import DataError
 from visioncal.estimator.linalg import covariance, one_blas_thread
 from visioncal.estimator.networkfit import network_information
 from visioncal.session import Session
@@ -22,6 +25,7 @@ from visioncal.types import Corners, FloatArray, Progress
 def align(
     session: Session | Path | str,
     *,
+    arms: ArmsAsked = "reported",
     corners: Mapping[int, Corners] | None = None,
     progress: Progress | None = None,
 ) -> Alignment:
@@ -29,6 +33,8 @@ def align(
 
     Args:
         session: A session, or the path of its folder or recording.
+        arms: What is estimated of the robots themselves: nothing, the `offsets` of their joints, or
+            their whole `kinematics`; it takes joint angles and a model.
         corners: What was found in its images before, by view; None to look.
         progress: Told of long work.
 
@@ -39,13 +45,15 @@ def align(
         DataError: The input is wrong or shows no target.
         DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
     """
+    if arms not in ARMS_ASKED:
+        raise DataError(f"arms is {arms!r}, one of {', '.join(ARMS_ASKED)} is needed.")
     loaded = session if isinstance(session, Session) else Session.load(session)
     cell = read_cell(loaded)
     looked = look_around(cell, corners, progress)
     if progress is not None:
         progress("align", 0, 1)
     with one_blas_thread():
-        solved = solve(cell, looked)
+        solved = solve(cell, looked, arms)
         return alignment_of(cell, looked, solved)
 
 
@@ -77,7 +85,17 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
     }
     moved, noise = movements(solved), _noise(solved)
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
-    warnings = [*session.warnings, *looked.warnings, *size_warnings(solved, spread)]
+    missing = [
+        f"Robot {it} stays as it reports itself: its errors take joint angles and a known model."
+        for it in solved.arms.unasked
+    ]
+    warnings = [
+        *missing,
+        *_erring(solved),
+        *session.warnings,
+        *looked.warnings,
+        *size_warnings(solved, spread),
+    ]
     return Alignment(
         session_name=session.name,
         session_sha256=session.digest(),
@@ -94,7 +112,32 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
         untied=untied,
         weakest=weakest_link(solved.cell, last),
         verdict=judge(solved, last, noise, moved, untied, warnings),
+        details=_details(solved, spread),
     )
+
+
+def _erring(solved: Solved) -> list[str]:
+    """Words robots whose errors follow their posture, where these were not asked for."""
+    if len(solved.arms):
+        return []
+    agreed = solved.agreed
+    part = agreed.network.subset(agreed.used)
+    found = erring_arms(solved.cell, part, agreed.fit.state, agreed.fit.noise)
+    return [
+        f"The errors of robot {robot} follow its posture, as those of its own "
+        f"{'joint offsets' if asked == 'offsets' else 'kinematics'} do, and frames are off by more "
+        f"than is said. Align again with --arms {asked}."
+        for robot, asked in found.items()
+    ]
+
+
+def _details(solved: Solved, spread: FloatArray) -> dict[str, Any]:
+    """What was found of the arms, where it was asked for."""
+    count = len(solved.arms)
+    if not count:
+        return {}
+    values = solved.agreed.fit.state.shared[-count:]
+    return {"arms": solved.arms.document(values, spread[-count:, -count:])}
 
 
 def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:
@@ -135,8 +178,9 @@ def _cameras(solved: Solved, looked: Looked, spread: FloatArray) -> dict[str, Ca
     seen = solved.seen
     if seen is None:
         return {}
-    looks = seen.looks.moved(seen.free, solved.agreed.fit.state.shared)
-    first, found = len(spread) - len(seen.free), {}
+    change = solved.agreed.fit.state.shared[: solved.looks_count]
+    looks = seen.looks.moved(seen.free, change)
+    first, found = len(spread) - len(seen.free) - len(solved.arms), {}
     for name, look in looked.cameras.items():
         lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
         if not np.isin(lens, seen.free).all():

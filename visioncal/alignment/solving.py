@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.alignment.arms import ArmsAsked, ArmsErrors, arms_errors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook, Looked
 from visioncal.alignment.reading import nominal_spread, places_alone
@@ -36,6 +37,7 @@ class Solved:
         seen: What all corners say of lenses and boards; None without images.
         poses: Each row's one pose.
         untied: Frames that nothing ties to the rest.
+        arms: The robots' own errors; the last of what is shared.
     """
 
     cell: Cell
@@ -43,10 +45,21 @@ class Solved:
     seen: Seen | None
     poses: tuple[ViewPoses, ...]
     untied: tuple[str, ...]
+    arms: ArmsErrors
+
+    @property
+    def looks_count(self) -> int:
+        """How many values of lenses and boards are free: the first of what is shared."""
+        return 0 if self.seen is None else len(self.seen.free)
 
 
-def solve(cell: Cell, looked: Looked) -> Solved:
+def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
     """Solves a whole cell.
+
+    Args:
+        cell: The cell.
+        looked: What its cameras saw.
+        asked: What is to be estimated of the robots' arms.
 
     Raises:
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
@@ -61,10 +74,20 @@ def solve(cell: Cell, looked: Looked) -> Solved:
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, network, state, unplaced = _started(cell, views)
     agreed = agree(network, state, _movable(network))
-    seen = None
+    seen, arms = None, arms_errors(cell, asked)
     if looked.cameras:
-        agreed, seen = _with_looks(cell, looked.cameras, views, agreed)
-    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced))
+        agreed, seen = _with_looks(cell, looked.cameras, views, agreed, arms)
+    elif len(arms):
+        agreed = _with_arms(agreed, arms)
+    agreed = settle(agreed, _movable(agreed.network))
+    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
+
+
+def _with_arms(agreed: Agreed, arms: ArmsErrors) -> Agreed:
+    network = arms.added(agreed.network)
+    state = State(agreed.fit.state.edges, np.zeros(len(arms)))
+    fit = fit_network(network.subset(agreed.used), state, agreed.fit.noise)
+    return replace(agreed, network=network, fit=fit)
 
 
 def _movable(network: Network) -> tuple[str, ...]:
@@ -194,15 +217,19 @@ def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
 
 
 def _with_looks(
-    cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPoses], agreed: Agreed
+    cell: Cell,
+    cameras: Mapping[str, CameraLook],
+    views: Sequence[ViewPoses],
+    agreed: Agreed,
+    arms: ArmsErrors,
 ) -> tuple[Agreed, Seen]:
-    """Fits lenses and boards with the rest, and looks again what agrees."""
+    """Fits lenses and boards with the rest, and the arms' errors where they are asked for."""
     looks = _looks(cell, cameras, views)
-    agreed, seen = _settled(cell, looks, looks.first, agreed)
-    wider = _wider(cell, seen, agreed)
+    agreed, seen = _settled(cell, looks, looks.first, agreed, arms)
+    wider = _wider(cell, seen, agreed, arms)
     if len(wider) > len(seen.free):
-        agreed, seen = _settled(cell, seen.looks, wider, agreed)
-    return settle(agreed, _movable(agreed.network)), seen
+        agreed, seen = _settled(cell, seen.looks, wider, agreed, arms)
+    return agreed, seen
 
 
 def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPoses]) -> Looks:
@@ -228,18 +255,22 @@ def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPo
     return Looks.of(problems, poses)
 
 
-def _settled(cell: Cell, looks: Looks, free: IntArray, agreed: Agreed) -> tuple[Agreed, Seen]:
+def _settled(
+    cell: Cell, looks: Looks, free: IntArray, agreed: Agreed, arms: ArmsErrors
+) -> tuple[Agreed, Seen]:
     """Linearises corners and fits the cell in turn, until lenses and boards stay."""
+    bent = np.zeros(len(arms))
     for _ in range(_ROUNDS):
         seen = looks.seen(free)
-        network = with_seen(cell, agreed.network, seen)
-        state = State(agreed.fit.state.edges, np.zeros(len(free)))
+        network = arms.added(with_seen(cell, agreed.network, seen))
+        state = State(agreed.fit.state.edges, np.concatenate([np.zeros(len(free)), bent]))
         part = network.subset(agreed.used)
         fit = fit_network(part, state, agreed.fit.noise)
-        change = fit.state.shared
+        change, bent = np.split(fit.state.shared, [len(free)])
         sigma = np.sqrt(np.diag(covariance(normal_equations(part, fit.state, fit.noise)[0])))
+        sigma = sigma[6 * len(fit.state.edges) :][: len(free)]
         agreed = replace(agreed, network=network, fit=fit)
-        if np.all(np.abs(change) <= _SETTLED * sigma[len(sigma) - len(free) :]):
+        if np.all(np.abs(change) <= _SETTLED * sigma):
             break
         looks = seen.looks.moved(free, change)
     return agreed, seen
@@ -255,10 +286,10 @@ def with_seen(cell: Cell, network: Network, seen: Seen) -> Network:
     measured[mine] = seen.looks.poses[rows[mine]]
     spread[mine], by_free[mine] = seen.spread[rows[mine]], seen.by_free[rows[mine]]
     sightings = replace(network.sightings, measured=measured, covariance=spread, by_shared=by_free)
-    return replace(network, sightings=sightings, common=seen.common)
+    return replace(network, sightings=sightings, common=seen.common, by_flange={})
 
 
-def _wider(cell: Cell, seen: Seen, agreed: Agreed) -> IntArray:
+def _wider(cell: Cell, seen: Seen, agreed: Agreed, arms: ArmsErrors) -> IntArray:
     """What more the corners ask to set free: boards' bends, and lenses that were stated."""
     looks = seen.looks
     groups: list[IntArray] = [looks.shape_of(it) for it in range(len(looks.scales))]
@@ -269,7 +300,8 @@ def _wider(cell: Cell, seen: Seen, agreed: Agreed) -> IntArray:
     if not all(it.has_spare_corners for it in looks.problems.values()):
         return seen.free
     every = np.unique(np.concatenate([seen.free, *groups]))
-    scores = _Scores.of(with_seen(cell, agreed.network, looks.seen(every)), agreed, every)
+    network = arms.added(with_seen(cell, agreed.network, looks.seen(every)))
+    scores = _Scores.of(network, agreed, every, arms)
     free = seen.free
     while groups:
         gain, at = max((scores.gain(free, it), at) for at, it in enumerate(groups))
@@ -286,12 +318,15 @@ class _Scores:
     information: FloatArray
     gradient: FloatArray
     free: IntArray
+    arms: int
 
     @classmethod
-    def of(cls, network: Network, agreed: Agreed, free: IntArray) -> "_Scores":
-        state = State(agreed.fit.state.edges, np.zeros(len(free)))
+    def of(cls, network: Network, agreed: Agreed, free: IntArray, arms: ArmsErrors) -> "_Scores":
+        bent = agreed.fit.state.shared[len(agreed.fit.state.shared) - len(arms) :]
+        shared = np.concatenate([np.zeros(len(free)), bent])
+        state = State(agreed.fit.state.edges, shared)
         part = network.subset(agreed.used)
-        return cls(*normal_equations(part, state, agreed.fit.noise), free)
+        return cls(*normal_equations(part, state, agreed.fit.noise), free, len(arms))
 
     def gain(self, free: IntArray, group: IntArray) -> float:
         """By how much more than chance the squared error falls with a group free (Rao)."""
@@ -299,7 +334,8 @@ class _Scores:
         return self._score(np.union1d(free, more)) - self._score(free) - chance_limit(len(more))
 
     def _score(self, free: IntArray) -> float:
-        edges = len(self.gradient) - len(self.free)
-        at = np.concatenate([np.arange(edges), edges + np.searchsorted(self.free, free)])
+        size = len(self.gradient)
+        edges, arms = size - len(self.free) - self.arms, np.arange(size - self.arms, size)
+        at = np.concatenate([np.arange(edges), edges + np.searchsorted(self.free, free), arms])
         gradient = self.gradient[at]
         return float(gradient @ covariance(self.information[np.ix_(at, at)]) @ gradient)

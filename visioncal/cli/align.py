@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.alignment import align
+from visioncal.alignment import ArmsAsked, align
 from visioncal.calibration import Alignment
 from visioncal.cli.console import messages, print_verdict, shown_progress
 from visioncal.figures import figure
@@ -18,6 +18,13 @@ from visioncal.session import Session
 def align_command(
     session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")] = Path("out"),
+    arms: Annotated[
+        ArmsAsked,
+        typer.Option(
+            help="What is estimated of the robots themselves: reported (nothing), offsets (of "
+            "their joints) or kinematics."
+        ),
+    ] = "reported",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print alignment.json to stdout.")
     ] = False,
@@ -29,13 +36,13 @@ def align_command(
     there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
     leave a frame open.
     """
-    align_into(Session.load(session), out, as_json=as_json)
+    align_into(Session.load(session), out, arms=arms, as_json=as_json)
 
 
-def align_into(session: Session, out: Path, *, as_json: bool) -> None:
+def align_into(session: Session, out: Path, *, arms: ArmsAsked = "reported", as_json: bool) -> None:
     """Aligns a session's cell, writes the result into a folder and tells of it."""
     with shown_progress(quiet=as_json) as told:
-        result = align(session, progress=told)
+        result = align(session, arms=arms, progress=told)
     written = write_alignment(out, session, result)
     if as_json:
         typer.echo(json.dumps(result.document(), indent=2))

@@ -8,7 +8,7 @@ of each robot's flange at each of its stops, which all that was seen by way of t
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -159,6 +159,8 @@ class Network:
         poses: (s, 4, 4) `base_from_flange` by robot and stop; not a number where unknown.
         sightings: What was seen.
         common: What is known of the values that are shared.
+        by_flange: (s, 6, k) by robot, how its flange moves at every stop with what is shared; of
+            robots that are as they say, nothing.
         points: Frames of which only the place is asked for: their rotation is a matter of choice.
     """
 
@@ -167,6 +169,7 @@ class Network:
     sightings: Sightings
     common: Common
     points: frozenset[str] = frozenset()
+    by_flange: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.sightings)
@@ -240,7 +243,8 @@ class Network:
     def _edge(self, step: Step, state: State, stops: IntArray) -> FloatArray:
         """(4, 4) or (m, 4, 4) `parent_from_frame` of a step."""
         if step.robot:
-            return self.poses[step.robot][stops]
+            poses, moves = self.poses[step.robot][stops], self.by_flange.get(step.robot)
+            return poses if moves is None else poses @ exp(moves[stops] @ state.shared)
         known = self.tree.branches[step.frame].known
         return state.edges[self.unknown[step.frame]] if known is None else known
 
@@ -286,17 +290,23 @@ class Network:
             by_measured @ adjoint(invert(error)),
             _place_slope(np.broadcast_to(np.eye(4), error.shape)),
         )
-        edges, slack = self._slopes(state)
-        shared = by_measured @ seen.by_shared
+        edges, slack, arms = self._slopes(state)
+        shared = by_measured @ seen.by_shared + by_predicted @ arms
         return Linear(
             residuals, np.concatenate([by_predicted @ edges, shared], axis=2), by_predicted @ slack
         )
 
-    def _slopes(self, state: State) -> tuple[FloatArray, FloatArray]:
-        """How what is predicted moves with the edges (n, 6, 6 e) and the flanges (n, 6, 6 w)."""
+    def _slopes(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How what is predicted moves.
+
+        Returns:
+            (n, 6, 6 e) with the edges, (n, 6, 6 w) with the flanges, and (n, 6, k) with what is
+            shared of the arms.
+        """
         of, members = self.units
         edges = np.zeros((len(self), 6, 6 * len(self.unknown)))
         slack = np.zeros((len(self), 6, 6 * members.shape[1]))
+        arms = np.zeros((len(self), 6, len(state.shared)))
         for group in self.groups:
             rest = np.broadcast_to(np.eye(4), (len(group.rows), 4, 4))
             stops = self.sightings.stops[group.rows]
@@ -313,8 +323,10 @@ class Network:
                     for slot in range(members.shape[1]):
                         rows = group.rows[mine[:, slot]]
                         slack[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
+                if step.robot in self.by_flange:
+                    arms[group.rows] += moved @ self.by_flange[step.robot][stops]
                 rest = before
-        return edges, slack
+        return edges, slack, arms
 
     def change_of(self, frame: str, state: State) -> FloatArray:
         """The change of a frame's edge that each observation asks for, were all else right.
