@@ -117,8 +117,8 @@ def faulty(seed: int) -> Faulty:
     besides = len(found.moved) - sum(told) + len(reasons) - len(wrong)
     return Faulty(
         *told,
-        len(exchanged) == 2,
-        len([it for it in wrong if it not in exchanged]),
+        len(exchanged) >= 2,
+        len(wrong) - 2,
         besides,
         _mm(cell, found),
         _mm(good, before),

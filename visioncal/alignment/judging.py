@@ -28,6 +28,7 @@ class Limits:
         sigma_deg: The same in rotation [deg].
         pixel_px: Noise of a corner's coordinate [px].
         robot_mm: Error of a flange from stop to stop [mm].
+        level: How much more a camera's poses scatter than its corners say.
         left_out: Share of observations that disagree.
     """
 
@@ -35,6 +36,7 @@ class Limits:
     sigma_deg: tuple[float, float] = (0.1, 0.3)
     pixel_px: tuple[float, float] = (0.7, 3.0)
     robot_mm: float = 0.2
+    level: float = 2.0
     left_out: tuple[float, float] = (0.25, 0.6)
 
 
@@ -93,10 +95,20 @@ def _more(cell: Cell, frame: str) -> str:
     others = sorted({it.seen if it.seer == frame else it.seer for it in rows})
     if not others:
         return "Add stops at which its robot turns about two axes or more."
+    if frame.startswith("target") and len(others) == 1 and frame not in _carried(cell):
+        return (
+            f"Let another camera than {others[0]} see {frame}, too, or measure its squares and "
+            "state square_sigma_m."
+        )
     return (
         f"Add stops with {some_of(others)} and {frame}, turned by 30 degrees or more about two "
         "axes."
     )
+
+
+def _carried(cell: Cell) -> set[str]:
+    """The frames that robots carry."""
+    return {it for it in cell.tree.branches if cell.tree.body(it) != cell.tree.root}
 
 
 def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
@@ -197,6 +209,16 @@ def _noisy(
         if status:
             found.append(
                 (status, f"{name}: corners scatter by {figure(pixel)} px; 0.05 to 0.3 are usual.")
+            )
+        level = levels.get("level", 1.0)
+        if "pixel_px" in levels and level > limits.level:
+            found.append(
+                (
+                    "check",
+                    f"{name}: its poses scatter {figure(level)} times as much as its corners say: "
+                    "squares of few pixels, blur, or a lens that is not as stated. Go nearer, or "
+                    "show it larger squares.",
+                )
             )
         if robot > limits.robot_mm and not name.startswith("cam"):
             found.append(

@@ -168,7 +168,9 @@ def _noise(solved: Solved) -> dict[str, dict[str, float]]:
     if solved.seen is not None:
         pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
         found |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
-    sensors = sensors_of(solved.cell, solved.poses)
+    sensors = dict.fromkeys(
+        (*sensors_of(solved.cell, solved.poses), *(it.seer for it in solved.cell.rows))
+    )
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=True):
         found[frame] = {**found.get(frame, {}), "level": level}
     return found

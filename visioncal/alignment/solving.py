@@ -74,6 +74,7 @@ def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, network, state, unplaced = _started(cell, views)
     agreed = agree(network, state, _movable(network))
+    agreed = _levelled(cell, views, agreed)
     seen, arms = None, arms_errors(cell, asked)
     if looked.cameras:
         agreed, seen = _with_looks(cell, looked.cameras, views, agreed, arms)
@@ -81,6 +82,34 @@ def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
         agreed = _with_arms(agreed, arms)
     agreed = settle(agreed, _movable(agreed.network))
     return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
+
+
+def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
+    """Asks for the noise level of cameras, too, now that what is wrong is out.
+
+    Corners of one image may err alike, as those of small squares do: poses then scatter by more
+    than corners do about them, but never by less.
+    """
+    sensors = sensors_of(cell, views)
+    frames = tuple(dict.fromkeys((*sensors, *(it.seer for it in cell.rows))))
+    places = {it: at for at, it in enumerate(frames)}
+    network = agreed.network
+    sightings = replace(
+        network.sightings, sensors=np.array([places[it.seer] for it in cell.rows], dtype=np.int64)
+    )
+    more = np.ones(len(frames) - len(sensors))
+    noise = agreed.fit.noise
+    return replace(
+        agreed,
+        network=replace(
+            network,
+            sightings=sightings,
+            least_levels=np.concatenate([np.zeros(len(sensors)), more]),
+        ),
+        fit=replace(
+            agreed.fit, noise=replace(noise, sensors=np.concatenate([noise.sensors, more]))
+        ),
+    )
 
 
 def _with_arms(agreed: Agreed, arms: ArmsErrors) -> Agreed:
@@ -211,7 +240,7 @@ def is_sensed(seer: str, view: ViewPoses) -> bool:
 
 
 def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
-    """The frames whose observations have a noise level of their own."""
+    """The frames whose observations' noise is known up to a level; other cameras come behind."""
     pairs = zip(cell.rows, views, strict=True)
     return tuple(dict.fromkeys(row.seer for row, view in pairs if is_sensed(row.seer, view)))
 

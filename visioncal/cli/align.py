@@ -14,6 +14,9 @@ from visioncal.figures import figure
 from visioncal.outputs import write_alignment
 from visioncal.session import Session
 
+# Levels of noise that are nearer to what is said are not worth a word.
+_SHOWN_LEVEL = 1.2
+
 
 def align_command(
     session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
@@ -62,7 +65,14 @@ def _tell(result: Alignment) -> None:
             f"{edge.sigma_deg:.2g} deg"
         )
     for name, levels in result.noise.items():
-        words = [f"{figure(value)} {key.rpartition('_')[2]}" for key, value in levels.items()]
+        words = [
+            f"{figure(value)} {key.rpartition('_')[2]}"
+            for key, value in levels.items()
+            if key != "level"
+        ]
+        level = levels.get("level", 1.0)
+        if level > _SHOWN_LEVEL or not words:
+            words.append(f"{figure(level)} times what is said of it")
         console.print(f"noise of {name}: {', '.join(words)}")
     for it in result.sights:
         if not it.used:

@@ -161,6 +161,7 @@ class Network:
         common: What is known of the values that are shared.
         by_flange: (s, 6, k) by robot, how its flange moves at every stop with what is shared; of
             robots that are as they say, nothing.
+        least_levels: (s,) below which no sensor's level is; where there are none, any.
         points: Frames of which only the place is asked for: their rotation is a matter of choice.
     """
 
@@ -169,6 +170,7 @@ class Network:
     sightings: Sightings
     common: Common
     points: frozenset[str] = frozenset()
+    least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
     by_flange: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:

@@ -123,7 +123,7 @@ def _without_needless(found: Agreed) -> Agreed:
 def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
     """Settles what agrees one by one, and what moved by less than single observations tell."""
     network, moves = agreed.network, list(agreed.moves)
-    used, fit = _settled(network, agreed.used, agreed.fit)
+    used, fit = _settled(network, *_widened(network, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
         slight = slight_move(network.subset(used), fit, movable)
         if slight is None:

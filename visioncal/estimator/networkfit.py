@@ -140,6 +140,8 @@ def estimate_noise(
         if redundancy > 1.0:
             factor = np.sqrt(float(squares[mine].sum()) / redundancy)
             sensors[at] = np.clip(sensors[at] * factor, *_SENSOR_RANGE)
+    if len(network.least_levels):
+        sensors = np.maximum(sensors, network.least_levels)
     return replace(noise, sensors=sensors)
 
 
