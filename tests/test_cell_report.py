@@ -54,6 +54,12 @@ def test_the_table_has_any_frame_in_any_other():
     assert table.rows[2].cells[2] == ""
 
 
+def test_errors_of_robots_are_told_where_they_were_estimated():
+    found = replace(CELL, details={"arms": {"a": {"values": [2.2e-4], "sigmas": [1.4e-4]}}})
+    assert "robot a 0.22 \N{PLUS-MINUS SIGN} 0.14" in text_of(render_cell(found))
+    assert "Errors of the robots" not in render_cell(CELL)
+
+
 def test_what_moved_and_what_is_untied_is_told(tmp_path):
     frames = {**CELL.frames, "cam_top_until_stop_4": "cell"}
     edges = {**CELL.edges, "cell_from_cam_top_until_stop_4": CELL.edge_of("cam_top")}

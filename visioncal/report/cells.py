@@ -1,7 +1,7 @@
 """The report of an aligned cell: one HTML file that says how well its frames are tied."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,6 +87,7 @@ def render_cell(found: Alignment) -> str:
         tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
         edges=cards,
         noise=_noise_facts(found),
+        arms=_arm_facts(found),
         lenses=[(name, _lens_facts(it)) for name, it in found.cameras.items()],
         residual_plot=residuals(found),
         left_out=[it for it in found.sights if not it.used],
@@ -167,7 +168,7 @@ def _is_turned(found: Alignment, frame: str) -> bool:
 
 
 def _noise_facts(found: Alignment) -> list[Fact]:
-    units = {"mm": "mm", "deg": _DEG, "px": "px", "level": "times what was stated"}
+    units = {"mm": "mm", "deg": _DEG, "px": "px", "level": "times what is said of it"}
     facts = []
     for name, levels in found.noise.items():
         words = [
@@ -176,6 +177,21 @@ def _noise_facts(found: Alignment) -> list[Fact]:
         label = f"robot {name}" if name in found.robots.values() else name
         facts.append(Fact(label, ", ".join(words)))
     return facts
+
+
+def _arm_facts(found: Alignment) -> list[Fact]:
+    """The robots' own errors, where they were estimated [mrad, mm]."""
+    arms: Mapping[str, Mapping[str, Sequence[float]]] = found.details.get("arms", {})
+    return [
+        Fact(
+            f"robot {name}",
+            ", ".join(
+                f"{1e3 * value:.2f} {content.PLUS_MINUS} {1e3 * sigma:.2f}"
+                for value, sigma in zip(it["values"], it["sigmas"], strict=True)
+            ),
+        )
+        for name, it in arms.items()
+    ]
 
 
 def _lens_facts(camera: CameraResult) -> list[Fact]:
