@@ -60,7 +60,8 @@ class Scene:
             reported = view.base_from_flange()
             if seen is not None and seen.base_from_flange is not None:
                 poses[view.number] = seen.base_from_flange
-            elif reported is not None:
+            elif reported is not None and not session.is_network:
+                # Of several robots, each pose is in a base of its own, which nothing places.
                 poses[view.number] = reported.as_matrix()
         distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
         size_m = float(np.median(distances)) if distances else 1.0
