@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimator.network import Common, Network, Sightings, State
+from visioncal.estimator.network import Network
 from visioncal.estimator.networktree import Branch, Tree
+from visioncal.estimator.sightings import Common, Sightings, State
 
 # Of a camera's poses [rad and m]: across the view, and towards it.
 CAMERA_SIGMAS = np.array([3e-4, 3e-4, 1e-4, 3e-5, 3e-5, 1.2e-4])

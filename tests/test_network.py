@@ -7,7 +7,6 @@ import pytest
 from networks import ROBOT_SIGMAS, away, moved, observed, true_state, world
 
 from visioncal.estimator.linalg import covariance
-from visioncal.estimator.network import Common, Noise, State
 from visioncal.estimator.networkagree import agree, settle
 from visioncal.estimator.networkfit import (
     equations_by_stop,
@@ -16,6 +15,7 @@ from visioncal.estimator.networkfit import (
     normal_equations,
     posterior,
 )
+from visioncal.estimator.sightings import Common, Noise, State
 from visioncal.stages.choose import Candidates
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import tie

@@ -14,8 +14,9 @@ from scipy.linalg import block_diag
 from visioncal.alignment.cell import Cell, robot_key
 from visioncal.estimator.joint import chance_limit
 from visioncal.estimator.linalg import covariance
-from visioncal.estimator.network import Common, Network, Noise, State
+from visioncal.estimator.network import Network
 from visioncal.estimator.networkfit import normal_equations
+from visioncal.estimator.sightings import Common, Noise, State
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray

@@ -160,18 +160,7 @@ def judge(
     doubts: list[tuple[VerdictStatus, str]] = [("check", it) for it in warnings]
     doubts += [("check", moved_words(it)) for it in moved]
     doubts += [("check", f"{it.frame} is tied to nothing. {it.remedy}") for it in untied]
-    for name, edge in edges.items():
-        status = _beyond(edge.sigma_mm, limits.sigma_mm) or _beyond(
-            edge.sigma_deg, limits.sigma_deg
-        )
-        if status:
-            doubts.append(
-                (
-                    status,
-                    f"{name} is known to {figure(edge.sigma_mm)} mm and {figure(edge.sigma_deg)} "
-                    f"deg only. {_more(solved.cell, name)}",
-                )
-            )
+    doubts += _weak(solved.cell, edges, limits)
     doubts += _noisy(noise, limits)
     out = int(np.sum(~solved.agreed.used))
     if out:
@@ -191,6 +180,21 @@ def judge(
         f"All {len(edges)} frames are tied, and {int(solved.agreed.used.sum())} observations agree."
     )
     return Verdict("good", (agreed, *(words for _, words in doubts)))
+
+
+def _weak(cell: Cell, edges: Mapping[str, Edge], limits: Limits) -> list[tuple[VerdictStatus, str]]:
+    found: list[tuple[VerdictStatus, str]] = []
+    for name, edge in edges.items():
+        status = _beyond(edge.sigma_mm, limits.sigma_mm) or _beyond(
+            edge.sigma_deg, limits.sigma_deg
+        )
+        if status:
+            words = (
+                f"{name} is known to {figure(edge.sigma_mm)} mm and {figure(edge.sigma_deg)} deg "
+                f"only. {_more(cell, name)}"
+            )
+            found.append((status, words))
+    return found
 
 
 def _beyond(value: float, limits: tuple[float, float]) -> VerdictStatus | None:

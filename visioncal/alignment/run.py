@@ -85,17 +85,6 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
     }
     moved, noise = movements(solved), _noise(solved)
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
-    missing = [
-        f"Robot {it} stays as it reports itself: its errors take joint angles and a known model."
-        for it in solved.arms.unasked
-    ]
-    warnings = [
-        *missing,
-        *_erring(solved),
-        *session.warnings,
-        *looked.warnings,
-        *size_warnings(solved, spread),
-    ]
     return Alignment(
         session_name=session.name,
         session_sha256=session.digest(),
@@ -111,9 +100,24 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
         moved=moved,
         untied=untied,
         weakest=weakest_link(solved.cell, last),
-        verdict=judge(solved, last, noise, moved, untied, warnings),
+        verdict=judge(solved, last, noise, moved, untied, _warnings(solved, looked, spread)),
         details=_details(solved, spread),
     )
+
+
+def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
+    """Reasons for doubt that are no figure of the result."""
+    missing = [
+        f"Robot {it} stays as it reports itself: its errors take joint angles and a known model."
+        for it in solved.arms.unasked
+    ]
+    return [
+        *missing,
+        *_erring(solved),
+        *solved.cell.session.warnings,
+        *looked.warnings,
+        *size_warnings(solved, spread),
+    ]
 
 
 def _erring(solved: Solved) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.network import Network, State
+from visioncal.estimator.network import Network
 from visioncal.estimator.networkfit import (
     NetworkFit,
     fit_network,
@@ -34,6 +34,7 @@ from visioncal.estimator.networkmoves import (
     unmoved,
 )
 from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.estimator.sightings import State
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mask
 

@@ -7,8 +7,9 @@ import numpy as np
 from visioncal.estimator.closure import RATIO_PRIOR
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance, damped_step, gram, squared_lengths
-from visioncal.estimator.network import Linear, Network, Noise, State
+from visioncal.estimator.network import Linear, Network
 from visioncal.estimator.networkreduce import Reduced, reduce
+from visioncal.estimator.sightings import Noise, State
 from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
 from visioncal.types import FloatArray, Mask
 

@@ -15,7 +15,7 @@ from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Compressed, 
 from visioncal.estimator.corners import floored_sigma_px
 from visioncal.estimator.joint import Problem
 from visioncal.estimator.linalg import covariance
-from visioncal.estimator.network import Common
+from visioncal.estimator.sightings import Common
 from visioncal.types import Camera, FloatArray, IntArray
 
 

@@ -12,13 +12,14 @@ import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimator.linalg import covariance, spectrum
-from visioncal.estimator.network import Network, State
+from visioncal.estimator.network import Network
 from visioncal.estimator.networkfit import (
     NetworkFit,
     by_noise_alone,
     equations_by_stop,
     normal_equations,
 )
+from visioncal.estimator.sightings import State
 from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimator.linalg import gram
-from visioncal.estimator.network import ANYTHING, Linear, Network, State
+from visioncal.estimator.network import ANYTHING, Linear, Network
+from visioncal.estimator.sightings import State
 from visioncal.types import FloatArray
 
 # Eigenvalues of the information on a flange below this share of the largest are none.
