@@ -49,7 +49,7 @@ _NEAR_M, _FAR = 0.04, 6.0
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # Distances are compared with the limit once more, without the observation's own say in the noise,
 # when they come this near.
-_SUSPECT_SHARE = 0.4
+_SUSPECT_SHARE = 0.6
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from visioncal.types import FloatArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-8
 # Noise levels that change by less have settled, far below what is known of them.
-_LEVELS_SETTLED = 1e-3
+_LEVELS_SETTLED = 1e-2
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
 # Where they are sought again, it is from so much above where they were.
