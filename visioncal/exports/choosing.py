@@ -51,22 +51,18 @@ def select_all(source: Source, selection: Selection, form: ExportFormat) -> tupl
     """
     there = placements(source, selection.camera)
     _check_takes(form, selection)
-    several = [it.name for it in (form,) if it.write_all is not None]
-    one = [selection.inverse, selection.parent is not None, selection.child is not None]
-    if there.cell is None or not several or any(one):
-        why = (
-            f"{form.name} holds one transform"
-            if not several
-            else "--inverse, --parent and --child are of one transform"
-            if any(one)
-            else f"{there.words} is of no whole cell"
-        )
+    why = ""
+    if form.write_all is None:
+        why = f"{form.name} holds one transform"
+    elif selection.inverse or selection.parent is not None or selection.child is not None:
+        why = "--inverse, --parent and --child are of one transform"
+    elif there.cell is None:
+        why = f"{there.words} is of no whole cell"
+    if why:
         raise DataError(
             f"--edge all: {why}.",
             culprits=["--edge"],
-            next_step="Name one with --edge, as base_a_from_base_b."
-            if there.cell is not None
-            else f"Name one of {', '.join(there.by_name)}.",
+            next_step=f"Name one of {', '.join(there.by_name)}.",
         )
     return tuple(_content(form, selection, there, name) for name in there.by_name)
 

@@ -220,17 +220,15 @@ class _Tree:
         named = {
             name_of(self.declaration, "robot", view)
             for view in self.views
-            if tells_robot(view) and frame in self._about(view)
+            if tells_robot(view) and frame in observed(self.declaration, view)
         }
         return frame_name("flange", named.pop()) if len(named) == 1 else None
 
-    def _about(self, view: View) -> tuple[str, str]:
-        """What sees and what is seen in a row."""
-        return observed(self.declaration, view)
-
     def _across(self, frame: str) -> set[str]:
         """What a camera sees, or which cameras see a target."""
-        pairs = [self._about(it) for it in self.views if is_seen(it) and not it.is_of_lens]
+        pairs = [
+            observed(self.declaration, it) for it in self.views if is_seen(it) and not it.is_of_lens
+        ]
         return {other for pair in pairs if frame in pair for other in pair if other != frame}
 
     def _unclear(self, missing: Sequence[str]) -> DataError:
