@@ -47,7 +47,7 @@ def condition_of(base: BaseModel, motion: Motion, weights: FloatArray) -> Condit
 
 
 def _unit(rows: FloatArray) -> FloatArray:
-    return rows / np.maximum(np.linalg.norm(rows, axis=0), _TINY)
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), _TINY))
 
 
 def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatArray]:

@@ -9,8 +9,7 @@ look at a thousand samples a second finds within all limits.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import minimize
@@ -60,7 +59,7 @@ class ExcitationRequest:
 
     period_s: float = 20.0
     harmonics: int = 5
-    terms: FrictionTerms = FrictionTerms()
+    terms: FrictionTerms = field(default_factory=FrictionTerms)
     seconds: float = 25.0
     seed: int = 0
     starts: int = 1000
@@ -177,7 +176,7 @@ class _Search:
     def _descend(self, free: FloatArray, *, hurry: bool) -> FloatArray:
         """Goes down from a motion, round by round; in a hurry it stops when the time is up."""
 
-        def look(_: Any) -> None:
+        def look(_: FloatArray) -> None:
             if self._progress is not None:
                 seconds = self._request.seconds
                 self._progress("excitation", int(seconds - max(self._left_s, 0.0)), int(seconds))

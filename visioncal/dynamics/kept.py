@@ -57,11 +57,12 @@ class Kept:
             ("acceleration", self.acceleration, allowed.acceleration, "rad/s^2"),
             *([("torque", self.torque, allowed.torque, "N m")] if self.torque is not None else []),
         ):
-            for joint in np.flatnonzero(used > limit + _ROUNDING * np.maximum(1.0, np.abs(limit))):
-                found.append(
-                    f"{what} of {names[joint]} reaches {abs(used[joint]):.3g} {unit}, "
-                    f"{abs(limit[joint]):.3g} is allowed"
-                )
+            beyond = np.flatnonzero(used > limit + _ROUNDING * np.maximum(1.0, np.abs(limit)))
+            found += [
+                f"{what} of {names[joint]} reaches {abs(used[joint]):.3g} {unit}, "
+                f"{abs(limit[joint]):.3g} is allowed"
+                for joint in beyond
+            ]
         if self.apart_m < 0.0:
             found.append(
                 f"{' and '.join(self.nearest)} come to {1e3 * self.clearance_m:.0f} mm of one "
