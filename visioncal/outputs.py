@@ -1,4 +1,4 @@
-"""What `visioncal calibrate`, `visioncal verify` and `visioncal plan` write into a folder."""
+"""What `visioncal calibrate`, `verify`, `plan` and `dynamics` write into a folder."""
 
 import json
 import tempfile
@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.written import MOTION_FILES, motion_files
 from visioncal.errors import DataError
 from visioncal.files import named_errors, write_atomically
 from visioncal.pipeline import Run
@@ -127,6 +129,45 @@ def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[P
     if not program:
         with named_errors(folder / PROGRAM):
             (folder / PROGRAM).unlink(missing_ok=True)
+    return written
+
+
+def write_motions(
+    folder: Path, plan: MotionPlan, rate_hz: float, document: Mapping[str, Any]
+) -> tuple[Path, ...]:
+    """Writes planned motions as tables, programs, preview and JSON, together or not at all.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        plan: The motions.
+        rate_hz: Samples a second in the tables.
+        document: The content of plan.json.
+
+    Returns:
+        The files that were written. Robots that are not programmed like a UR get no programs; what
+        an earlier plan left and this one has not is taken away.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.planning.motions import motion_preview
+    from visioncal.recording.motions import write_motion_preview
+    from visioncal.viewer.motions import motion_blueprint
+
+    texts = motion_files(plan, rate_hz)
+    preview = motion_preview(plan)
+
+    def write(aside: Path) -> None:
+        write_motion_preview(aside / PREVIEW, preview, motion_blueprint(preview))
+        for name, text in texts.items():
+            write_atomically(aside / name, text)
+        write_atomically(aside / PLAN, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+    written = _write_together(folder, (PREVIEW, *texts, PLAN), write)
+    for name in MOTION_FILES:
+        if name not in texts:
+            with named_errors(folder / name):
+                (folder / name).unlink(missing_ok=True)
     return written
 
 

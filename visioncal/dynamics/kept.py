@@ -46,6 +46,20 @@ class Kept:
         return self.apart_m + self.allowed.share.clearance_m
 
     @property
+    def shares(self) -> dict[str, list[float]]:
+        """By limit, what share of it each joint uses; torque only where it is known."""
+        allowed = self.allowed
+        reach = np.maximum(self.highest - allowed.middle, allowed.middle - self.lowest)
+        found = {
+            "range": reach / allowed.half,
+            "speed": self.speed / allowed.speed,
+            "acceleration": self.acceleration / allowed.acceleration,
+        }
+        if self.torque is not None and not allowed.unchecked:
+            found["torque"] = self.torque / allowed.torque
+        return {name: [float(it) for it in np.round(used, 6)] for name, used in found.items()}
+
+    @property
     def breaches(self) -> tuple[str, ...]:
         """What is not kept, in words; empty for a motion that may be driven."""
         allowed, names = self.allowed, self.allowed.robot.joint_names

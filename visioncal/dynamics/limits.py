@@ -106,6 +106,22 @@ class Allowed:
         """(n,) half of the ranges [rad]."""
         return 0.5 * (self.upper - self.lower)
 
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What cannot be looked at for want of knowledge, in words."""
+        if self.inertias is None:
+            return (
+                f"torques: the description of {self.robot.name} tells no inertias of its links",
+            )
+        unknown = [
+            name
+            for name, limit in zip(self.robot.joint_names, self.torque, strict=True)
+            if not np.isfinite(limit)
+        ]
+        if unknown:
+            return (f"torques: no greatest torque is told of {some_of(unknown)}",)
+        return ()
+
     def torques(self, motion: Motion) -> FloatArray | None:
         """Torques (m, n) of the nominal arm [N m]; None where its inertias are not known."""
         if self.inertias is None:

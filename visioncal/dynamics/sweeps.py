@@ -19,8 +19,8 @@ from visioncal.types import FloatArray
 
 # Ramps last at least, and constant speed is held at least [s].
 _SHORTEST_RAMP_S, _SHORTEST_HOLD_S = 0.15, 0.4
-# The arm rests between strokes [s].
-_REST_S = 0.2
+# The arm rests after each stroke [s].
+REST_S = 0.2
 # Ways to where a sweep begins are driven at this share of the greatest speed.
 _UNHURRIED = 0.2
 # A joint sweeps at most so far [rad]; its room is felt for in steps [rad].
@@ -249,7 +249,7 @@ def _surely(
 
 
 def _begins(strokes: tuple[Stroke, ...]) -> FloatArray:
-    lengths = [it.duration_s + _REST_S for it in strokes]
+    lengths = [it.duration_s + REST_S for it in strokes]
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 

@@ -63,6 +63,11 @@ PREDICTED_SIGMA = "/plan/sigma_after_so_many_stops_mm"
 PLAN_NOTE = "/notes/plan"
 STOP_NOTE = "/notes/stop"
 
+# A planned motion, second by second.
+MOTION_TIMELINE = "motion"
+MOTION = "/motion"
+MOTION_KINDS = ("position_deg", "speed_deg_s", "acceleration_deg_s2", "torque_nm")
+
 # A recording at work.
 LIVE_SIGMA = "/live/predicted_sigma_mm"
 LIVE_NOTE = "/notes/recording"
