@@ -30,9 +30,9 @@ from visioncal.types import FloatArray, Progress
 # joints, more have speeds that shake the arm.
 SHORTEST_S, LONGEST_S = 10.0, 30.0
 FEWEST, MOST = 3, 10
-# Sharpness of the condition and price of breaches, round by round, and steps of each round.
+# Sharpness of the condition and price of breaches, round by round.
 _ROUNDS = ((1.0, 10.0), (4.0, 40.0), (12.0, 160.0), (30.0, 640.0))
-_STEPS, _MEMORY = 80, 20
+_MEMORY = 20
 # Random motions use this share of the limits, and start from one of so many random postures.
 _MODEST, _POSTURES = 0.5, 2000
 # A motion that breaks a limit is made smaller by this, so many times, before it is given up.
@@ -55,6 +55,7 @@ class ExcitationRequest:
             even if it takes longer.
         seed: Of the random motions that the search starts from.
         starts: The most of them.
+        steps: The most of each round of a descent.
     """
 
     period_s: float = 20.0
@@ -63,6 +64,7 @@ class ExcitationRequest:
     seconds: float = 25.0
     seed: int = 0
     starts: int = 1000
+    steps: int = 80
 
     def __post_init__(self) -> None:
         if not SHORTEST_S <= self.period_s <= LONGEST_S:
@@ -77,10 +79,10 @@ class ExcitationRequest:
                 f"a motion of {self.harmonics} harmonics is wished; {FEWEST} to {MOST} is needed.",
                 culprits=["--harmonics"],
             )
-        if not 0.0 <= self.seconds < np.inf or self.starts < 1:
+        if not 0.0 <= self.seconds < np.inf or min(self.starts, self.steps) < 1:
             raise DataError(
-                f"a search of {self.seconds:g} s from {self.starts} starts is wished; 0 s or more, "
-                "and one start, are needed.",
+                f"a search of {self.seconds:g} s from {self.starts} starts with {self.steps} steps "
+                "is wished; 0 s or more, a start and a step are needed.",
                 culprits=["--seconds"],
             )
 
@@ -193,7 +195,7 @@ class _Search:
                 jac=True,
                 method="L-BFGS-B",
                 callback=look,
-                options={"maxiter": _STEPS, "maxcor": _MEMORY},
+                options={"maxiter": self._request.steps, "maxcor": _MEMORY},
             )
             free = found.x
         return free

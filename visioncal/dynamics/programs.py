@@ -105,8 +105,8 @@ def sweeps_program(robot: Robot, sweeps: Sweeps) -> str:
 def _heading(robot: Robot, what: str) -> Iterator[str]:
     name = one_line(robot.name).encode("ascii", "replace").decode()
     yield f"# visioncal {__version__}: {name}, {what}."
-    yield "# Look at plan.rrd first, try it in a simulator, and keep a hand on the stop button. While"
-    yield "# it is recorded the speed slider stands at 100 %: a slower motion is another one."
+    yield "# Look at plan.rrd first, try it in a simulator, and keep a hand on the stop button."
+    yield "# While it is recorded the speed slider stands at 100 %: a slower motion is another one."
     yield "# The way from where the arm stands to the first posture was not looked at: bring it"
     yield "# there by hand first. Cables, grippers and people are not known to the plan."
 
