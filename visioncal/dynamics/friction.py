@@ -1,6 +1,7 @@
-"""What a joint loses by itself: the terms of its friction that are linear in their parameters."""
+"""What the drives of joints take for themselves: friction, an offset, and their rotors."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -79,3 +80,42 @@ class FrictionTerms:
         columns = np.zeros((count, joints, joints, kinds))
         columns[:, range(joints), range(joints)] = own
         return columns.reshape(count, joints, joints * kinds)
+
+
+@dataclass(frozen=True, eq=False)
+class Friction:
+    """What each of n drives takes.
+
+    `(Fc + Fs exp(-(dq / vs)^2)) sign(dq) + Fv dq + offset + Ia ddq`: dry friction that is greater
+    where a joint breaks loose (Stribeck's, as in Armstrong-Helouvry, Dupont and Canudas de Wit
+    1994), viscous friction, and the rotor's inertia.
+
+    Attributes:
+        coulomb: (n,) Fc [N m].
+        viscous: (n,) Fv [N m s/rad].
+        offset: (n,) [N m].
+        motor_inertia: (n,) Ia [kg m^2].
+        breaking: (n,) Fs, what breaking loose takes beyond `coulomb` [N m].
+        breaking_rad_s: (n,) vs, the speed over which that fades [rad/s].
+        slow_rad_s: See `sign`.
+    """
+
+    coulomb: FloatArray
+    viscous: FloatArray
+    offset: FloatArray
+    motor_inertia: FloatArray
+    breaking: FloatArray
+    breaking_rad_s: FloatArray
+    slow_rad_s: float = SLOW_RAD_S
+
+    @classmethod
+    def none(cls, joints: int) -> Self:
+        """No friction at all."""
+        nothing = np.zeros(joints)
+        return cls(nothing, nothing, nothing, nothing, nothing, np.ones(joints))
+
+    def torques(self, dq: FloatArray, ddq: FloatArray) -> FloatArray:
+        """What the drives take at (m, n) speeds and accelerations: (m, n) [N m]."""
+        breaking = self.breaking * np.exp(-((dq / self.breaking_rad_s) ** 2))
+        dry = (self.coulomb + breaking) * sign(dq, self.slow_rad_s)
+        return np.asarray(dry + self.viscous * dq + self.offset + self.motor_inertia * ddq)

@@ -29,6 +29,7 @@ from visioncal.robot.inertia import (
 )
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
 from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
+from visioncal.robot.momentum import mass_matrices, momenta
 from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
@@ -40,6 +41,7 @@ from visioncal.robot.tables import (
 )
 from visioncal.robot.torques import body_regressor, joint_torques, torque_regressor
 from visioncal.robot.urdfs import corrected_tip, corrected_urdf
+from visioncal.robot.weighing import with_inertias
 from visioncal.robot.weights import WeightFunctions
 from visioncal.robot.writing import (
     small_urdf,
@@ -78,6 +80,8 @@ __all__ = [
     "corrected_urdf",
     "joint_torques",
     "load_robot",
+    "mass_matrices",
+    "momenta",
     "moving",
     "other_convention",
     "parallel_axes",
@@ -97,5 +101,6 @@ __all__ = [
     "unwritten",
     "ur_flange",
     "ur_kinematics_yaml",
+    "with_inertias",
     "with_zeros",
 ]
