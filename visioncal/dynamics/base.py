@@ -80,7 +80,7 @@ class BaseModel:
 
     def regressor(self, motion: Motion) -> FloatArray:
         """Derivatives (m, n, b) of the torques by the base parameters."""
-        return np.asarray(self.model.regressor(motion)[:, :, self.independent])
+        return self.model.regressor(motion, self.independent)
 
     def of(self, standard: FloatArray) -> FloatArray:
         """The (b,) base parameters that (p,) standard parameters make up."""

@@ -10,10 +10,16 @@ from visioncal.errors import DataError
 from visioncal.robot.inertia import Inertias, moving
 from visioncal.robot.kinematics import regressors
 from visioncal.robot.model import Robot
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
 
 
-def torque_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
+def torque_regressor(
+    robot: Robot,
+    q: FloatArray,
+    dq: FloatArray,
+    ddq: FloatArray,
+    columns: IntArray | None = None,
+) -> FloatArray:
     """Derivatives of the joints' torques by the links' inertial parameters.
 
     Args:
@@ -21,18 +27,22 @@ def torque_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArra
         q: (m, n) joint angles [rad].
         dq: (m, n) their speeds [rad/s].
         ddq: (m, n) their accelerations [rad/s^2].
+        columns: (c,) which parameters are wanted; all where None.
 
     Returns:
-        (m, n, 10 n) in the order of `Inertias.values` [N m for a unit of each].
+        (m, n, c) in the order of `Inertias.values` [N m for a unit of each].
 
     Raises:
         DataError: A shape is wrong.
     """
     states = effective_states(robot, q, dq, ddq)
-    rows = np.empty((len(q), 10 * robot.joint_count, robot.joint_count))
+    count = 10 * robot.joint_count
+    wanted = np.arange(count) if columns is None else columns
+    rows = np.empty((len(q), len(wanted), robot.joint_count))
     found = regressors(robot.pinocchio_model, robot.gravity, states)
     for row, values in zip(rows, found, strict=True):
-        row[:] = values
+        # This loop runs for every sample: a checked copy would take as long as the dynamics.
+        values.take(wanted, 0, row, "clip")
     return np.swapaxes(rows, 1, 2)
 
 
