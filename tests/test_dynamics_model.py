@@ -35,6 +35,7 @@ from visioncal.robot import (
     robot_names,
     small_urdf,
     torque_regressor,
+    weighed_urdf,
     with_inertias,
 )
 from visioncal.robot.momentum import weighed_model
@@ -277,3 +278,30 @@ def test_what_an_arm_weighs_is_no_fact_of_a_recording():
     told = {key for row in read_robot_document("panda")["joint"] for key in row}
     assert {"mass_kg", "com_m", "inertia_kg_m2", "torque_nm", "velocity_rad_s"} <= told
     assert {"mass_kg", "com_m", "inertia_kg_m2", "torque_nm", "velocity_rad_s"} <= set(LINK_KEYS)
+
+
+def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
+    robot = Robot.from_document(urdf_of(load_robot("ur5e")))
+    text = robot.document["urdf"]
+    # Something fixed to a link moves with it, and a gripper's finger is locked.
+    more = (
+        '<link name="box"><inertial><mass value="2.0"/><inertia ixx="0.01" ixy="0" ixz="0" '
+        'iyy="0.01" iyz="0" izz="0.01"/></inertial><visual/></link><link name="finger"/>'
+        '<joint name="on" type="fixed"><parent link="link_3"/><child link="box"/></joint>'
+        '<joint name="grip" type="prismatic"><parent link="box"/><child link="finger"/>'
+        '<limit lower="0" upper="1" effort="0" velocity="0"/></joint></robot>'
+    )
+    given = dict(robot.document) | {"urdf": text.replace("</robot>", more)}
+    heavy = Robot.from_document(given)
+    assert heavy.masses.kg[2] == pytest.approx(robot.masses.kg[2] + 2.0)
+    found = Inertias(1.2 * heavy.inertias.values)
+    written = weighed_urdf(heavy, found, ["identified -- yesterday"])
+    again = Robot.from_document(given | {"urdf": written})
+    assert again.inertias.values == pytest.approx(found.values, abs=1e-12)
+    assert again.base_from_flange(states(robot)[0]) == pytest.approx(
+        robot.base_from_flange(states(robot)[0]), abs=1e-12
+    )
+    assert "<visual/>" in written
+    assert "<!-- identified - - yesterday -->" in written
+    with pytest.raises(DataError, match="a robot of a URDF is needed"):
+        weighed_urdf(load_robot("ur5e"), found)

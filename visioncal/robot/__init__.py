@@ -40,6 +40,7 @@ from visioncal.robot.tables import (
     table_from_document,
 )
 from visioncal.robot.torques import body_regressor, joint_torques, torque_regressor
+from visioncal.robot.urdf_bodies import weighed_urdf
 from visioncal.robot.urdfs import corrected_tip, corrected_urdf
 from visioncal.robot.weighing import with_inertias
 from visioncal.robot.weights import WeightFunctions
@@ -101,6 +102,7 @@ __all__ = [
     "unwritten",
     "ur_flange",
     "ur_kinematics_yaml",
+    "weighed_urdf",
     "with_inertias",
     "with_zeros",
 ]
