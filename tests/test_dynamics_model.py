@@ -162,6 +162,22 @@ def test_names_say_what_base_parameters_are(name):
         assert eval(plain, {}, known) == pytest.approx(value, abs=2e-3), text
 
 
+def test_base_parameters_are_those_that_are_kept():
+    model = DynamicModel(load_robot("ur10e"), FrictionTerms())
+    base = BaseModel.reduce(model)
+    again = BaseModel.keeping(model, base.independent)
+    assert again.names == base.names
+    # Other states may choose other columns; those of the first go with them as well.
+    other = BaseModel.reduce(model, np.random.default_rng(8))
+    standard = np.random.default_rng(3).standard_normal(len(model.names))
+    motion = motion_of(model.robot, seed=6)
+    wanted = other.regressor(motion) @ other.of(standard)
+    assert again.regressor(motion) @ again.of(standard) == pytest.approx(wanted, abs=1e-8)
+    for wrong in (base.independent[1:], np.append(base.independent, len(model.names) - 1)):
+        with pytest.raises(DataError, match="are no base parameters of it"):
+            BaseModel.keeping(model, wrong)
+
+
 def test_names_keep_only_what_counts():
     names = BaseModel.reduce(DynamicModel(load_robot("ur5e"), FrictionTerms())).names
     assert {"Fc3", "m6*cx6"} <= set(names)

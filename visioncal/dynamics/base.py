@@ -14,6 +14,7 @@ from scipy.linalg import qr, solve_triangular
 
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
+from visioncal.errors import DataError
 from visioncal.types import FloatArray, IntArray
 
 # States that stand for all, and their greatest speeds [rad/s] and accelerations [rad/s^2]; at these
@@ -22,6 +23,9 @@ _STATES, _FASTEST, _HARDEST = 200, 3.0, 10.0
 # A column is another's multiple where less than this share of it is left, and has no effect where
 # its length is less than this share of the longest. True shares are above 1e-3, rounding 1e-13.
 _RANK = 1e-8
+# Equal columns, as those of a rotor and of its link about the first joint, are taken in their order
+# whatever rounding says: each counts for so much less than the first.
+_TIE = 1e-4
 # Coefficients smaller than this share of a row's columns are rounding.
 _ROUNDING = 1e-9
 
@@ -48,22 +52,45 @@ class BaseModel:
             model: The model.
             rng: Chooses the states; always the same ones where None.
         """
-        states = random_motion(model, rng or np.random.default_rng(0))
-        matrix = model.regressor(states).reshape(-1, len(model.names))
+        matrix = _columns(model, rng or np.random.default_rng(0))
         lengths = np.linalg.norm(matrix, axis=0)
         acts = np.flatnonzero(lengths > _RANK * lengths.max())
-        scaled = matrix[:, acts] / lengths[acts]
-        upper, order = qr(scaled, mode="r", pivoting=True)
+        favour = 1.0 - _TIE * np.arange(len(acts)) / len(acts)
+        upper, order = qr(matrix[:, acts] * (favour / lengths[acts]), mode="r", pivoting=True)
         left = np.abs(np.diag(upper))
         rank = int(np.sum(left > _RANK * left[0]))
-        mixed = solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
+        return cls.keeping(model, np.sort(acts[order[:rank]]))
+
+    @classmethod
+    def keeping(cls, model: DynamicModel, independent: IntArray) -> Self:
+        """Takes a model with columns that are known to be independent, and all that there are.
+
+        Args:
+            model: The model.
+            independent: (b,) ascending places of the parameters that are kept.
+
+        Raises:
+            DataError: They are not independent, or others are independent of them.
+        """
+        matrix = _columns(model, np.random.default_rng(0))
+        lengths = np.linalg.norm(matrix, axis=0)
+        lengths[lengths <= _RANK * lengths.max()] = np.inf
+        scaled = matrix / lengths
+        across, upper = qr(scaled[:, independent], mode="economic")
+        shares = across.T @ scaled
+        left = np.abs(np.diag(upper)).min(initial=1.0)
+        if left <= _RANK or np.abs(scaled - across @ shares).max() > _RANK:
+            kept = ", ".join(model.names[it] for it in independent)
+            raise DataError(
+                f"robot {model.robot.name}: {kept} are no base parameters of it.",
+                culprits=[model.robot.name],
+            )
+        mixed = solve_triangular(upper, shares)
         mixed[np.abs(mixed) < _ROUNDING] = 0.0
-        kept, others = acts[order[:rank]], acts[order[rank:]]
-        dependence = np.zeros((rank, len(model.names)))
-        dependence[range(rank), kept] = 1.0
-        dependence[:, others] = mixed * lengths[others] / lengths[kept][:, None]
-        ascending = np.argsort(kept)
-        return cls(model, kept[ascending], dependence[ascending])
+        sizes = np.where(np.isfinite(lengths), lengths, 0.0)
+        dependence = mixed * sizes / lengths[independent][:, None]
+        dependence[:, independent] = np.eye(len(independent))
+        return cls(model, independent, dependence)
 
     @property
     def rank(self) -> int:
@@ -85,6 +112,11 @@ class BaseModel:
     def of(self, standard: FloatArray) -> FloatArray:
         """The (b,) base parameters that (p,) standard parameters make up."""
         return np.asarray(self.dependence @ standard)
+
+
+def _columns(model: DynamicModel, rng: np.random.Generator) -> FloatArray:
+    """The regressor in random states, row by row: (m n, p)."""
+    return model.regressor(random_motion(model, rng)).reshape(-1, len(model.names))
 
 
 def random_motion(model: DynamicModel, rng: np.random.Generator) -> Motion:
