@@ -44,6 +44,12 @@ class LowPass:
         """Samples on either side of an output that it rests on."""
         return len(self.taps) // 2
 
+    @property
+    def correlation(self) -> FloatArray:
+        """(l,) correlations of one output with the next, and so on, where the input is white."""
+        full = np.correlate(self.taps, self.taps, "full")[len(self.taps) - 1 :: self.step]
+        return np.asarray(full[1:] / full[0])
+
     def count(self, samples: int) -> int:
         """How many outputs so many samples give."""
         return max((samples - len(self.taps)) // self.step + 1, 0)

@@ -28,6 +28,7 @@ from visioncal.robot.inertia import (
     pseudo_inertias,
 )
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
+from visioncal.robot.logcholesky import LogCholesky
 from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
 from visioncal.robot.momentum import mass_matrices, momenta
 from visioncal.robot.rates import RATE_KEYS, Rates
@@ -68,6 +69,7 @@ __all__ = [
     "DHTable",
     "Inertias",
     "Loads",
+    "LogCholesky",
     "Masses",
     "Rates",
     "Recognised",
