@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -186,9 +187,7 @@ def condition(
     return Conditioned(recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes))
 
 
-def _even_parts(
-    recorded: Recorded, bad: Mask, notes: list[str]
-) -> Iterator[tuple[Recorded, Mask]]:
+def _even_parts(recorded: Recorded, bad: Mask, notes: list[str]) -> Iterator[tuple[Recorded, Mask]]:
     """The parts between gaps, each on an even clock."""
     steps = np.diff(recorded.times_s)
     usual = float(np.median(steps))
@@ -207,14 +206,12 @@ def _even_parts(
             f"{1e3 * inner.min():.3g} to {1e3 * inner.max():.3g} ms); it was resampled evenly."
         )
     bounds = [0, *(gaps + 1), len(recorded)]
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in pairwise(bounds):
         if end - begin > 2:
             yield _even(recorded, bad, slice(begin, end), jitter > _JITTER)
 
 
-def _even(
-    recorded: Recorded, bad: Mask, rows: slice, resampled: bool
-) -> tuple[Recorded, Mask]:
+def _even(recorded: Recorded, bad: Mask, rows: slice, resampled: bool) -> tuple[Recorded, Mask]:
     """A part, brought to a clock with even steps where it has none."""
     times_s = recorded.times_s[rows]
     even = np.linspace(times_s[0], times_s[-1], len(times_s))

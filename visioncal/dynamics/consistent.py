@@ -159,4 +159,3 @@ class _Problem:
             return _State(state.links + links, state.own + np.where(self.held, 0.0, own))
 
         return Linearised(state, cost, step)
-

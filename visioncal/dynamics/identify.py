@@ -1,25 +1,25 @@
 """Dynamic identification: from streams of motion and torque to the parameters of an arm."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.consistent import Consistent, fit_consistent
-from visioncal.dynamics.excitement import check_told, check_turning
+from visioncal.dynamics.consistent import fit_consistent
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified, StreamFacts
 from visioncal.dynamics.mistakes import check_mistakes
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.regression import Block, Regression, regress
+from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
+from visioncal.dynamics.untold import check_told, check_turning
 from visioncal.robot import Robot
-from visioncal.types import FloatArray
 
-# Filtered speeds are known to about a tenth of this; joints creep through it in no time [rad/s].
-SLOW_RAD_S = 1e-3
+# What speeds are known to after filtering; joints are through it in no time [rad/s].
+SLOW_RAD_S = 3e-4
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Options:
         checked: Whether the torques are compared with what the robot's inertias predict.
     """
 
-    terms: FrictionTerms = FrictionTerms(slow_rad_s=SLOW_RAD_S)
+    terms: FrictionTerms = field(default_factory=partial(FrictionTerms, slow_rad_s=SLOW_RAD_S))
     stribeck: bool = True
     consistent: bool = True
     checked: bool = True
@@ -73,7 +73,7 @@ def identify(
     base = BaseModel.reduce(DynamicModel(robot, options.terms))
     check_turning(base, streams)
     if options.checked and robot.inertias is not None:
-        check_mistakes(robot, streams)
+        check_mistakes(base, streams)
     blocks = [block_of(base, it) for it in streams]
     check_told(base, blocks)
     fit = regress(blocks)
@@ -109,25 +109,11 @@ def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts,
             cutoff_hz=stream.cutoff_hz,
             rate_hz=stream.rate_hz,
             noise_nm=sigma,
-            rms_nm=_rms(residuals, block.used),
-            torque_nm=_spread(block.y, block.used),
+            rms_nm=rms_of(residuals, block.used),
+            torque_nm=spread_of(block.y, block.used),
             notes=stream.notes,
         )
         for stream, block, residuals, sigma in zip(
             streams, fit.blocks, fit.residuals, fit.sigmas, strict=True
         )
     )
-
-
-def _rms(values: FloatArray, used: FloatArray) -> FloatArray:
-    counts = np.maximum(used.sum(axis=0), 1)
-    return np.asarray(np.sqrt(np.sum(used * values**2, axis=0) / counts))
-
-
-def _spread(values: FloatArray, used: FloatArray) -> FloatArray:
-    counts = np.maximum(used.sum(axis=0), 1)
-    mean = np.sum(used * values, axis=0) / counts
-    return _rms(values - mean, used)
-
-
-__all__ = ["Consistent", "Identification", "Options", "block_of", "identify", "replace"]

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from scipy.signal.windows import kaiser
 
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mask
 
 # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
 _BETA, _SPAN = 5.65, 1.81
@@ -58,7 +58,7 @@ class LowPass:
         """Filters (m, ...) values along their first axis: (k, ...), the first at `half`."""
         return self._summed(values, self.taps)
 
-    def touched(self, bad: FloatArray) -> FloatArray:
+    def touched(self, bad: Mask) -> FloatArray:
         """(k, ...) what share of each output's weights rests on bad samples (m, ...)."""
         weights = np.abs(self.taps)
         return self._summed(bad.astype(float), weights / weights.sum())

@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import nnls
 
+from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Measured, Motion
@@ -20,10 +21,13 @@ from visioncal.robot import Inertias, Robot, joint_torques
 from visioncal.types import FloatArray, IntArray
 
 # So many samples are enough to tell.
-_SAMPLES = 400
+_SAMPLES = 250
 # A mistake is named where undoing it divides the unexplained power of the torques by this much, and
 # leaves of the joints concerned no more than this share.
 _BETTER, _LEFT = 10.0, 0.5
+# Two joints that are swapped are named where undoing it lets a fit leave so many times less: right
+# recordings get worse by any swap.
+_FITS_BETTER = 2.5
 # Of the power of a joint's torques so much is always left: noise, and inertias that are off.
 _FLOOR = 0.01
 # Inertias are off by less than these factors, and a torque on the motor's side, or in thousandths,
@@ -48,28 +52,27 @@ class _Guess:
     predicted: FloatArray
 
 
-def check_mistakes(robot: Robot, streams: Sequence[Conditioned]) -> None:
+def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     """Refuses recordings that are plainly mistaken.
 
     Args:
-        robot: The arm, with inertias.
+        base: The model of an arm with inertias.
         streams: The recordings.
 
     Raises:
         DataError: Torques or angles are of another joint, of the other sign, or in other units.
     """
+    robot = base.model.robot
     for stream in streams:
-        measured = _some(stream)
-        found = _mistake(robot, measured)
+        as_it_is = _as_it_is(robot, _some(stream))
+        found = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
         if found is not None:
             raise DataError(
-                f"{stream.label}: {found.words}: so taken, {_explained(found, found.joints)} of "
-                f"the torques of {_named(found.joints)} is explained by the inertias of "
-                f"{robot.name}, instead of {_explained(_as_it_is(robot, measured), found.joints)}.",
-                culprits=[f"joint {it + 1}" for it in found.joints],
+                f"{stream.label}: {found[0].words}: {found[1]}.",
+                culprits=[f"joint {it + 1}" for it in found[0].joints],
                 next_step="Mend the columns of the stream, or name the robot that was recorded.",
             )
-        _check_units(stream.label, robot, measured)
+        _check_units(stream.label, robot, as_it_is)
 
 
 def _some(stream: Conditioned) -> Measured:
@@ -79,9 +82,8 @@ def _some(stream: Conditioned) -> Measured:
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
 
-def _mistake(robot: Robot, measured: Measured) -> _Guess | None:
-    """The mistake that explains by far the most, if there is one."""
-    as_it_is = _as_it_is(robot, measured)
+def _predicted_better(robot: Robot, as_it_is: _Guess) -> tuple[_Guess, str] | None:
+    """The mistake without which by far the most is as predicted, if there is one, and why."""
     before = _left(as_it_is)
     best, gain = None, np.log(_BETTER)
     for guess in _guesses(robot, as_it_is):
@@ -89,7 +91,46 @@ def _mistake(robot: Robot, measured: Measured) -> _Guess | None:
         better = float(np.sum(np.log(before / after)))
         if better > gain and after[list(guess.joints)].max() < _LEFT:
             best, gain = guess, better
-    return best
+    if best is None:
+        return None
+    joints = list(best.joints)
+    shares = [100.0 * (1.0 - float(left[joints].mean())) for left in (_left(best), before)]
+    return best, (
+        f"so taken, {shares[0]:.0f} % of the torques of {_named(best.joints)} is explained by the "
+        f"inertias of {robot.name} and by friction, instead of {max(shares[1], 0.0):.0f} %"
+    )
+
+
+def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | None:
+    """Two joints in each other's place that a fit tells, if there are, and why.
+
+    Where friction is most of their torques, predictions hardly tell them; but no inertias at all
+    can explain the others' torques.
+    """
+    before, predicted = _unfitted(base, as_it_is.measured), _left(as_it_is)
+    best, gain = None, np.log(_FITS_BETTER)
+    for guess in _swapped_joints(base.model.robot, as_it_is):
+        if np.sum(np.log(predicted / _left(guess))) < -1.0:
+            continue
+        better = float(np.sum(np.log(before / _unfitted(base, guess.measured))))
+        if better > gain:
+            best, gain = guess, better
+    if best is None:
+        return None
+    times = float(np.exp(gain / len(as_it_is.joints)))
+    return best, f"so taken, the best fit leaves {times:.2g} times less of the torques' power"
+
+
+def _unfitted(base: BaseModel, measured: Measured) -> FloatArray:
+    """(n,) what the best fit leaves of the power of each joint's torques."""
+    sizes = np.maximum(np.std(measured.torques_nm, axis=0), 1e-12)
+    x = base.regressor(measured.motion) / sizes[:, None]
+    y = measured.torques_nm / sizes
+    rows = x.reshape(-1, base.rank)
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-12)
+    values = np.linalg.lstsq(rows, y.ravel(), rcond=1e-9)[0]
+    left = np.mean((y - (rows @ values).reshape(y.shape)) ** 2, axis=0)
+    return np.asarray(np.maximum(left, 1e-12))
 
 
 def _as_it_is(robot: Robot, measured: Measured) -> _Guess:
@@ -99,33 +140,57 @@ def _as_it_is(robot: Robot, measured: Measured) -> _Guess:
 
 def _guesses(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
     """The recording without one mistake or another."""
-    measured, count = as_it_is.measured, as_it_is.predicted.shape[1]
+    yield from _swapped_columns(robot, as_it_is)
+    yield from _swapped_joints(robot, as_it_is)
+    yield from _flipped(robot, as_it_is)
+    measured, every = as_it_is.measured, as_it_is.joints
     motion, torques = measured.motion, measured.torques_nm
-    for one, other in combinations(range(count), 2):
-        order = np.arange(count)
-        order[[one, other]] = other, one
-        both, pair = (one, other), f"of joints {one + 1} and {other + 1} are swapped"
-        swapped = replace(measured, torques_nm=torques[:, order])
-        yield replace(as_it_is, words=f"the torques {pair}", joints=both, measured=swapped)
-        turned = _reordered(motion, order)
-        yield _moved(robot, turned, torques, f"the angles {pair}", both)
-        # Both at once look like one joint that is taken for the other.
-        yield _moved(robot, turned, torques[:, order], f"angles and torques {pair}", both)
-    for joint in range(count):
-        signs = np.where(np.arange(count) == joint, -1.0, 1.0)
-        flipped = replace(measured, torques_nm=torques * signs)
-        words = f"of joint {joint + 1} has the other sign"
-        yield replace(
-            as_it_is, words=f"the torque {words}", joints=(joint,), measured=flipped
-        )
-        yield _moved(robot, _scaled(motion, signs), torques, f"the angle {words}", (joint,))
-    every = tuple(range(count))
     words = "all torques have the other sign (what the links do to the drives)"
     flipped = replace(measured, torques_nm=-torques)
-    yield replace(as_it_is, words=words, joints=every, measured=flipped)
+    yield replace(as_it_is, words=words, measured=flipped)
     words = "the joints are in the reverse order"
     yield _moved(robot, _reordered(motion, every[::-1]), torques[:, ::-1], words, every)
     yield _moved(robot, _scaled(motion, np.pi / 180.0), torques, "angles are in degrees", every)
+
+
+def _swapped_columns(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+    """The recording without the torques, or the angles, of two joints swapped."""
+    measured = as_it_is.measured
+    for pair, order in _pairs(as_it_is):
+        words = f"of joints {pair[0] + 1} and {pair[1] + 1} are swapped"
+        swapped = replace(measured, torques_nm=measured.torques_nm[:, order])
+        yield replace(as_it_is, words=f"the torques {words}", joints=pair, measured=swapped)
+        turned = _reordered(measured.motion, order)
+        yield _moved(robot, turned, measured.torques_nm, f"the angles {words}", pair)
+
+
+def _swapped_joints(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+    """The recording without two joints taken for each other."""
+    measured = as_it_is.measured
+    for pair, order in _pairs(as_it_is):
+        words = f"joints {pair[0] + 1} and {pair[1] + 1} are swapped, with angles and torques"
+        turned = _reordered(measured.motion, order)
+        yield _moved(robot, turned, measured.torques_nm[:, order], words, pair)
+
+
+def _pairs(as_it_is: _Guess) -> Iterator[tuple[tuple[int, int], IntArray]]:
+    for one, other in combinations(as_it_is.joints, 2):
+        order = np.array(as_it_is.joints)
+        order[[one, other]] = other, one
+        yield (one, other), order
+
+
+def _flipped(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+    """The recording without the other sign of a joint's torque or angle."""
+    measured = as_it_is.measured
+    for joint in as_it_is.joints:
+        signs = np.where(np.array(as_it_is.joints) == joint, -1.0, 1.0)
+        flipped = replace(measured, torques_nm=measured.torques_nm * signs)
+        words = f"the torque of joint {joint + 1} has the other sign than its angle"
+        yield replace(as_it_is, words=words, joints=(joint,), measured=flipped)
+        words = f"the angle of joint {joint + 1} has the other sign"
+        turned = _scaled(measured.motion, signs)
+        yield _moved(robot, turned, measured.torques_nm, words, (joint,))
 
 
 def _moved(
@@ -168,25 +233,20 @@ def _fitted(guess: _Guess, joint: int) -> tuple[FloatArray, float]:
     return found / sizes, max(left**2 / power, _FLOOR)
 
 
-def _explained(guess: _Guess, joints: tuple[int, ...]) -> str:
-    return f"{100.0 * (1.0 - float(_left(guess)[list(joints)].mean())):.0f} %"
-
-
 def _named(joints: tuple[int, ...]) -> str:
     return ("joint " if len(joints) == 1 else "joints ") + ", ".join(str(it + 1) for it in joints)
 
 
-def _check_units(label: str, robot: Robot, measured: Measured) -> None:
+def _check_units(label: str, robot: Robot, guess: _Guess) -> None:
     """Refuses torques that are multiples of what they should be.
 
     Raises:
         DataError: They are.
     """
-    guess = _as_it_is(robot, measured)
     scales = np.full(len(guess.joints), np.nan)
     for joint in guess.joints:
         found, left = _fitted(guess, joint)
-        torques = measured.torques_nm[:, joint]
+        torques = guess.measured.torques_nm[:, joint]
         share = found[0] ** 2 * np.var(guess.predicted[:, joint]) / max(np.var(torques), 1e-24)
         if share > _SHARE and left < _LEFT:
             scales[joint] = found[0]
@@ -198,7 +258,7 @@ def _check_units(label: str, robot: Robot, measured: Measured) -> None:
     scale = float(np.median(scales[wrong]))
     raise DataError(
         f"{label}: {whose} are {scale:.3g} times what the inertias of {robot.name} need; "
-        f"{_unit(scale)}.",
+        f"{_unit(scale)}",
         culprits=[f"{label}, tau{it + 1}_nm" for it in wrong],
         next_step="Torques are those of the joints, behind the gears, in N m. Currents belong into "
         "current1_a ... [A], and --gains turns them into torques.",

@@ -45,7 +45,7 @@ class Recorded:
     @property
     def joint_count(self) -> int:
         """The number n of joints."""
-        return self.q.shape[1]
+        return int(self.q.shape[1])
 
     def part(self, begin: float, end: float) -> "Recorded":
         """The samples between two shares of the whole, 0 to 1."""

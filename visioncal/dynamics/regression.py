@@ -12,7 +12,7 @@ from scipy.linalg import qr, solve_triangular
 
 from visioncal.chance import chi2_limit
 from visioncal.estimator.linalg import one_blas_thread
-from visioncal.types import FloatArray, Mask
+from visioncal.types import FloatArray, IntArray, Mask
 
 # Rows that are decomposed at a time, so that they stay in the processor's cache.
 _CHUNK = 2000
@@ -21,7 +21,7 @@ _ROUNDS, _SETTLED = 30, 1e-4
 _OUTLIER_CHANCE = 1e-3
 _CUTS = 10
 # Correlations are followed until they are lost in their own noise, and over this share of samples.
-_LOST, _FOLLOWED = 2.0, 0.1
+_LOST, _FOLLOWED = 3.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class _Joint:
         count: How many rows it stands for.
     """
 
-    columns: FloatArray
+    columns: IntArray
     triangle: FloatArray
     count: int
 
@@ -112,6 +112,18 @@ def regress(blocks: Sequence[Block]) -> Regression:
         return replace(fit, covariance=_covariance(fit))
 
 
+def rms_of(values: FloatArray, used: Mask) -> FloatArray:
+    """(n,) root mean square of those of (k, n) values that count."""
+    counts = np.maximum(used.sum(axis=0), 1)
+    return np.asarray(np.sqrt(np.sum(used * values**2, axis=0) / counts))
+
+
+def spread_of(values: FloatArray, used: Mask) -> FloatArray:
+    """(n,) standard deviation of those of (k, n) values that count."""
+    counts = np.maximum(used.sum(axis=0), 1)
+    return rms_of(values - np.sum(used * values, axis=0) / counts, used)
+
+
 def _limit(block: Block) -> float:
     return float(np.sqrt(chi2_limit(_OUTLIER_CHANCE / max(block.used.sum(), 1), 1.0)))
 
@@ -128,9 +140,10 @@ def _weighted(
     sigmas = [np.ones(len(it)) for it in joints]
     for turn in range(_ROUNDS):
         values, root = _solved(joints, sigmas, size)
-        before, sigmas = sigmas, [
+        before = sigmas
+        sigmas = [
             np.array([_sigma(it, values, root, old) for it, old in zip(of, olds, strict=True)])
-            for of, olds in zip(joints, sigmas, strict=True)
+            for of, olds in zip(joints, before, strict=True)
         ]
         pairs = zip(before, sigmas, strict=True)
         if turn and all(np.allclose(old, new, rtol=_SETTLED) for old, new in pairs):

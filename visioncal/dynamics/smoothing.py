@@ -4,7 +4,7 @@ import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from visioncal.dynamics.motion import Motion
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
 
 # A motion's band ends where the power of its accelerations stays under this share of its peak,
 # sought in parts of a quarter octave; it is told by joints that move at least this share of the
@@ -21,7 +21,7 @@ def band_of(q: FloatArray, rate_hz: float) -> float:
 
     Of a periodic motion that is its highest harmonic.
     """
-    frequencies = np.fft.rfftfreq(len(q), 1.0 / rate_hz)[1:]
+    frequencies = np.asarray(np.fft.rfftfreq(len(q), 1.0 / rate_hz)[1:], dtype=float)
     spectrum = np.fft.rfft((q - q.mean(axis=0)) * np.hanning(len(q))[:, None], axis=0)[1:]
     speeds = np.sqrt(np.sum(np.abs(spectrum * frequencies[:, None]) ** 2, axis=0))
     moving = speeds >= _MOVING * speeds.max()
@@ -31,7 +31,7 @@ def band_of(q: FloatArray, rate_hz: float) -> float:
     return max(_edge(it, parts, frequencies) for it in power.T)
 
 
-def _edge(power: FloatArray, parts: FloatArray, frequencies: FloatArray) -> float:
+def _edge(power: FloatArray, parts: IntArray, frequencies: FloatArray) -> float:
     """Where a joint's power, from its peak on upwards, falls out of the band."""
     slow = frequencies < 0.02 * frequencies[-1]
     peak = int(np.argmax(np.where(slow, power, 0.0)))

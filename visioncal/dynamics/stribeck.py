@@ -142,9 +142,7 @@ def _fitted(
     return found, _projected(streams, plain, found)[2]
 
 
-def _solved(
-    streams: Sequence[Conditioned], plain: Regression, humps: Stribeck
-) -> Stribeck:
+def _solved(streams: Sequence[Conditioned], plain: Regression, humps: Stribeck) -> Stribeck:
     """The same speeds with the best humps."""
     count = len(humps.joints)
     a, b = _normal(streams, plain, humps)

@@ -10,7 +10,7 @@ from visioncal.dynamics.identified import Identified, Validation
 from visioncal.dynamics.identify import Identification
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.regression import Block, regress
+from visioncal.dynamics.regression import Block, regress, rms_of, spread_of
 from visioncal.errors import DegenerateError
 from visioncal.robot import joint_torques
 from visioncal.types import FloatArray, Mask
@@ -41,14 +41,12 @@ class Prediction:
 
     def rms_nm(self, predicted_nm: FloatArray) -> FloatArray:
         """(n,) root mean square error of a prediction [N m]."""
-        return _rms(predicted_nm - self.measured_nm, self.used)
+        return rms_of(predicted_nm - self.measured_nm, self.used)
 
     @property
     def torque_nm(self) -> FloatArray:
         """(n,) how far the torques range, as a standard deviation [N m]."""
-        counts = np.maximum(self.used.sum(axis=0), 1)
-        mean = np.sum(self.used * self.measured_nm, axis=0) / counts
-        return _rms(self.measured_nm - mean, self.used)
+        return spread_of(self.measured_nm, self.used)
 
 
 def predict(
@@ -122,8 +120,3 @@ def _link_torques(model: DynamicModel, motion: Motion) -> FloatArray:
 def _known_torques(identified: Identified, friction: FloatArray, motion: Motion) -> FloatArray:
     model = identified.base.model
     return np.asarray(_link_torques(model, motion) + model.terms.columns(motion) @ friction)
-
-
-def _rms(values: FloatArray, used: Mask) -> FloatArray:
-    counts = np.maximum(used.sum(axis=0), 1)
-    return np.asarray(np.sqrt(np.sum(used * values**2, axis=0) / counts))

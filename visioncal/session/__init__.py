@@ -3,7 +3,17 @@
 from visioncal.session.document import Declaration
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.session import Session
+from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
-__all__ = ["Declaration", "FolderImages", "ImageStore", "MemoryImages", "Session", "Stream", "View"]
+__all__ = [
+    "STREAMS",
+    "Declaration",
+    "FolderImages",
+    "ImageStore",
+    "MemoryImages",
+    "Session",
+    "Stream",
+    "View",
+]

@@ -103,12 +103,15 @@ class Declaration(_TableModel):
     prior: dict[str, PriorTable] = Field(default_factory=dict)
 
 
-def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
+def read_declaration(
+    document: Mapping[str, Any], label: str, *, observed: bool = True
+) -> Declaration:
     """Checks the content of a session.toml.
 
     Args:
         document: The content, as TOML or JSON gives it.
         label: The file's name, for messages.
+        observed: Whether there are views, which something observed.
 
     Raises:
         DataError: A field is missing, of another type, out of range, or contradicts another; the
@@ -135,7 +138,7 @@ def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
     except ValidationError as error:
         problems = [(_dotted(entry["loc"]), _in_words(entry)) for entry in error.errors()]
     else:
-        problems = list(_contradictions(declaration))
+        problems = list(_contradictions(declaration, observed))
     if problems:
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
@@ -183,10 +186,11 @@ _MISSING = {
 }
 
 
-def _contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
+def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[str, str]]:
     """Finds fields that are well typed but do not fit together: (dotted path, words)."""
     camera = declaration.camera
-    if declaration.mount is None and (declaration.instrument is None or camera is not None):
+    unseen = declaration.instrument is None and observed
+    if declaration.mount is None and (unseen or camera is not None):
         yield "mount", "is missing" + _MISSING["mount"]
     if camera is not None:
         yield from _camera_contradictions(camera)

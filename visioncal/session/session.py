@@ -19,7 +19,7 @@ from visioncal.session.boards import COLUMN, check_targets_named, read_targets, 
 from visioncal.session.checks import check_images_can_be_used, view_warnings
 from visioncal.session.digest import digest_facts, is_file
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
-from visioncal.session.images import FolderImages, ImageStore, inside_path
+from visioncal.session.images import FolderImages, ImageStore, MemoryImages, inside_path
 from visioncal.session.streams import (
     FOLDER,
     Stream,
@@ -30,6 +30,9 @@ from visioncal.session.streams import (
 )
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.types import Camera, CameraKind, Mount, Target
+
+# The columns of a session without views.
+ALONE = ("view",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,8 @@ class Session:
     ) -> "Session":
         """Loads a session's folder, or the `.rrd` recording of one.
 
-        An image that is missing is no error here: the view that needs it is named later.
+        An image that is missing is no error here: the view that needs it is named later. Where
+        there are streams, views.csv may be absent.
 
         Args:
             path: The folder or the recording.
@@ -89,7 +93,12 @@ class Session:
                 culprits=[str(path)],
             )
         document = parse_toml(read_text(path / "session.toml"), "session.toml")
-        columns, rows = parse_csv(read_text(path / "views.csv"), "views.csv")
+        streams = read_streams(path)
+        columns: tuple[str, ...] = ALONE
+        rows: tuple[Row, ...] = ()
+        # What an arm's drives needed is told by streams alone.
+        if not streams or (path / "views.csv").exists():
+            columns, rows = parse_csv(read_text(path / "views.csv"), "views.csv")
         session = _build(
             document,
             columns,
@@ -98,7 +107,16 @@ class Session:
             folder=path,
             target_document=target_document,
         )
-        return session.with_streams(read_streams(path))
+        return session.with_streams(streams)
+
+    @classmethod
+    def of_streams(cls, document: Mapping[str, Any], streams: Mapping[str, Stream]) -> "Session":
+        """Builds a session that has streams and no views, with the checks of `load`.
+
+        Raises:
+            DataError: A field or a column is wrong.
+        """
+        return _build(document, ALONE, (), MemoryImages({})).with_streams(streams)
 
     @classmethod
     def assemble(
@@ -196,7 +214,7 @@ class Session:
     @cached_property
     def declaration(self) -> Declaration:
         """The content of session.toml, typed: the clock, the priors, the instrument."""
-        return read_declaration(self.document, "session.toml")
+        return read_declaration(self.document, "session.toml", observed=bool(self.views))
 
     @property
     def name(self) -> str:
@@ -286,7 +304,8 @@ class Session:
             document["robot"] = {**document["robot"], "model": model}
             texts[model] = content
         texts["session.toml"] = tomli_w.dumps(document)
-        texts["views.csv"] = write_csv(self.columns, self.views)
+        if self.views or not self.streams:
+            texts["views.csv"] = write_csv(self.columns, self.views)
         texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
         for path in self._image_paths():
             if self.images.exists(path):
@@ -322,7 +341,7 @@ def _build(
     robot_document: Mapping[str, Any] | None = None,
 ) -> Session:
     """Checks the facts of a session and puts them together."""
-    declaration = read_declaration(document, "session.toml")
+    declaration = read_declaration(document, "session.toml", observed=bool(rows))
     views = read_views(columns, rows, "views.csv")
     warnings = [
         *declaration_warnings(declaration, "session.toml"),

@@ -171,9 +171,7 @@ def _off(body: Body, share: float, rng: np.random.Generator) -> Body:
     return Body(float(kg), centre, np.trace(spread) * np.eye(3) - spread)
 
 
-def drive_torques(
-    built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray
-) -> FloatArray:
+def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
     """What the drives have to give for a motion (Luh, Walker and Paul 1980).
 
     All vectors are told in the base's frame.

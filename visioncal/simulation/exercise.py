@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.session import MemoryImages, Session, Stream
+from visioncal.session import Session, Stream
 from visioncal.simulation.dynamics import DynamicArm, drive_torques
 from visioncal.types import FloatArray
 
@@ -119,4 +119,4 @@ def record(
 def exercise_session(robot: str, streams: Mapping[str, Stream], name: str = "exercise") -> Session:
     """A session of motions alone, without views."""
     document = {"schema": 1, "name": name, "robot": {"model": robot}}
-    return Session.moving(document, streams)
+    return Session.of_streams(document, streams)

@@ -1,0 +1,238 @@
+"""`visioncal dynamics identify` and `validate`."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from visioncal.calibration import Verdict
+from visioncal.cli.console import messages, print_verdict
+from visioncal.cli.stdout import write_stdout
+from visioncal.dynamics.document import stribeck_rows, to_document
+from visioncal.dynamics.friction import FrictionTerms
+from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
+from visioncal.dynamics.identify import SLOW_RAD_S, Options
+from visioncal.dynamics.judge import judge
+from visioncal.dynamics.run import Request, identify_session, validate_session
+from visioncal.dynamics.validate import Prediction, validate
+from visioncal.errors import DataError
+from visioncal.figures import figure
+from visioncal.files import named_errors
+from visioncal.session import Session
+
+_FRICTION = ("coulomb", "viscous", "offset", "motor-inertia")
+_StreamOption: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--stream", help="A stream with torques; may be repeated. Default: all."),
+]
+_CutoffOption: TypeAlias = Annotated[
+    float | None,
+    typer.Option(
+        "--cutoff-hz", min=0.1, help="Of the low-pass. Default: ten times the motion's band."
+    ),
+]
+_GainsOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--gains",
+        metavar="K1,K2,...",
+        help="Torque for a current, by joint [N m/A], where currents were recorded.",
+    ),
+]
+_SessionArgument: TypeAlias = Annotated[
+    Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
+]
+
+
+def dynamics_identify_command(
+    session: _SessionArgument,
+    stream: _StreamOption = None,
+    validate_on: Annotated[
+        str | None,
+        typer.Option(help="A stream to predict. Default: the last 30 % of the fastest motion."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help=f"A folder for {FILE}.")
+    ] = None,
+    friction: Annotated[
+        str,
+        typer.Option(help=f"What joints have of their own: {', '.join(_FRICTION)}; or none."),
+    ] = "coulomb,viscous,offset",
+    stribeck: Annotated[
+        bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
+    ] = True,
+    cutoff_hz: _CutoffOption = None,
+    gains: _GainsOption = None,
+    unchecked: Annotated[
+        bool,
+        typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help=f"Print {FILE}.")] = False,
+) -> None:
+    """Identify an arm's inertias and friction from the torques of its motions.
+
+    Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
+    """
+    options = Options(terms=_terms(friction), stribeck=stribeck, checked=not unchecked)
+    request = Request(
+        tuple(stream or ()), validate_on or "", cutoff_hz, _numbers(gains, "--gains"), options
+    )
+    run = identify_session(Session.load(session), request)
+    identified = run.identified
+    if output is not None:
+        with named_errors(output):
+            output.mkdir(parents=True, exist_ok=True)
+        identified.save(output / FILE)
+    if as_json:
+        write_stdout(json.dumps(to_document(identified), indent=2, allow_nan=False) + "\n")
+        return
+    _tell(identified)
+    if output is None:
+        messages().print("nothing was written: -o names a folder for it")
+    else:
+        messages().print(escape(f"wrote {output / FILE}"))
+
+
+def dynamics_validate_command(
+    session: _SessionArgument,
+    against: Annotated[
+        Path | None, typer.Option(help=f"A folder of identify, or its {FILE}.")
+    ] = None,
+    stream: _StreamOption = None,
+    cutoff_hz: _CutoffOption = None,
+    gains: _GainsOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+) -> None:
+    """Predict the torques of other motions, and say how near that comes.
+
+    Exit status 0: there are figures; 2: there are none, for the reason given.
+    """
+    if against is None:
+        raise DataError(
+            f"dynamics validate: what was identified (--against {FILE}) is needed.",
+            culprits=["--against"],
+            next_step="Name the output folder of visioncal dynamics identify.",
+        )
+    identified = Identified.load(against)
+    request = Request(tuple(stream or ()), "", cutoff_hz, _numbers(gains, "--gains"))
+    predictions = validate_session(Session.load(session), identified, request)
+    if as_json:
+        write_stdout(json.dumps([_figures(it) for it in predictions], indent=2) + "\n")
+        return
+    for prediction in predictions:
+        messages().print(escape(prediction.label))
+        _tell_prediction(identified, prediction)
+
+
+def _terms(words: str) -> FrictionTerms:
+    """The terms of friction that the user names.
+
+    Raises:
+        DataError: There is no such term.
+    """
+    names = [] if words == "none" else [it.strip() for it in words.split(",")]
+    wrong = [it for it in names if it not in _FRICTION]
+    if wrong:
+        raise DataError(
+            f"--friction names {', '.join(wrong)}; the terms are {', '.join(_FRICTION)}, or none.",
+            culprits=["--friction"],
+        )
+    coulomb, viscous, offset, motor = (it in names for it in _FRICTION)
+    return FrictionTerms(coulomb, viscous, offset, motor, SLOW_RAD_S)
+
+
+def _numbers(words: str | None, option: str) -> tuple[float, ...]:
+    """Reads a list of numbers, as many as there are.
+
+    Raises:
+        DataError: It is none.
+    """
+    try:
+        return () if words is None else tuple(float(it) for it in words.split(","))
+    except ValueError as error:
+        raise DataError(
+            f"{option} is {words!r}; numbers with commas between are needed.", culprits=[option]
+        ) from error
+
+
+def _tell(identified: Identified) -> None:
+    console, judged = messages(), judge(identified)
+    print_verdict(Verdict(judged.status, judged.reasons), f"dynamics of {identified.robot.name}")
+    for stream in identified.streams:
+        left = f", {stream.left_out} torques left out" if stream.left_out else ""
+        console.print(
+            escape(
+                f"{stream.label}: {stream.samples} samples at {figure(2 * stream.cutoff_hz)} Hz of "
+                f"a motion up to {figure(stream.band_hz)} Hz{left}"
+            )
+        )
+        for note in stream.notes:
+            console.print(f"  - {escape(note)}")
+    counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
+    told = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
+    console.print(
+        f"{identified.base.rank} base parameters: {told}, {counts[-1][1]} {counts[-1][0]}, "
+        f"{identified.determined.count(NOT_TOLD)} {NOT_TOLD}"
+    )
+    console.print(_joint_table(identified))
+
+
+def _joint_table(identified: Identified) -> Table:
+    """What each joint's torques and friction came to."""
+    validation = identified.validation
+    table = Table("joint", "fitted to [N m]", box=None)
+    if validation is not None:
+        table.add_column("predicted to [N m]")
+        table.add_column("of its range")
+        if validation.known_rms_nm is not None:
+            table.add_column("before [N m]")
+    for name in ("Fc [N m]", "Fv [N m s/rad]", "Fs/Fc", "vs [rad/s]"):
+        table.add_column(name)
+    humps = {row["joint"]: row for row in stribeck_rows(identified)}
+    names = [identified.base.model.names[it] for it in identified.base.independent]
+    values = dict(zip(names, identified.values.tolist(), strict=True))
+    for joint, name in enumerate(identified.robot.joint_names):
+        cells = [name, figure(float(identified.streams[0].rms_nm[joint]))]
+        if validation is not None:
+            cells.append(figure(float(validation.rms_nm[joint])))
+            cells.append(f"{figure(100.0 * float(validation.shares[joint]))} %")
+            if validation.known_rms_nm is not None:
+                cells.append(figure(float(validation.known_rms_nm[joint])))
+        for symbol in ("Fc", "Fv"):
+            value = values.get(f"{symbol}{joint + 1}")
+            cells.append("" if value is None else figure(value))
+        hump = humps.get(joint + 1)
+        cells.append("" if hump is None else figure(hump["static_over_coulomb"]))
+        cells.append("" if hump is None else figure(hump["speed_rad_s"]))
+        table.add_row(*cells)
+    return table
+
+
+def _tell_prediction(identified: Identified, prediction: Prediction) -> None:
+    found = validate(identified, prediction)
+    fitted = identified.streams[0].rms_nm
+    table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
+    for joint, name in enumerate(identified.robot.joint_names):
+        table.add_row(
+            name,
+            figure(float(found.rms_nm[joint])),
+            f"{figure(100.0 * float(found.shares[joint]))} %",
+            figure(float(fitted[joint])),
+        )
+    messages().print(table)
+
+
+def _figures(prediction: Prediction) -> dict[str, str | Sequence[float]]:
+    rms_nm = prediction.rms_nm(prediction.predicted_nm)
+    figures: dict[str, str | Sequence[float]] = {
+        "stream": prediction.label,
+        "rms_nm": rms_nm.tolist(),
+        "torque_nm": prediction.torque_nm.tolist(),
+    }
+    if prediction.consistent_nm is not None:
+        figures["consistent_rms_nm"] = prediction.rms_nm(prediction.consistent_nm).tolist()
+    return figures
