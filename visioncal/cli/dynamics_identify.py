@@ -24,7 +24,7 @@ from visioncal.figures import figure
 from visioncal.files import named_errors
 from visioncal.session import Session
 
-_FRICTION = ("coulomb", "viscous", "offset", "motor-inertia")
+_FRICTION = ("coulomb", "viscous", "offset")
 _StreamOption: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--stream", help="A stream with torques; may be repeated. Default: all."),
@@ -62,6 +62,14 @@ def dynamics_identify_command(
         str,
         typer.Option(help=f"What joints have of their own: {', '.join(_FRICTION)}; or none."),
     ] = "coulomb,viscous,offset",
+    rotors: Annotated[
+        bool | None,
+        typer.Option(
+            "--rotors/--no-rotors",
+            help="Motors' inertia in the torques, or none in those of sensors behind the gears. "
+            "Default: as unseen torques have it.",
+        ),
+    ] = None,
     stribeck: Annotated[
         bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
     ] = True,
@@ -79,7 +87,12 @@ def dynamics_identify_command(
     """
     options = Options(terms=_terms(friction), stribeck=stribeck, checked=not unchecked)
     request = Request(
-        tuple(stream or ()), validate_on or "", cutoff_hz, _numbers(gains, "--gains"), options
+        tuple(stream or ()),
+        validate_on or "",
+        cutoff_hz,
+        _numbers(gains, "--gains"),
+        options,
+        rotors,
     )
     run = identify_session(Session.load(session), request)
     identified = run.identified
@@ -141,8 +154,8 @@ def _terms(words: str) -> FrictionTerms:
             f"--friction names {', '.join(wrong)}; the terms are {', '.join(_FRICTION)}, or none.",
             culprits=["--friction"],
         )
-    coulomb, viscous, offset, motor = (it in names for it in _FRICTION)
-    return FrictionTerms(coulomb, viscous, offset, motor, SLOW_RAD_S)
+    coulomb, viscous, offset = (it in names for it in _FRICTION)
+    return FrictionTerms(coulomb, viscous, offset, slow_rad_s=SLOW_RAD_S)
 
 
 def _numbers(words: str | None, option: str) -> tuple[float, ...]:
@@ -179,36 +192,31 @@ def _tell(identified: Identified) -> None:
         f"{identified.determined.count(NOT_TOLD)} {NOT_TOLD}"
     )
     console.print(_joint_table(identified))
+    console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
 
 
 def _joint_table(identified: Identified) -> Table:
     """What each joint's torques and friction came to."""
-    validation = identified.validation
-    table = Table("joint", "fitted to [N m]", box=None)
-    if validation is not None:
-        table.add_column("predicted to [N m]")
-        table.add_column("of its range")
-        if validation.known_rms_nm is not None:
-            table.add_column("before [N m]")
-    for name in ("Fc [N m]", "Fv [N m s/rad]", "Fs/Fc", "vs [rad/s]"):
-        table.add_column(name)
-    humps = {row["joint"]: row for row in stribeck_rows(identified)}
     names = [identified.base.model.names[it] for it in identified.base.independent]
     values = dict(zip(names, identified.values.tolist(), strict=True))
-    for joint, name in enumerate(identified.robot.joint_names):
-        cells = [name, figure(float(identified.streams[0].rms_nm[joint]))]
-        if validation is not None:
-            cells.append(figure(float(validation.rms_nm[joint])))
-            cells.append(f"{figure(100.0 * float(validation.shares[joint]))} %")
-            if validation.known_rms_nm is not None:
-                cells.append(figure(float(validation.known_rms_nm[joint])))
-        for symbol in ("Fc", "Fv"):
-            value = values.get(f"{symbol}{joint + 1}")
-            cells.append("" if value is None else figure(value))
-        hump = humps.get(joint + 1)
-        cells.append("" if hump is None else figure(hump["static_over_coulomb"]))
-        cells.append("" if hump is None else figure(hump["speed_rad_s"]))
-        table.add_row(*cells)
+    humps = {row["joint"]: row for row in stribeck_rows(identified)}
+    joints = range(1, identified.robot.joint_count + 1)
+    columns: dict[str, list[float | None]] = {"fitted": [*identified.streams[0].rms_nm]}
+    validation = identified.validation
+    if validation is not None:
+        columns["predicted"] = [*validation.rms_nm]
+        columns["of range, %"] = [*(100.0 * validation.shares)]
+        if validation.known_rms_nm is not None:
+            columns["before"] = [*validation.known_rms_nm]
+    for symbol in ("Fc", "Fv", "Ia"):
+        columns[symbol] = [values.get(f"{symbol}{it}") for it in joints]
+    columns["Fs/Fc"] = [humps.get(it, {}).get("static_over_coulomb") for it in joints]
+    columns["vs"] = [humps.get(it, {}).get("speed_rad_s") for it in joints]
+    told = {name: it for name, it in columns.items() if any(value is not None for value in it)}
+    table = Table("joint", *told, box=None)
+    for at, joint in enumerate(joints):
+        row = [None if it[at] is None else figure(float(it[at] or 0.0)) for it in told.values()]
+        table.add_row(str(joint), *row)
     return table
 
 

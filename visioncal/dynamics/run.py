@@ -19,6 +19,8 @@ from visioncal.types import FloatArray
 
 # The share of a motion's end that is predicted where no other motion is named.
 HELD_OUT = 0.3
+# Rotors are there where with them an error of some joint's unseen torques falls to this share.
+_ROTORS = 0.75
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Request:
         cutoff_hz: Of the low-pass [Hz]; by the motion where None.
         gains_nm_a: Torque for a current, by joint, where currents were recorded [N m/A].
         options: What is estimated.
+        rotors: Whether that are rotors, too; None where the torques shall tell: those behind the
+            gears have none in them.
     """
 
     streams: tuple[str, ...] = ()
@@ -38,6 +42,15 @@ class Request:
     cutoff_hz: float | None = None
     gains_nm_a: tuple[float, ...] = ()
     options: Options = field(default_factory=Options)
+    rotors: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """Streams without the end of the fastest motion, and that."""
+
+    rest: tuple[Conditioned, ...]
+    unseen: Conditioned
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +93,16 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
         )
     recorded = [_read(session, robot, it, request) for it in names]
     streams = [_conditioned(robot, it, request) for it in recorded]
-    whole = identify(robot, streams, request.options)
-    proof: Prediction | None
+    split = _split(robot, recorded, streams, request)
+    options = _with_rotors(robot, split, request)
+    whole = identify(robot, streams, options)
+    proof = None
     if request.validate_on:
         other = _read(session, robot, request.validate_on, request)
         proof = _predicted(whole, _conditioned(robot, other, request))
-    else:
-        proof = _of_its_end(robot, recorded, streams, request)
+    elif split is not None:
+        of_rest = identify(robot, split.rest, replace(options, checked=False))
+        proof = _predicted(of_rest, split.unseen, "the last 30 % of ")
     identified = replace(
         whole.identified,
         validation=None if proof is None else validate(whole.identified, proof),
@@ -170,27 +186,44 @@ def _conditioned(robot: Robot, recorded: Recorded, request: Request) -> Conditio
     return condition(recorded, request.cutoff_hz, robot.torque_nm)
 
 
-def _of_its_end(
+def _split(
     robot: Robot, recorded: Sequence[Recorded], streams: Sequence[Conditioned], request: Request
-) -> Prediction | None:
-    """Predicts the end of the fastest motion by a fit of all the rest; None where that tells less.
+) -> _Split | None:
+    """Leaves the end of the fastest motion out; None where the rest tells too little.
 
     Sweeps move one joint after the other: no part of them stands for the others.
     """
     fastest = int(np.argmax([_speed(it) for it in streams]))
-    cutoff = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
-    begin, end = (
-        recorded[fastest].part(0.0, 1.0 - HELD_OUT),
-        recorded[fastest].part(1.0 - HELD_OUT, 1.0),
-    )
+    filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
+    begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)
+    end = recorded[fastest].part(1.0 - HELD_OUT, 1.0)
+    rest = list(streams)
     try:
-        rest = list(streams)
-        rest[fastest] = _conditioned(robot, begin, cutoff)
-        unseen = _conditioned(robot, end, cutoff)
-        options = replace(request.options, checked=False)
-        return _predicted(identify(robot, rest, options), unseen, "the last 30 % of ")
+        rest[fastest] = _conditioned(robot, begin, filtered)
+        split = _Split(tuple(rest), _conditioned(robot, end, filtered))
+        identify(robot, split.rest, _quick(request.options, request.rotors is not False))
     except (DataError, DegenerateError):
         return None
+    return split
+
+
+def _with_rotors(robot: Robot, split: _Split | None, request: Request) -> Options:
+    """The options with rotors, where these are asked for, or predict by far better."""
+    options, rotors = request.options, request.rotors
+    if rotors is None and split is not None:
+        errors = []
+        for there in (False, True):
+            found = identify(robot, split.rest, _quick(options, there))
+            unseen = predict(found.identified, split.unseen)
+            errors.append(unseen.rms_nm(unseen.predicted_nm))
+        rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < _ROTORS)
+    return replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
+
+
+def _quick(options: Options, rotors: bool) -> Options:
+    """The same for base parameters alone."""
+    terms = replace(options.terms, motor_inertia=rotors)
+    return Options(terms, stribeck=False, consistent=False, checked=False)
 
 
 def _speed(stream: Conditioned) -> FloatArray:
