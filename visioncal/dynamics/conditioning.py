@@ -66,7 +66,7 @@ class Piece:
             end = min(begin + at_once, total)
             rows = slice(begin * step, (end - 1) * step + width)
             parts.append(self.lowpass(columns(self.measured.motion.chosen(rows))))
-        return np.concatenate(parts)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     @property
     def used(self) -> Mask:
@@ -123,7 +123,8 @@ class Conditioned:
 
     def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
         """Filters what is computed of the motion, as the torques are: (k, ...)."""
-        return np.concatenate([it.filtered(columns) for it in self.pieces])
+        parts = [it.filtered(columns) for it in self.pieces]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     @classmethod
     def unfiltered(cls, measured: Measured, label: str = "samples") -> Self:
@@ -131,7 +132,7 @@ class Conditioned:
         steps = np.diff(measured.motion.times_s)
         rate_hz = 1.0 / float(np.median(steps))
         bad = np.zeros(measured.torques_nm.shape, dtype=bool)
-        piece = Piece(measured, bad, LowPass(np.ones(1), 1))
+        piece = Piece(measured, bad, LowPass.none())
         return cls(label, (piece,), 0.5 * rate_hz, 0.5 * rate_hz, rate_hz, ())
 
 

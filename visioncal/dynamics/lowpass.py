@@ -32,12 +32,15 @@ class LowPass:
     def of(cls, band_hz: float, rate_hz: float) -> Self:
         """Designs the filter for a cut-off and a rate of samples [Hz]."""
         step = max(int(rate_hz / (2.0 * band_hz)), 1)
-        if step == 1 and rate_hz <= 2.0 * band_hz:
-            return cls(np.ones(1), 1)
         half = step * int(np.ceil(_SPAN * rate_hz / band_hz / step))
         at = np.arange(-half, half + 1)
         taps = np.sinc(2.0 * band_hz / rate_hz * at) * kaiser(len(at), _BETA)
         return cls(taps / taps.sum(), step)
+
+    @classmethod
+    def none(cls) -> Self:
+        """Lets all pass as it is."""
+        return cls(np.ones(1), 1)
 
     @property
     def half(self) -> int:
@@ -67,7 +70,7 @@ class LowPass:
         """Products of blocks of samples with blocks of taps, summed along the diagonals."""
         count, flat = self.count(len(values)), values.reshape(len(values), -1)
         if len(taps) == 1:
-            return np.asarray(values[:: self.step][:count] * taps[0])
+            return values
         blocks = (len(taps) - 1) // self.step
         kept = flat[: (count + blocks - 1) * self.step].reshape(-1, self.step, flat.shape[1])
         parts = taps[:-1].reshape(blocks, self.step) @ kept

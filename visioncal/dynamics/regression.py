@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.fft import next_fast_len, rfft
 from scipy.linalg import qr, solve_triangular
 
 from visioncal.chance import chi2_limit
@@ -22,6 +23,8 @@ _OUTLIER_CHANCE = 1e-3
 _CUTS = 10
 # Correlations are followed until they are lost in their own noise, and over this share of samples.
 _LOST, _FOLLOWED = 3.0, 0.1
+# No frequency has less than this share of white noise's power.
+_LEAST_POWER = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +43,16 @@ class Block:
     y: FloatArray
     used: Mask
     correlation: FloatArray
+
+    def __post_init__(self) -> None:
+        # Joint after joint in memory, since that is how they are read, again and again.
+        by_joint = np.ascontiguousarray(np.moveaxis(self.x, 1, 0))
+        object.__setattr__(self, "x", np.moveaxis(by_joint, 0, 1))
+
+    def predicted(self, values: FloatArray) -> FloatArray:
+        """(k, n) torques by (p,) parameters [N m]."""
+        joints = range(self.y.shape[1])
+        return np.stack([self.x[:, joint] @ values for joint in joints], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +74,7 @@ class Regression:
     @property
     def residuals(self) -> tuple[FloatArray, ...]:
         """(k, n) torques less the fit, a block."""
-        return tuple(it.y - it.x @ self.values for it in self.blocks)
+        return tuple(it.y - it.predicted(self.values) for it in self.blocks)
 
     @property
     def cost(self) -> float:
@@ -101,7 +114,9 @@ def regress(blocks: Sequence[Block]) -> Regression:
         for _ in range(_CUTS):
             values, sigmas, root = _weighted(blocks)
             cut = tuple(
-                replace(it, used=it.used & (np.abs(it.y - it.x @ values) <= _limit(it) * sigma))
+                replace(
+                    it, used=it.used & (np.abs(it.y - it.predicted(values)) <= _limit(it) * sigma)
+                )
                 for it, sigma in zip(blocks, sigmas, strict=True)
             )
             pairs = zip(cut, blocks, strict=True)
@@ -206,18 +221,33 @@ def _covariance(fit: Regression) -> FloatArray:
     where they are plainly larger.
     """
     white = fit.covariance
-    more = np.zeros_like(white)
+    scores = np.zeros_like(white)
     for block, residuals, sigma in zip(fit.blocks, fit.residuals, fit.sigmas, strict=True):
         for joint in range(len(sigma)):
             used = block.used[:, joint]
             shares = _correlations(residuals[:, joint] * used, used, block.correlation)
             rows = block.x[:, joint] * used[:, None] / sigma[joint]
             columns = np.flatnonzero(rows.any(axis=0))
-            rows = rows[:, columns]
-            for lag, share in enumerate(shares, start=1):
-                product = share * rows[lag:].T @ rows[:-lag]
-                more[np.ix_(columns, columns)] += product + product.T
-    return np.asarray(white + white @ more @ white)
+            scores[np.ix_(columns, columns)] += _scores(rows[:, columns], shares)
+    return np.asarray(white @ scores @ white)
+
+
+def _scores(rows: FloatArray, shares: FloatArray) -> FloatArray:
+    """`rows^T T rows`, where T has ones on its diagonal and `shares` beside it.
+
+    By the noise's spectrum, which cannot be negative, whatever cut-off correlations say.
+    """
+    if not len(shares):
+        return np.asarray(rows.T @ rows)
+    size = next_fast_len(len(rows) + len(shares), real=True)
+    kernel = np.zeros(size)
+    kernel[0] = 1.0
+    kernel[1 : len(shares) + 1] = kernel[-1 : -len(shares) - 1 : -1] = shares
+    power = np.maximum(rfft(kernel).real, _LEAST_POWER)
+    # Of a real signal's spectrum all but the ends stand for two frequencies.
+    power[1 : (size + 1) // 2] *= 2.0
+    waves = rfft(rows, size, axis=0) * np.sqrt(power / size)[:, None]
+    return np.asarray(waves.real.T @ waves.real + waves.imag.T @ waves.imag)
 
 
 def _correlations(residuals: FloatArray, used: Mask, known: FloatArray) -> FloatArray:

@@ -77,9 +77,10 @@ def untold(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
     information = np.zeros((base.rank, base.rank))
     rows = 0
     for block in blocks:
-        x = block.x[..., : base.rank].reshape(-1, base.rank)
-        information += x.T @ x
-        rows += len(x)
+        for joint in range(block.y.shape[1]):
+            x = block.x[:, joint]
+            information += x.T @ x
+            rows += len(x)
     sizes = _usual(base)
     relative = information / np.outer(sizes, sizes) / max(rows, 1)
     values, vectors = np.linalg.eigh(relative)
