@@ -54,6 +54,13 @@ class Block:
         joints = range(self.y.shape[1])
         return np.stack([self.x[:, joint] @ values for joint in joints], axis=1)
 
+    def within(self, values: FloatArray, sigma: FloatArray) -> "Block":
+        """The same without torques that are farther from a fit than chance takes them."""
+        count = max(int(self.used.sum()), 1)
+        limit = float(np.sqrt(chi2_limit(_OUTLIER_CHANCE / count, 1.0)))
+        near = np.abs(self.y - self.predicted(values)) <= limit * sigma
+        return replace(self, used=self.used & near)
+
 
 @dataclass(frozen=True, eq=False)
 class Regression:
@@ -113,12 +120,7 @@ def regress(blocks: Sequence[Block]) -> Regression:
     with one_blas_thread():
         for _ in range(_CUTS):
             values, sigmas, root = _weighted(blocks)
-            cut = tuple(
-                replace(
-                    it, used=it.used & (np.abs(it.y - it.predicted(values)) <= _limit(it) * sigma)
-                )
-                for it, sigma in zip(blocks, sigmas, strict=True)
-            )
+            cut = tuple(it.within(values, sigma) for it, sigma in zip(blocks, sigmas, strict=True))
             pairs = zip(cut, blocks, strict=True)
             if all(new.used.sum() == old.used.sum() for new, old in pairs):
                 break
@@ -137,10 +139,6 @@ def spread_of(values: FloatArray, used: Mask) -> FloatArray:
     """(n,) standard deviation of those of (k, n) values that count."""
     counts = np.maximum(used.sum(axis=0), 1)
     return rms_of(values - np.sum(used * values, axis=0) / counts, used)
-
-
-def _limit(block: Block) -> float:
-    return float(np.sqrt(chi2_limit(_OUTLIER_CHANCE / max(block.used.sum(), 1), 1.0)))
 
 
 def _weighted(

@@ -1,7 +1,8 @@
 """What breaking loose takes: Stribeck's hump of dry friction at low speeds, and how wide it is.
 
-Dry friction is `(Fc + (Fs - Fc) exp(-(dq / vs)^2)) sign(dq)`. All but the speeds vs are linear, and
-eliminated (Golub and Pereyra 1973, variable projection, in Kaufman's form of 1975).
+Dry friction is `(Fc + (Fs - Fc) exp(-(dq / vs)^2)) sign(dq)`. Where friction sets in gradually, as
+torque sensors behind a gear have it, the hump is a dip: Fs is less than Fc. All but the speeds vs
+are linear, and eliminated (Golub and Pereyra 1973, variable projection, in Kaufman's form of 1975).
 """
 
 from collections.abc import Sequence
@@ -109,12 +110,12 @@ def _polished(
 
 
 def _shown(found: Stribeck, fit: Regression) -> FloatArray:
-    """(a,) whether a hump is above chance, upright, and within the range of speeds."""
+    """(a,) whether a hump is above chance and within the range of speeds."""
     count = len(found.joints)
     sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
     limit = float(np.sqrt(chi2_limit(_CHANCE, 2.0)))
     inside = (found.speed_rad_s > 1.01 * _SLOWEST) & (found.speed_rad_s < 0.99 * _FASTEST)
-    return np.asarray((found.hump_nm > limit * sigma) & inside)
+    return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside)
 
 
 def _fitted(
