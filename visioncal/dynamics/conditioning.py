@@ -24,8 +24,9 @@ _TORQUE_BAND, _LEAST_HZ = 10.0, 4.0
 _GAP, _GAP_S, _JITTER = 2.5, 0.02, 0.02
 # Torques at rest on an extreme for so many samples on end, within this share of it, are cut off.
 _FLAT_SAMPLES, _FLAT = 5, 1e-6
-# Torques that stand out from their neighbours by so many times what is usual are slips of the line.
-_SPIKE, _NEIGHBOURS = 10.0, 5
+# Torques that stand out from their neighbours by so many times what is usual, and by this share of
+# their range, are slips of the line.
+_SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
 # So many samples' regressors are held at a time.
 _SAMPLES_AT_ONCE = 20_000
 # An output that rests on bad samples by more than this share is not used.
@@ -243,8 +244,9 @@ def _cleaned(
     around = median_filter(torques, (_NEIGHBOURS, 1), mode="nearest")
     away = np.abs(torques - around)
     # Of normal noise three in four samples depart from the median of five by less than this.
-    usual = np.quantile(away, 0.75, axis=0) + 1e-9 * np.abs(torques).max(axis=0) + 1e-12
-    spikes = (away > _SPIKE * usual) & ~flat
+    usual = np.quantile(away, 0.75, axis=0)
+    range_nm = np.quantile(torques, 0.999, axis=0) - np.quantile(torques, 0.001, axis=0)
+    spikes = (away > np.maximum(_SPIKE * usual, _SPIKE_SHARE * range_nm)) & ~flat
     spikes &= spikes.mean(axis=0) < _TOUCHED
     torques[spikes] = around[spikes]
     for what, wrong, done in (
