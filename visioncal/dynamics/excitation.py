@@ -24,6 +24,7 @@ from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.objective import Objective
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimator.linalg import one_blas_thread
+from visioncal.files import some_of
 from visioncal.types import FloatArray, Progress
 
 # How long a motion may be [s], and of how many harmonics: fewer cannot tell the parameters of six
@@ -41,6 +42,8 @@ _SMALLER, _TRIES = 0.97, 5
 _FIGURES_HZ = 100.0
 # Random motions whose condition is told, to compare with.
 _COMPARED = 20
+# Broken limits that a message names.
+_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -160,7 +163,7 @@ class _Search:
         if self._best is None:
             raise DegenerateError(
                 f"robot {self._allowed.robot.name}: no motion was found that keeps the limits; of "
-                f"the last one tried, {self._breaches[0]}.",
+                f"the last one tried, {some_of(self._breaches, _NAMED)}.",
                 culprits=self._breaches,
                 next_step="Search for longer (--seconds), or leave the motion more room: "
                 "--duration, --margin-deg, --clearance-mm, --floor.",

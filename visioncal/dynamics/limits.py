@@ -193,7 +193,8 @@ def _check_told(robot: Robot, reach: FloatArray, speed: FloatArray, hard: FloatA
                 f"robot {robot.name}: its description tells no limits of {what} for "
                 f"{some_of(lacking)}; a motion is planned within limits only.",
                 culprits=lacking,
-                next_step=f"Write {keys} into the robot's description, or give {option}.",
+                next_step=f"Write {keys} into its description (a <limit> into a URDF), or give "
+                f"{option}.",
             )
 
 

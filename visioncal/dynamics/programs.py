@@ -34,7 +34,8 @@ def excitation_program(robot: Robot, series: Series) -> str:
         f"  start = {_joints(series.start)}",
         *_begin(),
         "  t = 0.0",
-        "  while t < period:",
+        # Sums of steps round: the last one must not be driven twice.
+        "  while t < period - 0.5 * step:",
         "    w = 6.283185307179586 * t / period",
         *(f"    s{it} = sin({it}.0 * w)" for it in orders),
         *(f"    c{it} = cos({it}.0 * w)" for it in orders),

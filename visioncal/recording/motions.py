@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
@@ -125,7 +126,7 @@ def _log_curves(stream: rr.RecordingStream, part: MotionPart, begin_s: float) ->
     curves = [np.rad2deg(it) for it in (motion.q, motion.dq, motion.ddq)]
     if part.torques_nm is not None:
         curves.append(part.torques_nm)
-    times = rr.TimeColumn(paths.MOTION_TIMELINE, duration=begin_s + motion.times_s)
+    times = rr.TimeColumn(paths.MOTION_TIMELINE, duration=_durations(begin_s + motion.times_s))
     for kind, values in zip(paths.MOTION_KINDS, curves, strict=False):
         columns = rr.Scalars.columns(scalars=values)
         stream.send_columns(f"{paths.MOTION}/{kind}", indexes=[times], columns=columns)
@@ -135,9 +136,15 @@ def _log_way(
     stream: rr.RecordingStream, preview: MotionPreview, part: MotionPart, begin_s: float
 ) -> None:
     """Moves the arm."""
-    for seconds, q in zip(part.motion.times_s.tolist(), part.motion.q, strict=True):
-        stream.set_time(paths.MOTION_TIMELINE, duration=begin_s + seconds)
+    motion = part.motion
+    for duration, q in zip(_durations(begin_s + motion.times_s), motion.q, strict=True):
+        stream.set_time(paths.MOTION_TIMELINE, duration=duration)
         links = preview.robot.link_frames(q)
         log_arm(stream, links)
         log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, links[-1])
     stream.reset_time()
+
+
+def _durations(times_s: FloatArray) -> npt.NDArray[np.timedelta64]:
+    """Times as the recording counts them, so that curves and arm have the same to the last bit."""
+    return np.round(1e9 * times_s).astype("timedelta64[ns]")
