@@ -37,11 +37,11 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
     found = plan.excitation
     condition, random = found.condition, found.random
     told = [
-        f"exciting motion of {found.request.period_s:g} s for {found.base.rank} base parameters: "
-        f"condition {condition.weighted:.1f}, of random motions {random.weighted:.0f} (joints "
-        "weighted by their greatest torques, columns of unit length); "
-        f"{condition.scaled:.1f} and {random.scaled:.0f} without weights, {condition.raw:.0f} and "
-        f"{random.raw:.0f} raw",
+        f"exciting motion of {found.request.period_s:g} s: condition {condition.weighted:.1f} for "
+        f"{found.base.rank} base parameters (random motions: {random.weighted:.0f})",
+        "joints weighted by their greatest torques, columns of unit length; unweighted "
+        f"{condition.scaled:.1f} (random: {random.scaled:.0f}), raw {condition.raw:.0f} (random: "
+        f"{random.raw:.0f})",
         f"it uses {_used(found.kept)}",
     ]
     if plan.sweeps is not None:
