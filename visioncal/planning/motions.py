@@ -62,10 +62,7 @@ def _used(kept: Kept) -> str:
     parts = [f"{100.0 * max(values):.0f} % of the {name}" for name, values in shares.items()]
     near = ""
     if kept.nearest:
-        first, second = kept.nearest
-        near = (
-            f"; nearest to one another come {first} and {second}, {1e3 * kept.clearance_m:.0f} mm"
-        )
+        near = f"; {' and '.join(kept.nearest)} come to {1e3 * kept.clearance_m:.0f} mm"
     return f"at most {', '.join(parts)} allowed{near}"
 
 

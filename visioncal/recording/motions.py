@@ -114,8 +114,11 @@ def _log_static(stream: rr.RecordingStream, preview: MotionPreview) -> None:
         drawn = rr.LineStrips3D([way], colors=colour, radii=_LINE * size_m)
         stream.log(f"{paths.WAY}/{part.name}", in_base, drawn, static=True)
     names = list(preview.robot.joint_names)
+    # A joint has the same colour in all curves.
+    tints = [colours.SCALE[place % len(colours.SCALE)] for place in range(len(names))]
     for kind in paths.MOTION_KINDS:
-        stream.log(f"{paths.MOTION}/{kind}", rr.SeriesLines(names=names), static=True)
+        lines = rr.SeriesLines(names=names, colors=tints)
+        stream.log(f"{paths.MOTION}/{kind}", lines, static=True)
     note = rr.TextDocument(preview.note, media_type="text/markdown")
     stream.log(paths.PLAN_NOTE, note, static=True)
 

@@ -38,10 +38,20 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
     kinds: tuple[str, ...] = paths.MOTION_KINDS
     if any(it.torques_nm is None for it in preview.parts):
         kinds = kinds[:-1]
-    curves = [rrb.TimeSeriesView(name=_TITLES[it], origin=f"{paths.MOTION}/{it}") for it in kinds]
+    # One legend is enough: a joint has the same colour in all curves.
+    curves = [
+        rrb.TimeSeriesView(
+            name=_TITLES[it],
+            origin=f"{paths.MOTION}/{it}",
+            plot_legend=rrb.PlotLegend(visible=it == kinds[0]),
+        )
+        for it in kinds
+    ]
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(cell, note, row_shares=[2, 1]), rrb.Vertical(*curves), column_shares=[1, 1]
+            rrb.Vertical(cell, note, row_shares=[2, 1]),
+            rrb.Vertical(*curves, row_shares=[2, *(1 for _ in curves[1:])]),
+            column_shares=[1, 1],
         ),
         rrb.TimePanel(
             state=rrb.PanelState.Collapsed, timeline=paths.MOTION_TIMELINE, play_state="paused"
