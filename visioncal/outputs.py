@@ -6,11 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from visioncal.dynamics import FILE as DYNAMICS
+from visioncal.dynamics import Run
 from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.written import MOTION_FILES, motion_files
 from visioncal.errors import DataError
 from visioncal.files import named_errors, write_atomically
-from visioncal.pipeline import Run
+from visioncal.pipeline import Run as Calibrated
 from visioncal.planning.plan import Plan
 from visioncal.planning.written import program_of, stops_table
 from visioncal.session import Session
@@ -22,7 +24,7 @@ STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.r
 
 
 def write_outputs(
-    folder: Path, session: Session | None, run: Run, note: str = ""
+    folder: Path, session: Session | None, run: Calibrated, note: str = ""
 ) -> tuple[Path, ...]:
     """Writes the three files into a folder.
 
@@ -169,6 +171,31 @@ def write_motions(
             with named_errors(folder / name):
                 (folder / name).unlink(missing_ok=True)
     return written
+
+
+def write_dynamics(folder: Path, run: Run) -> tuple[Path, ...]:
+    """Writes identified dynamics, their report and recording into a folder, together or not at all.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        run: The result with its evidence.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.recording.dynamics import write_dynamics_recording
+    from visioncal.report.dynamics import write_dynamics_report
+    from visioncal.viewer.dynamics import dynamics_blueprint
+
+    def write(aside: Path) -> None:
+        run.identified.save(aside / DYNAMICS)
+        write_dynamics_report(aside / REPORT, run)
+        write_dynamics_recording(aside / RECORDING, run, dynamics_blueprint(run))
+
+    return _write_together(folder, (RECORDING, REPORT, DYNAMICS), write)
 
 
 def _write_together(

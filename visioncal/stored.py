@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.calibration import Calibration, FrameFile, to_document
+from visioncal.dynamics import FILE as DYNAMICS
+from visioncal.dynamics import Identified
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import read_bytes
@@ -75,15 +77,35 @@ def load_placed(path: Path) -> Calibration | FrameFile:
     return FrameFile.load(file) if _holds_frames(file) else load_calibration(path)
 
 
+def load_exportable(path: Path) -> Calibration | FrameFile | Identified:
+    """Loads what `load_placed` loads, or an arm's dynamics.
+
+    Args:
+        path: As for `load_placed`, or a dynamics.json, or a folder with one and no
+            calibration.json.
+
+    Raises:
+        DataError: There is nothing of the kind, or it cannot be read.
+    """
+    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / DYNAMICS).is_file()
+    file = path / DYNAMICS if alone else path
+    return Identified.load(file) if _holds(file, "base") else load_placed(path)
+
+
 def _holds_frames(path: Path) -> bool:
-    """Tells a file of frames by its content: every calibration has transforms."""
+    """Tells a file of frames by its content."""
+    return _holds(path, "frames")
+
+
+def _holds(path: Path, key: str) -> bool:
+    """Whether a file is JSON with some key, and no calibration: each of these has transforms."""
     if path.suffix.lower() == ".rrd" or not path.is_file():
         return False
     try:
         document = json.loads(read_bytes(path))
     except (ValueError, RecursionError):
         return False
-    return isinstance(document, dict) and "frames" in document and "transforms" not in document
+    return isinstance(document, dict) and key in document and "transforms" not in document
 
 
 def _frames_alone(path: Path) -> DataError:

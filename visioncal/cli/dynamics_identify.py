@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -11,6 +11,15 @@ from rich.table import Table
 
 from visioncal.calibration import Verdict
 from visioncal.cli.console import messages, print_verdict
+from visioncal.cli.dynamics_options import (
+    AgainstOption,
+    CutoffOption,
+    GainsOption,
+    SessionArgument,
+    StreamOption,
+    identified_of,
+    number_list,
+)
 from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics.document import stribeck_rows, to_document
 from visioncal.dynamics.friction import FrictionTerms
@@ -21,42 +30,22 @@ from visioncal.dynamics.run import Request, identify_session, validate_session
 from visioncal.dynamics.validate import Prediction, validate
 from visioncal.errors import DataError
 from visioncal.figures import figure
-from visioncal.files import named_errors
+from visioncal.outputs import write_dynamics
 from visioncal.session import Session
 
 _FRICTION = ("coulomb", "viscous", "offset")
-_StreamOption: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option("--stream", help="A stream with torques; may be repeated. Default: all."),
-]
-_CutoffOption: TypeAlias = Annotated[
-    float | None,
-    typer.Option(
-        "--cutoff-hz", min=0.1, help="Of the low-pass. Default: ten times the motion's band."
-    ),
-]
-_GainsOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--gains",
-        metavar="K1,K2,...",
-        help="Torque for a current, by joint [N m/A], where currents were recorded.",
-    ),
-]
-_SessionArgument: TypeAlias = Annotated[
-    Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
-]
 
 
 def dynamics_identify_command(
-    session: _SessionArgument,
-    stream: _StreamOption = None,
+    session: SessionArgument,
+    stream: StreamOption = None,
     validate_on: Annotated[
         str | None,
         typer.Option(help="A stream to predict. Default: the last 30 % of the fastest motion."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help=f"A folder for {FILE}.")
+        Path | None,
+        typer.Option("-o", "--output", help=f"A folder for {FILE}, report and recording."),
     ] = None,
     friction: Annotated[
         str,
@@ -73,8 +62,8 @@ def dynamics_identify_command(
     stribeck: Annotated[
         bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
     ] = True,
-    cutoff_hz: _CutoffOption = None,
-    gains: _GainsOption = None,
+    cutoff_hz: CutoffOption = None,
+    gains: GainsOption = None,
     unchecked: Annotated[
         bool,
         typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
@@ -90,48 +79,37 @@ def dynamics_identify_command(
         tuple(stream or ()),
         validate_on or "",
         cutoff_hz,
-        _numbers(gains, "--gains"),
+        number_list(gains, "--gains"),
         options,
         rotors,
     )
     run = identify_session(Session.load(session), request)
     identified = run.identified
-    if output is not None:
-        with named_errors(output):
-            output.mkdir(parents=True, exist_ok=True)
-        identified.save(output / FILE)
+    written = () if output is None else write_dynamics(output, run)
     if as_json:
         write_stdout(json.dumps(to_document(identified), indent=2, allow_nan=False) + "\n")
         return
     _tell(identified)
-    if output is None:
+    for path in written:
+        messages().print(escape(f"wrote {path}"))
+    if not written:
         messages().print("nothing was written: -o names a folder for it")
-    else:
-        messages().print(escape(f"wrote {output / FILE}"))
 
 
 def dynamics_validate_command(
-    session: _SessionArgument,
-    against: Annotated[
-        Path | None, typer.Option(help=f"A folder of identify, or its {FILE}.")
-    ] = None,
-    stream: _StreamOption = None,
-    cutoff_hz: _CutoffOption = None,
-    gains: _GainsOption = None,
+    session: SessionArgument,
+    against: AgainstOption = None,
+    stream: StreamOption = None,
+    cutoff_hz: CutoffOption = None,
+    gains: GainsOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
 ) -> None:
     """Predict the torques of other motions, and say how near that comes.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
-    if against is None:
-        raise DataError(
-            f"dynamics validate: what was identified (--against {FILE}) is needed.",
-            culprits=["--against"],
-            next_step="Name the output folder of visioncal dynamics identify.",
-        )
-    identified = Identified.load(against)
-    request = Request(tuple(stream or ()), "", cutoff_hz, _numbers(gains, "--gains"))
+    identified = identified_of(against, "validate")
+    request = Request(tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"))
     predictions = validate_session(Session.load(session), identified, request)
     if as_json:
         write_stdout(json.dumps([_figures(it) for it in predictions], indent=2) + "\n")
@@ -156,20 +134,6 @@ def _terms(words: str) -> FrictionTerms:
         )
     coulomb, viscous, offset = (it in names for it in _FRICTION)
     return FrictionTerms(coulomb, viscous, offset, slow_rad_s=SLOW_RAD_S)
-
-
-def _numbers(words: str | None, option: str) -> tuple[float, ...]:
-    """Reads a list of numbers, as many as there are.
-
-    Raises:
-        DataError: It is none.
-    """
-    try:
-        return () if words is None else tuple(float(it) for it in words.split(","))
-    except ValueError as error:
-        raise DataError(
-            f"{option} is {words!r}; numbers with commas between are needed.", culprits=[option]
-        ) from error
 
 
 def _tell(identified: Identified) -> None:

@@ -11,7 +11,7 @@ from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
 from visioncal.files import check_free, read_text, write_atomically
-from visioncal.stored import load_placed
+from visioncal.stored import load_exportable
 
 
 def _show_formats(wanted: bool) -> None:
@@ -26,7 +26,8 @@ def export_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="An output folder, its calibration.json, a recording (.rrd), or a file of frames."
+            help="An output folder, its calibration.json or dynamics.json, a recording (.rrd), or "
+            "a file of frames."
         ),
     ],
     to: Annotated[str, typer.Option("--to", help="The format; --list shows them all.")],
@@ -91,7 +92,7 @@ def export_command(
     selection = Selection(
         edge, inverse, parent, child, number, load, convention, calibration_hash, kept
     )
-    written = document(load_placed(source), to, selection)
+    written = document(load_exportable(source), to, selection)
     for it in written.warnings:
         messages().print(f"[bold red]warning:[/] {escape(it)}")
     if out is None or out == Path("-"):

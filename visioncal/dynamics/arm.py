@@ -1,10 +1,13 @@
 """An arm whose dynamics are known, put to use: what its drives have to give."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from visioncal.dynamics.friction import Friction
+from visioncal.dynamics.identified import Identified
+from visioncal.errors import DataError
 from visioncal.robot import Inertias, Robot, joint_torques, momenta, moving, with_inertias
 from visioncal.types import FloatArray
 
@@ -22,6 +25,44 @@ class ArmDynamics:
     robot: Robot
     inertias: Inertias
     friction: Friction
+
+    @classmethod
+    def of(cls, identified: Identified) -> Self:
+        """Takes an identified arm, with links that are bodies.
+
+        Raises:
+            DataError: Its inertias were not known before, so that there are no bodies.
+        """
+        robot = identified.robot
+        if identified.consistent is None:
+            raise DataError(
+                f"dynamics: nothing was known of the inertias of {robot.name}, so there are no "
+                "links that are bodies.",
+                culprits=[robot.name],
+                next_step="Tell mass_kg, com_m and inertia_kg_m2 of its joints, and identify "
+                "again.",
+            )
+        standard = identified.consistent.values
+        links = 10 * robot.joint_count
+        own = dict(zip(identified.base.model.names[links:], standard[links:], strict=True))
+
+        def of_joints(symbol: str) -> FloatArray:
+            joints = range(1, robot.joint_count + 1)
+            return np.array([own.get(f"{symbol}{joint}", 0.0) for joint in joints])
+
+        humps = identified.stribeck
+        breaking, speeds = np.zeros(robot.joint_count), np.ones(robot.joint_count)
+        breaking[humps.joints], speeds[humps.joints] = humps.hump_nm, humps.speed_rad_s
+        friction = Friction(
+            of_joints("Fc"),
+            of_joints("Fv"),
+            of_joints("offset"),
+            of_joints("Ia"),
+            breaking,
+            speeds,
+            identified.base.model.terms.slow_rad_s,
+        )
+        return cls(robot, Inertias(standard[:links].reshape(-1, 10)), friction)
 
     def torques(self, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
         """What the drives have to give for a motion: the torque to feed forward.

@@ -69,6 +69,11 @@ class Run:
     predicted: Prediction | None
     fitted: tuple[Prediction, ...]
 
+    @property
+    def predictions(self) -> tuple[Prediction, ...]:
+        """All of them, those that were not fitted last."""
+        return self.fitted if self.predicted is None else (*self.fitted, self.predicted)
+
 
 def identify_session(session: Session, request: Request | None = None) -> Run:
     """Identifies the dynamics of a session's arm.
@@ -124,12 +129,23 @@ def validate_session(
     Raises:
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
     """
+    return [predict(identified, it) for it in conditioned_streams(session, identified, request)]
+
+
+def conditioned_streams(
+    session: Session, identified: Identified, request: Request
+) -> list[Conditioned]:
+    """Reads a session's streams, filtered as those from which an arm was identified.
+
+    Raises:
+        DataError: The robot is another one, there is no such stream, or a stream is wrong.
+    """
     robot = identified.robot
     names = torque_streams(session, request.streams)
     recorded = [_read(session, robot, it, request) for it in names]
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
     filtered = replace(request, cutoff_hz=cutoff_hz)
-    return [predict(identified, _conditioned(robot, it, filtered)) for it in recorded]
+    return [_conditioned(robot, it, filtered) for it in recorded]
 
 
 def robot_of(session: Session) -> Robot:

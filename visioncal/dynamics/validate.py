@@ -29,6 +29,8 @@ class Prediction:
         known_nm: (k, n) by the robot's own inertias, with the friction that goes best with them;
             None where it has none.
         used: (k, n) which of the torques count.
+        q: (k, n) joint angles, filtered likewise [rad].
+        dq: (k, n) their speeds [rad/s].
     """
 
     label: str
@@ -38,6 +40,8 @@ class Prediction:
     consistent_nm: FloatArray | None
     known_nm: FloatArray | None
     used: Mask
+    q: FloatArray
+    dq: FloatArray
 
     def rms_nm(self, predicted_nm: FloatArray) -> FloatArray:
         """(n,) root mean square error of a prediction [N m]."""
@@ -72,6 +76,8 @@ def predict(
         stream.filtered(identified.consistent_torques) if with_bodies else None,
         known,
         stream.used,
+        stream.filtered(lambda motion: motion.q),
+        stream.filtered(lambda motion: motion.dq),
     )
 
 

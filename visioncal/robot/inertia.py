@@ -49,7 +49,7 @@ class Inertias:
         turned = np.array([skew(it) for it in centres_m])
         about_origin = about - kg[:, None, None] * turned @ turned
         moments = kg[:, None] * centres_m
-        return cls(np.column_stack([kg, moments, about_origin[:, _ROWS, _COLUMNS]]))
+        return cls(np.column_stack([kg, moments, entries(about_origin)]))
 
     @property
     def masses(self) -> Masses:
@@ -74,9 +74,14 @@ class Inertias:
 
     def rows(self) -> list[dict[str, Any]]:
         """The joints' entries in a description whose rows are the joints' frames."""
-        about = self.about_centres[:, _ROWS, _COLUMNS].tolist()
+        about = entries(self.about_centres).tolist()
         rows = zip(self.masses.rows(), about, strict=True)
         return [mass | {INERTIA_KEY: it} for mass, it in rows]
+
+
+def entries(full: FloatArray) -> FloatArray:
+    """The (..., 6) xx, xy, yy, xz, yz, zz of (..., 3, 3) symmetric matrices."""
+    return np.asarray(full[..., _ROWS, _COLUMNS])
 
 
 def matrices(six: FloatArray) -> FloatArray:
@@ -111,7 +116,7 @@ def parameters_of(pseudo: FloatArray) -> FloatArray:
     trace = np.trace(second, axis1=-2, axis2=-1)
     inertia = trace[..., None, None] * np.eye(3) - second
     mass, moments = pseudo[..., 3, 3][..., None], pseudo[..., :3, 3]
-    return np.concatenate([mass, moments, inertia[..., _ROWS, _COLUMNS]], axis=-1)
+    return np.concatenate([mass, moments, entries(inertia)], axis=-1)
 
 
 def moving(link_from_body: FloatArray) -> FloatArray:
