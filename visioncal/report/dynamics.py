@@ -25,6 +25,8 @@ _UNITS = {
     "offset": "N m",
 }
 _FIRST_MOMENT = "kg m"
+# So many of the fitted motions are shown: more look alike.
+_MOST_FITTED = 2
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ def render_dynamics(run: Run) -> str:
     identified = run.identified
     source = identified.facts.get("session", {})
     judged = judge(identified)
-    found = [(it, "fitted") for it in run.fitted]
-    found += [] if run.predicted is None else [(run.predicted, "not fitted")]
+    shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
+    shown += [(it, "fitted") for it in run.fitted[:_MOST_FITTED]]
     return (
         environment()
         .get_template("dynamics.html.j2")
@@ -101,8 +103,8 @@ def render_dynamics(run: Run) -> str:
             counts=_counts(identified),
             links=tuple(_link_rows(identified)),
             humps=tuple(_hump_facts(identified)),
-            plots=tuple(_plots(found)),
-            friction_plot=torqueplots.friction(identified, [it for it, _ in found]),
+            plots=tuple(_plots(shown)),
+            friction_plot=torqueplots.friction(identified, run.predictions),
             version=__version__,
             python=platform.python_version(),
             versions=content.dependency_versions(),
@@ -110,9 +112,9 @@ def render_dynamics(run: Run) -> str:
     )
 
 
-def _plots(found: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Markup]]:
-    """Torques over time, the unseen ones first, with a title each."""
-    for number, (prediction, how) in enumerate(reversed(found), start=1):
+def _plots(shown: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Markup]]:
+    """Torques over time, with a title each."""
+    for number, (prediction, how) in enumerate(shown, start=1):
         yield f"{prediction.label}, {how}", torqueplots.torques(prediction, number)
 
 
