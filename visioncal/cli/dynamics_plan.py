@@ -2,15 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, TypeAlias
 
 import numpy as np
-import typer
 from rich.markup import escape
 
+from visioncal.cli import motion_options as options
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.numbers import numbers_in
-from visioncal.cli.planned_cell import box_of
+from visioncal.cli.plan_options import BoxOption, Clearance, Floor, Margin
+from visioncal.cli.planned_cell import box_of, floor_of
 from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.friction import FrictionTerms
@@ -26,125 +26,31 @@ from visioncal.robot import Robot, load_robot
 from visioncal.robot.bodies import Body, capsule
 from visioncal.types import FloatArray
 
-_MOTION, _LIMITS = "The motion", "What the arm must keep"
-_FRICTION = ("coulomb", "viscous", "offset", "motor-inertia")
-
-
-def _option(*names: str, panel: str, words: str, metavar: str | None = None) -> object:
-    return typer.Option(
-        *names, help=words, rich_help_panel=panel, show_default=False, metavar=metavar
-    )
-
-
-_Degrees: TypeAlias = float | None
-
 
 def dynamics_plan_command(
-    robot: Annotated[str, typer.Argument(help="A built-in robot, or a .urdf, .toml or .json.")],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for tables, programs and preview.")
-    ] = Path("motions"),
-    duration: Annotated[
-        float,
-        typer.Option(help="How long the exciting motion lasts, in s.", rich_help_panel=_MOTION),
-    ] = 20.0,
-    harmonics: Annotated[
-        int, typer.Option(help="Harmonics of that period.", rich_help_panel=_MOTION)
-    ] = 5,
-    friction: Annotated[
-        str,
-        typer.Option(
-            help=f"What is to be told besides inertias: {', '.join(_FRICTION)}; or none.",
-            rich_help_panel=_MOTION,
-        ),
-    ] = "coulomb,viscous,offset",
-    sweep_speeds: Annotated[
-        int, typer.Option(help="Speeds at which each joint sweeps.", rich_help_panel=_MOTION)
-    ] = 6,
-    no_sweeps: Annotated[
-        bool, typer.Option("--no-sweeps", help="No sweeps.", rich_help_panel=_MOTION)
-    ] = False,
-    rate_hz: Annotated[
-        float,
-        typer.Option(
-            "--rate",
-            min=1.0,
-            max=4000.0,
-            help="Rows a second of the tables.",
-            rich_help_panel=_MOTION,
-        ),
-    ] = 500.0,
-    seconds: Annotated[
-        float,
-        typer.Option(help="How long to search, in s of one core.", rich_help_panel=_MOTION),
-    ] = 25.0,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Of the random starts.", rich_help_panel=_MOTION)
-    ] = 0,
-    margin_deg: Annotated[
-        float, typer.Option(help="To the ends of the joints' ranges.", rich_help_panel=_LIMITS)
-    ] = 3.0,
-    speed: Annotated[
-        float, typer.Option(help="Share of the greatest speeds.", rich_help_panel=_LIMITS)
-    ] = 0.9,
-    acceleration: Annotated[
-        float, typer.Option(help="Share of the greatest accelerations.", rich_help_panel=_LIMITS)
-    ] = 0.9,
-    torque_margin: Annotated[
-        float,
-        typer.Option(
-            help="Torques may be so many times larger than predicted.", rich_help_panel=_LIMITS
-        ),
-    ] = 1.2,
-    clearance_mm: Annotated[
-        float, typer.Option(help="Distance that all keep.", rich_help_panel=_LIMITS)
-    ] = 30.0,
-    floor: Annotated[
-        str,
-        typer.Option(
-            help="Height of the floor in the base, in mm; or none.", rich_help_panel=_LIMITS
-        ),
-    ] = "0",
-    boxes: Annotated[
-        list[str] | None,
-        _option(
-            "--box",
-            panel=_LIMITS,
-            metavar="NAME:X,Y,Z:SX,SY,SZ",
-            words="Something in the way: centre in the base and lengths, in mm; may be repeated.",
-        ),
-    ] = None,
-    tool: Annotated[
-        str | None,
-        _option(
-            "--tool",
-            panel=_LIMITS,
-            metavar="LENGTH,RADIUS",
-            words="What sticks out of the flange, along its z, in mm.",
-        ),
-    ] = None,
-    payload: Annotated[
-        str | None,
-        _option(
-            "--payload",
-            panel=_LIMITS,
-            metavar="KG,X,Y,Z",
-            words="What the flange carries: mass, and its centre in the flange in mm.",
-        ),
-    ] = None,
-    range_deg: Annotated[
-        _Degrees,
-        _option("--range-deg", panel=_LIMITS, words="To either side, for joints without limits."),
-    ] = None,
-    speed_deg: Annotated[
-        _Degrees,
-        _option("--speed-deg", panel=_LIMITS, words="In deg/s, where the robot tells none."),
-    ] = None,
-    acceleration_deg: Annotated[
-        _Degrees,
-        _option("--acceleration-deg", panel=_LIMITS, words="In deg/s^2, where it tells none."),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print plan.json to stdout.")] = False,
+    robot: options.RobotName,
+    out: options.Out = Path("motions"),
+    duration: options.Duration = 20.0,
+    harmonics: options.HarmonicsOption = 5,
+    friction: options.Friction = "coulomb,viscous,offset",
+    sweep_speeds: options.SweepSpeeds = 6,
+    no_sweeps: options.NoSweeps = False,
+    rate_hz: options.Rate = 500.0,
+    seconds: options.Seconds = 25.0,
+    seed: options.SearchSeed = 0,
+    margin_deg: Margin = 3.0,
+    speed: options.SpeedShare = 0.9,
+    acceleration: options.AccelerationShare = 0.9,
+    torque_margin: options.TorqueMargin = 1.2,
+    clearance_mm: Clearance = 30.0,
+    floor: Floor = "0",
+    boxes: BoxOption = None,
+    tool: options.Tool = None,
+    payload: options.Payload = None,
+    range_deg: options.RangeDeg = None,
+    speed_deg: options.SpeedDeg = None,
+    acceleration_deg: options.AccelerationDeg = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Plan the motions that tell an arm's inertias and friction.
 
@@ -157,7 +63,7 @@ def dynamics_plan_command(
         acceleration,
         torque_margin,
         1e-3 * clearance_mm,
-        None if floor.strip().lower() == "none" else 1e-3 * numbers_in(floor, "--floor", "z")[0],
+        floor_of(floor),
     )
     arm = load_robot(robot)
     allowed = allowed_motion(
@@ -206,14 +112,14 @@ def _radians(degrees: float | None) -> float | None:
 
 def _terms(words: str) -> FrictionTerms:
     wanted = [] if words.strip().lower() == "none" else [it.strip() for it in words.split(",")]
-    unknown = [it for it in wanted if it not in _FRICTION]
+    unknown = [it for it in wanted if it not in options.FRICTION]
     if unknown:
         raise DataError(
-            f"--friction is {words[:80]!r}; of {some_of(_FRICTION)} is needed, with commas "
+            f"--friction is {words[:80]!r}; of {some_of(options.FRICTION)} is needed, with commas "
             "between, or none.",
             culprits=["--friction"],
         )
-    return FrictionTerms(*(it in wanted for it in _FRICTION))
+    return FrictionTerms(*(it in wanted for it in options.FRICTION))
 
 
 def _bodies(arm: Robot, boxes: list[str], tool: str | None) -> tuple[Body, ...]:
