@@ -1,4 +1,4 @@
-"""Whether a motion keeps its limits, looked at a thousand times a second."""
+"""Whether a motion keeps its limits, by looking at many of its samples."""
 
 from dataclasses import dataclass
 
