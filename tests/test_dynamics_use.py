@@ -260,3 +260,26 @@ def test_the_command_weighs(written, world, tmp_path):
     assert told["mass_kg"] == pytest.approx(2.8, abs=0.05)
     assert "on a UR: set_target_payload(2." in visioncal(*arguments).out
     assert Identified.load(written).base.rank == 58
+
+
+def test_the_command_finds_gains(tmp_path):
+    gains = (20.0, 21.0, 16.0, 9.0, 9.5, 8.7)
+    load = Body(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
+    world = World(4, load, Senses(gains_nm_a=gains))
+    world.empty.save(tmp_path / "empty")
+    world.full.save(tmp_path / "loaded")
+    known = ("--mass-kg", 8.0, "--com-mm", "80,-30,80", "--inertia", "0.012,0,0.01,0,0,0.008")
+    arguments = ("dynamics", "gains", tmp_path / "empty", "--loaded", tmp_path / "loaded", *known)
+    rows = json.loads(visioncal(*arguments, "--json").out)
+    assert [it["nm_per_a"] for it in rows] == pytest.approx(gains, rel=0.02)
+    assert visioncal(*arguments).out.startswith("--gains ")
+    wrong = visioncal(*arguments, "--inertia", "0.1,0,0.01,0,0,0.01")
+    assert (wrong.status, "are those of no body" in wrong.err) == (2, True)
+
+
+def test_gains_need_currents(world, tmp_path):
+    world.full.save(tmp_path / "loaded")
+    known = ("--mass-kg", 8.0, "--com-mm", "80,-30,80")
+    path = tmp_path / "loaded"
+    done = visioncal("dynamics", "gains", path, "--loaded", path, *known)
+    assert (done.status, "tells torques and no currents" in done.err) == (2, True)

@@ -2,6 +2,7 @@
 
 import typer
 
+from visioncal.cli.dynamics_gains import dynamics_gains_command
 from visioncal.cli.dynamics_identify import dynamics_identify_command, dynamics_validate_command
 from visioncal.cli.dynamics_payload import dynamics_payload_command
 from visioncal.cli.dynamics_plan import dynamics_plan_command
@@ -15,3 +16,4 @@ dynamics_app.command("plan")(dynamics_plan_command)
 dynamics_app.command("identify")(dynamics_identify_command)
 dynamics_app.command("validate")(dynamics_validate_command)
 dynamics_app.command("payload")(dynamics_payload_command)
+dynamics_app.command("gains")(dynamics_gains_command)

@@ -148,6 +148,34 @@ def conditioned_streams(
     return [_conditioned(robot, it, filtered) for it in recorded]
 
 
+def current_streams(
+    session: Session, robot: Robot, cutoff_hz: float | None = None
+) -> list[Conditioned]:
+    """Reads a session's streams of currents, for drives whose gains are not known.
+
+    Args:
+        session: The session.
+        robot: Its arm.
+        cutoff_hz: Of the low-pass [Hz]; by the motion where None.
+
+    Returns:
+        The streams, whose torques are currents [A].
+
+    Raises:
+        DataError: There is no stream of currents, or one is wrong.
+    """
+    request = Request(cutoff_hz=cutoff_hz, gains_nm_a=(1.0,) * robot.joint_count)
+    recorded = [_read(session, robot, it, request) for it in torque_streams(session)]
+    recorded = [it for it in recorded if it.of_currents]
+    if not recorded:
+        raise DataError(
+            f"session {session.name!r} tells torques and no currents.",
+            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            next_step="Drives whose torques are told need no gains: visioncal dynamics identify.",
+        )
+    return [condition(it, cutoff_hz) for it in recorded]
+
+
 def robot_of(session: Session) -> Robot:
     """The session's robot.
 
