@@ -45,12 +45,16 @@ class DynamicModel:
         Raises:
             DataError: The motion is not of as many joints as the arm has.
         """
+        robot = self.robot
         wanted = np.arange(len(self.names)) if columns is None else columns
-        first = 10 * self.robot.joint_count
-        links = torque_regressor(
-            self.robot, motion.q, motion.dq, motion.ddq, wanted[wanted < first]
-        )
-        own = self.terms.columns(motion)[:, :, wanted[wanted >= first] - first]
-        # Parameters before joints, as they are in memory: that is several times faster.
-        parts = [np.swapaxes(it, 1, 2) for it in (links, own)]
-        return np.swapaxes(np.concatenate(parts, axis=1), 1, 2)
+        own = wanted[wanted >= 10 * robot.joint_count] - 10 * robot.joint_count
+        links = wanted[: len(wanted) - len(own)]
+        # One array for all, parameters before joints: much faster than putting two together.
+        rows = np.empty((len(motion), len(wanted), robot.joint_count))
+        torque_regressor(robot, motion.q, motion.dq, motion.ddq, links, rows)
+        rows[:, len(links) :] = 0.0
+        values = self.terms.values(motion)
+        for place, column in enumerate(own.tolist(), start=len(links)):
+            joint, kind = divmod(column, values.shape[2])
+            rows[:, place, joint] = values[:, joint, kind]
+        return np.swapaxes(rows, 1, 2)

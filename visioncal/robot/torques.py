@@ -19,6 +19,7 @@ def torque_regressor(
     dq: FloatArray,
     ddq: FloatArray,
     columns: IntArray | None = None,
+    out: FloatArray | None = None,
 ) -> FloatArray:
     """Derivatives of the joints' torques by the links' inertial parameters.
 
@@ -28,6 +29,7 @@ def torque_regressor(
         dq: (m, n) their speeds [rad/s].
         ddq: (m, n) their accelerations [rad/s^2].
         columns: (c,) which parameters are wanted; all where None.
+        out: (m, c or more, n) where to write them, parameters before joints; new where None.
 
     Returns:
         (m, n, c) in the order of `Inertias.values` [N m for a unit of each].
@@ -38,7 +40,8 @@ def torque_regressor(
     states = effective_states(robot, q, dq, ddq)
     count = 10 * robot.joint_count
     wanted = np.arange(count) if columns is None else columns
-    rows = np.empty((len(q), len(wanted), robot.joint_count))
+    rows = np.empty((len(q), len(wanted), robot.joint_count)) if out is None else out
+    rows = rows[:, : len(wanted)]
     found = regressors(robot.pinocchio_model, robot.gravity, states)
     for row, values in zip(rows, found, strict=True):
         # This loop runs for every sample: a checked copy would take as long as the dynamics.
@@ -108,4 +111,6 @@ def effective_states(
         )
     chain = robot.chain
     slopes = chain.slopes(q)
+    if not chain.functions[:, 2:].any():
+        return chain.effective(q), slopes * dq, slopes * ddq
     return chain.effective(q), slopes * dq, slopes * ddq + chain.curvatures(q) * dq**2
