@@ -21,7 +21,9 @@ def dynamics_blueprint(run: Run) -> rrb.Blueprint:
     tabs = rrb.Tabs(_overview(run), _figures(), active_tab=0)
     return rrb.Blueprint(
         tabs,
-        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.MOTION_TIMELINE),
+        rrb.TimePanel(
+            state=rrb.PanelState.Collapsed, timeline=paths.MOTION_TIMELINE, play_state="paused"
+        ),
         rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
         rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
     )
@@ -51,7 +53,7 @@ def _overview(run: Run) -> rrb.Container:
     return rrb.Horizontal(
         left,
         rrb.Grid(*torques, grid_columns=2),
-        name="Torques: measured in grey, predicted in blue",
+        name="Torques: measured grey, predicted blue, by what was known before brown",
         column_shares=[1, 2],
     )
 
