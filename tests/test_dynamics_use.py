@@ -29,6 +29,7 @@ from visioncal.errors import DataError, DegenerateError
 from visioncal.outputs import write_dynamics
 from visioncal.recording.paths import MOTION_TIMELINE
 from visioncal.robot import Inertias, Loads, Robot, load_robot, small_urdf
+from visioncal.session import Session
 from visioncal.simulation.dynamics import Body, drive_torques, real_dynamics
 from visioncal.simulation.exercise import (
     Senses,
@@ -222,6 +223,8 @@ def test_the_recording_has_torques_over_time(written, run):
         entity = f"/dynamics/torques_nm/joint_3/{name}"
         count = len(column(path, entity, "Scalars:scalars", MOTION_TIMELINE))
         assert count == samples + len(run.predictions)
+    # It is the session as well, which can be identified again.
+    assert Session.load(path).digest() == run.session.digest()
 
 
 @pytest.mark.parametrize("form", ["robot-urdf", "robot-json"])

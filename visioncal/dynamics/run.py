@@ -58,12 +58,14 @@ class Run:
     """A result with its evidence.
 
     Attributes:
+        session: What it was identified from.
         identified: The result.
         identification: How it was fitted.
         predicted: Torques that were not fitted, measured and predicted; None where there are none.
         fitted: Those that were.
     """
 
+    session: Session
     identified: Identified
     identification: Identification
     predicted: Prediction | None
@@ -118,7 +120,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
     )
     friction = friction_of_known(whole)
     fitted = tuple(predict(identified, it, friction) for it in streams)
-    return Run(identified, whole, proof, fitted)
+    return Run(session, identified, whole, proof, fitted)
 
 
 def validate_session(

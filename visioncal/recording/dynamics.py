@@ -1,6 +1,7 @@
 """The recording of a dynamic identification: the arm as it moved, and its torques."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from visioncal.recording import colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.numbers import matched, significant
 from visioncal.recording.recorder import Recorder, beside
+from visioncal.recording.writer import RecordingWriter
 from visioncal.types import FloatArray
 
 # One motion follows the other after so long [s]; the arm is drawn so often [Hz].
@@ -24,30 +26,39 @@ _LINES = (
 
 
 def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | None = None) -> None:
-    """Writes what was measured and predicted over time, one motion behind the other.
+    """Writes a session with what its torques told: measured and predicted over time.
+
+    One motion follows the other on the timeline.
 
     Args:
-        path: The `.rrd` to write; it appears whole or not at all.
+        path: The `.rrd` to write; it appears whole or not at all. `read_session` gives the session
+            back.
         run: What was fitted and predicted.
         blueprint: The layout to open it in.
 
     Raises:
-        DataError: The file cannot be written.
+        DataError: The file cannot be written, or an image of the session cannot be read.
     """
-    identified, found = run.identified, run.predictions
+    session = run.session
     with beside(path) as aside:
-        with Recorder(aside) as recorder:
-            stream = recorder.stream
-            stream.send_recording_name(f"dynamics of {identified.robot.name}")
-            recorder.lay_out(blueprint)
-            _log_static(stream, identified, found)
-            begin_s = 0.0
-            for it in found:
-                times_s = begin_s + it.times_s - it.times_s[0]
-                _log_series(stream, it, times_s)
-                _log_motion(recorder, identified, it, times_s)
-                begin_s = float(times_s[-1]) + _PAUSE_S
+        with RecordingWriter(
+            aside, session, announced=len(session.views), blueprint=blueprint, label=path
+        ) as writer:
+            writer.add_session(session)
+            writer.draw(partial(_log, run))
         aside.replace(path)
+
+
+def _log(run: Run, recorder: Recorder) -> None:
+    """Draws all motions."""
+    recorder.stream.reset_time()
+    _log_static(recorder.stream, run.identified, run.predictions)
+    begin_s = 0.0
+    for it in run.predictions:
+        times_s = begin_s + it.times_s - it.times_s[0]
+        _log_series(recorder.stream, it, times_s)
+        _log_motion(recorder, run.identified, it, times_s)
+        begin_s = float(times_s[-1]) + _PAUSE_S
 
 
 def _log_static(
