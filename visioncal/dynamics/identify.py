@@ -19,7 +19,7 @@ from visioncal.dynamics.untold import check_told, check_turning
 from visioncal.robot import Robot
 
 # What speeds are known to after filtering; joints are through it in no time [rad/s].
-SLOW_RAD_S = 3e-4
+SLOW_RAD_S = 1e-4
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,10 @@ _SAMPLES = 250
 # A mistake is named where undoing it divides the unexplained power of the torques by this much, and
 # leaves of the joints concerned no more than this share.
 _BETTER, _LEFT = 10.0, 0.5
-# Two joints that are swapped are named where undoing it lets a fit leave so many times less: right
-# recordings get worse by any swap.
-_FITS_BETTER = 2.5
+# Two joints that are swapped are named where undoing it divides what a fit leaves by this much, all
+# joints together, and leaves no more than this share: right recordings of exciting motions get
+# worse by any swap, and those of slow sweeps, where friction is all there is, hardly change.
+_FITS_BETTER, _FIT_LEFT = 10.0, 0.01
 # Of the power of a joint's torques so much is always left: noise, and inertias that are off.
 _FLOOR = 0.01
 # Inertias are off by less than these factors, and a torque on the motor's side, or in thousandths,
@@ -112,8 +113,9 @@ def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | No
     for guess in _swapped_joints(base.model.robot, as_it_is):
         if np.sum(np.log(predicted / _left(guess))) < -1.0:
             continue
-        better = float(np.sum(np.log(before / _unfitted(base, guess.measured))))
-        if better > gain:
+        after = _unfitted(base, guess.measured)
+        better = float(np.sum(np.log(before / after)))
+        if better > gain and after.max() < _FIT_LEFT:
             best, gain = guess, better
     if best is None:
         return None
