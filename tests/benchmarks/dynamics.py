@@ -26,19 +26,17 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Identification, Options, ide
 from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Measured, Motion
-from visioncal.dynamics.payload import estimate_payload
 from visioncal.dynamics.reading import Recorded
 from visioncal.dynamics.validate import friction_of_known, predict, validate
 from visioncal.estimator.linalg import one_blas_thread
 from visioncal.robot import load_robot, small_urdf
-from visioncal.simulation.dynamics import Body, drive_torques, nominal_dynamics, real_dynamics
+from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import Exercise, multi_sine, slow_sweep
 from visioncal.types import FloatArray
 
 WORLDS, SEARCH_S, RATE_HZ, REPEATS = 20, 25.0, 500.0, 3
 PANDA = Path(__file__).parents[3] / "shared" / "data" / "dyn_franka_panda"
 PANDA_LIMITS = (5.0, 1.5, 2.4, 4.9, 6.2, 3.4, 17.9)
-LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
 WITH_ROTORS = FrictionTerms(motor_inertia=True, slow_rad_s=SLOW_RAD_S)
 
 
@@ -53,7 +51,6 @@ class World:
         consistent: The same by bodies.
         known: The same by the published inertias.
         bodies: Whether all links are bodies.
-        load: Errors of a payload's mass [g] and of its centre [mm], on a UR10e.
     """
 
     share: float
@@ -62,7 +59,6 @@ class World:
     consistent: FloatArray
     known: FloatArray
     bodies: bool
-    load: tuple[float, float]
 
 
 def excitation(name: str) -> Exercise:
@@ -72,9 +68,9 @@ def excitation(name: str) -> Exercise:
     return Exercise(motion.times_s, motion.q, motion.dq, motion.ddq)
 
 
-def world(job: tuple[int, Exercise, Exercise]) -> World:
-    """One UR5e and one UR10e, off by a fifth from what is published, at 3 % of torque noise."""
-    seed, motion, loaded = job
+def world(job: tuple[int, Exercise]) -> World:
+    """One UR5e, off by a fifth from what is published, at 3 % of torque noise."""
+    seed, motion = job
     rng = np.random.default_rng(seed)
     built = real_dynamics("ur5e", rng, stribeck=True)
     streams = [recorded(built, it, rng) for it in (motion, slow_sweep(6, rng))]
@@ -90,7 +86,6 @@ def world(job: tuple[int, Exercise, Exercise]) -> World:
         consistent,
         known,
         result.inertias is not None and result.inertias.consistent,
-        payload_errors(loaded, rng),
     )
 
 
@@ -129,17 +124,6 @@ def fresh_errors(found: Identification, built, rng) -> tuple[FloatArray, FloatAr
     return ratio(identified.torques(motion)), ratio(identified.consistent_torques(motion)), known
 
 
-def payload_errors(motion: Exercise, rng) -> tuple[float, float]:
-    """Errors of 2.8 kg on a UR10e by a run with it and one without [g], [mm]."""
-    built = real_dynamics("ur10e", rng)
-    robot = robot_with_bodies(nominal_dynamics("ur10e"))
-    empty = identify(robot, [recorded(built, motion, rng)], Options(WITH_ROTORS, stribeck=False))
-    full = [recorded(built.carrying(LOAD), motion, rng)]
-    found = estimate_payload(empty.identified, full)
-    away = np.linalg.norm(found.centre_m - LOAD.centre_m)
-    return 1e3 * abs(found.mass_kg - LOAD.kg), 1e3 * float(away)
-
-
 def worlds_text(found: list[World]) -> str:
     """What the simulated arms came to."""
     shares = np.array([it.share for it in found])
@@ -147,7 +131,6 @@ def worlds_text(found: list[World]) -> str:
     noise = max(float(it.noise.max()) for it in found)
     consistent = max(float(it.consistent.max()) for it in found)
     known = np.array([it.known for it in found])
-    loads = np.array([it.load for it in found])
     return WORLD_TEXT.format(
         worlds=len(found),
         share=shares.mean(),
@@ -158,8 +141,6 @@ def worlds_text(found: list[World]) -> str:
         consistent=consistent,
         bodies=sum(it.bodies for it in found),
         known=float(np.median(known)),
-        grams=loads[:, 0].max(),
-        mm=loads[:, 1].max(),
     )
 
 
@@ -252,9 +233,9 @@ def timed(run) -> tuple[float, Identification]:
 
 def main(worlds: int) -> None:
     """Prints all parts and keeps them."""
-    motion, loaded = excitation("ur5e"), excitation("ur10e")
+    motion = excitation("ur5e")
     with Pool() as pool:
-        found = pool.map(world, [(seed, motion, loaded) for seed in range(worlds)])
+        found = pool.map(world, [(seed, motion) for seed in range(worlds)])
     parts = (ranks_text(), worlds_text(found), panda_text(), figaroh_text())
     text = TEXT.format(*parts)
     print(text)
@@ -290,9 +271,7 @@ published ones, with Coulomb, viscous, offset and Stribeck friction and rotors; 
 | error of a fresh motion's torques over their noise, worst joint of all worlds | {noise:.3f} |
 | the same by bodies | {consistent:.3f} |
 | published inertias with fitted friction over identified ones, filtered, median | {known:.1f} |
-| worlds in which all links are bodies | {bodies} |
-| 2.8 kg on a UR10e (a run with it, one without): largest error of the mass [g] | {grams:.0f} |
-| of its centre [mm] | {mm:.1f} |"""
+| worlds in which all links are bodies | {bodies} |"""
 FIGAROH_TEXT = """
 10,000 samples of a UR5e with exact states and 3 % of torque noise, Coulomb, viscous and offset
 friction, in one process on one thread, the least of three times. figaroh 1.0.2 is timed
