@@ -17,7 +17,7 @@ from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
 from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step
+from visioncal.estimator.linalg import covariance, damped_step, gram
 from visioncal.types import FloatArray, IntArray
 
 # Where the search begins, and what it stays within [rad/s].
@@ -82,11 +82,12 @@ def fit_stribeck(
         logarithms of speeds, whose values are what is left to go and mean nothing.
     """
     joints = np.arange(blocks[0].y.shape[1])
-    whole = replace(plain, blocks=tuple(blocks))
+    whole = _Weighted.of(streams, blocks, plain.sigmas)
     while len(joints):
-        starts = [np.full(len(joints), it) for it in _STARTS]
-        tried = [_fitted(streams, whole, joints, it, slow_rad_s) for it in starts]
-        found, fit = _polished(streams, whole, min(tried, key=lambda it: it[1])[0])
+        ones = np.ones(len(joints))
+        starts = [Stribeck(joints, ones, it * ones, slow_rad_s) for it in _STARTS]
+        tried = [_descended(whole, it) for it in starts]
+        found, fit = _polished(streams, blocks, min(tried, key=lambda it: it.cost).humps)
         shown = _shown(found, fit)
         if shown.all():
             return found, fit
@@ -95,14 +96,13 @@ def fit_stribeck(
 
 
 def _polished(
-    streams: Sequence[Conditioned], whole: Regression, found: Stribeck
+    streams: Sequence[Conditioned], blocks: Sequence[Block], found: Stribeck
 ) -> tuple[Stribeck, Regression]:
     """Descends again under the noise that is left with humps, until that stays the same."""
-    fit = regress(_with_humps(streams, whole.blocks, found))
+    fit = regress(_with_humps(streams, blocks, found))
     for _ in range(_ROUNDS):
-        weighted = replace(whole, sigmas=fit.sigmas)
-        found, _ = _fitted(streams, weighted, found.joints, found.speed_rad_s, found.slow_rad_s)
-        before, fit = fit, regress(_with_humps(streams, whole.blocks, found))
+        found = _descended(_Weighted.of(streams, blocks, fit.sigmas), found).humps
+        before, fit = fit, regress(_with_humps(streams, blocks, found))
         pairs = zip(before.sigmas, fit.sigmas, strict=True)
         if all(np.allclose(old, new, rtol=_SETTLED_NOISE) for old, new in pairs):
             break
@@ -118,69 +118,109 @@ def _shown(found: Stribeck, fit: Regression) -> FloatArray:
     return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside)
 
 
-def _fitted(
-    streams: Sequence[Conditioned],
-    plain: Regression,
-    joints: IntArray,
-    start_rad_s: FloatArray,
-    slow_rad_s: float,
-) -> tuple[Stribeck, float]:
-    """The speeds that a descent from one start finds, with its cost."""
-    count = len(joints)
+def _descended(whole: "_Weighted", start: Stribeck) -> "_Look":
+    """The humps that a descent from some speeds finds."""
 
     def linearise(logs: FloatArray) -> Linearised[FloatArray]:
-        at = _solved(streams, plain, Stribeck(joints, np.ones(count), np.exp(logs), slow_rad_s))
-        information, gradient, cost = _projected(streams, plain, at)
+        look = whole.look(replace(start, speed_rad_s=np.exp(logs)))
 
         def step(damping: float) -> FloatArray:
-            by = np.clip(damped_step(information, gradient, damping), -1.0, 1.0)
+            by = np.clip(damped_step(look.information, look.gradient, damping), -1.0, 1.0)
             return np.clip(logs + by, np.log(_SLOWEST), np.log(_FASTEST))
 
-        return Linearised(logs, cost, step)
+        return Linearised(logs, look.cost, step)
 
-    logs, _ = descend(np.log(start_rad_s), linearise, _SETTLED)
-    found = _solved(streams, plain, Stribeck(joints, np.ones(count), np.exp(logs), slow_rad_s))
-    return found, _projected(streams, plain, found)[2]
-
-
-def _solved(streams: Sequence[Conditioned], plain: Regression, humps: Stribeck) -> Stribeck:
-    """The same speeds with the best humps."""
-    count = len(humps.joints)
-    a, b = _normal(streams, plain, humps)
-    a, b = a[:-count, :-count], b[:-count]
-    return replace(humps, hump_nm=(covariance(a) @ b)[-count:])
+    logs, _ = descend(np.log(start.speed_rad_s), linearise, _SETTLED)
+    return whole.look(replace(start, speed_rad_s=np.exp(logs)))
 
 
-def _projected(
-    streams: Sequence[Conditioned], plain: Regression, humps: Stribeck
-) -> tuple[FloatArray, FloatArray, float]:
-    """Information and gradient by the logarithms of speeds, all else being at its best; cost."""
-    count = len(humps.joints)
-    a, b = _normal(streams, plain, humps)
-    best = covariance(a[:-count, :-count]) @ b[:-count]
-    cross = a[-count:, :-count]
-    spread = covariance(a[:-count, :-count])
-    information = a[-count:, -count:] - cross @ spread @ cross.T
-    total = sum(
-        float(np.sum((it.used * it.y / sigma) ** 2))
-        for it, sigma in zip(plain.blocks, plain.sigmas, strict=True)
-    )
-    return information, cross @ best - b[-count:], total - float(best @ b[:-count])
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Humps of given speeds at their best.
+
+    Attributes:
+        humps: They.
+        cost: What is left with them, in units of the noise.
+        information: (a, a) by the logarithms of the speeds, all else being at its best.
+        gradient: (a,) of half the cost, likewise.
+    """
+
+    humps: Stribeck
+    cost: float
+    information: FloatArray
+    gradient: FloatArray
 
 
-def _normal(
-    streams: Sequence[Conditioned], plain: Regression, humps: Stribeck
-) -> tuple[FloatArray, FloatArray]:
-    """Normal equations of all parameters, under the noise of the fit without humps."""
-    size = plain.values.size + 2 * len(humps.joints)
-    a, b = np.zeros((size, size)), np.zeros(size)
-    blocks = _with_humps(streams, plain.blocks, humps)
-    for block, sigma in zip(blocks, plain.sigmas, strict=True):
-        weights = block.used / sigma
-        rows = (block.x * weights[:, :, None]).reshape(-1, size)
-        a += rows.T @ rows
-        b += rows.T @ (block.y * weights).ravel()
-    return a, b
+@dataclass(frozen=True, eq=False)
+class _Weighted:
+    """The problem without humps, under given noise.
+
+    Attributes:
+        streams: The samples.
+        blocks: The same in units of the noise.
+        weights: What these were multiplied by, (k, n) a block [1/(N m)].
+        information: (p, p) by the parameters without humps.
+        right: (p,) right side of their normal equations.
+        total: Sum of the squared torques.
+    """
+
+    streams: Sequence[Conditioned]
+    blocks: tuple[Block, ...]
+    weights: tuple[FloatArray, ...]
+    information: FloatArray
+    right: FloatArray
+    total: float
+
+    @classmethod
+    def of(
+        cls, streams: Sequence[Conditioned], blocks: Sequence[Block], sigmas: Sequence[FloatArray]
+    ) -> Self:
+        """Weighs blocks by the noise of their joints."""
+        weights = tuple(it.used / sigma for it, sigma in zip(blocks, sigmas, strict=True))
+        weighted = tuple(
+            replace(it, x=it.x * weight[:, :, None], y=it.y * weight)
+            for it, weight in zip(blocks, weights, strict=True)
+        )
+        return cls(
+            streams,
+            weighted,
+            weights,
+            np.asarray(sum(gram(it.x, it.x) for it in weighted)),
+            np.asarray(sum(gram(it.x, it.y) for it in weighted)),
+            float(sum(np.sum(it.y**2) for it in weighted)),
+        )
+
+    def look(self, at: Stribeck) -> _Look:
+        """Solves for all that is linear at given speeds."""
+        count, size = len(at.joints), len(self.right)
+        a, b = self._normal(replace(at, hump_nm=np.ones(count)))
+        linear, speeds = slice(size + count), slice(size + count, None)
+        spread = covariance(a[linear, linear])
+        best = spread @ b[linear]
+        humps = best[size:]
+        cross = humps[:, None] * a[speeds, linear]
+        return _Look(
+            replace(at, hump_nm=humps),
+            self.total - float(best @ b[linear]),
+            np.outer(humps, humps) * a[speeds, speeds] - cross @ spread @ cross.T,
+            cross @ best - humps * b[speeds],
+        )
+
+    def _normal(self, humps: Stribeck) -> tuple[FloatArray, FloatArray]:
+        """Normal equations with humps and speeds behind the other parameters."""
+        count, size = len(humps.joints), len(self.right)
+        a, b = np.zeros((size + 2 * count, size + 2 * count)), np.zeros(size + 2 * count)
+        a[:size, :size], b[:size] = self.information, self.right
+        for stream, block, weight in zip(self.streams, self.blocks, self.weights, strict=True):
+            slopes = stream.filtered(humps.slopes)
+            for at, joint in enumerate(humps.joints):
+                own = [size + at, size + count + at]
+                columns = slopes[:, [at, count + at]] * weight[:, joint, None]
+                a[:size, own] += block.x[:, joint].T @ columns
+                a[np.ix_(own, own)] += columns.T @ columns
+                b[own] += columns.T @ block.y[:, joint]
+        a[size:, :size] = a[:size, size:].T
+        return a, b
 
 
 def _with_humps(
