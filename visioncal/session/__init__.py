@@ -4,7 +4,7 @@ from visioncal.session.document import Declaration
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.session import Session
 from visioncal.session.streams import FOLDER as STREAMS
-from visioncal.session.streams import Stream
+from visioncal.session.streams import Stream, check_stream, save_stream
 from visioncal.session.table import View
 
 __all__ = [
@@ -16,4 +16,6 @@ __all__ = [
     "Session",
     "Stream",
     "View",
+    "check_stream",
+    "save_stream",
 ]
