@@ -13,7 +13,7 @@ from visioncal.files import write_atomically
 from visioncal.recording.numbers import matched, significant
 from visioncal.report import content, torqueplots
 from visioncal.report.content import Fact
-from visioncal.report.environment import environment
+from visioncal.report.templating import template
 from visioncal.types import FloatArray
 from visioncal.version import __version__
 
@@ -85,30 +85,26 @@ def render_dynamics(run: Run) -> str:
     judged = judge(identified)
     shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
     shown += [(it, "fitted") for it in run.fitted[:_MOST_FITTED]]
-    return (
-        environment()
-        .get_template("dynamics.html.j2")
-        .render(
-            robot=identified.robot.name,
-            session=source.get("name", ""),
-            sha256=source.get("sha256", ""),
-            created=content.readable_time(str(identified.facts.get("created", ""))),
-            judged=judged,
-            headline=content.HEADLINES[judged.status],
-            key_figures=tuple(_key_figures(identified)),
-            notes=tuple(note for it in identified.streams for note in it.notes),
-            torques=tuple(_torque_rows(identified)),
-            unseen="" if identified.validation is None else identified.validation.label,
-            parameters=tuple(_parameter_rows(identified)),
-            counts=_counts(identified),
-            links=tuple(_link_rows(identified)),
-            humps=tuple(_hump_facts(identified)),
-            plots=tuple(_plots(shown)),
-            friction_plot=torqueplots.friction(identified, run.predictions),
-            version=__version__,
-            python=platform.python_version(),
-            versions=content.dependency_versions(),
-        )
+    return template("dynamics.html.j2").render(
+        robot=identified.robot.name,
+        session=source.get("name", ""),
+        sha256=source.get("sha256", ""),
+        created=content.readable_time(str(identified.facts.get("created", ""))),
+        judged=judged,
+        headline=content.HEADLINES[judged.status],
+        key_figures=tuple(_key_figures(identified)),
+        notes=tuple(note for it in identified.streams for note in it.notes),
+        torques=tuple(_torque_rows(identified)),
+        unseen="" if identified.validation is None else identified.validation.label,
+        parameters=tuple(_parameter_rows(identified)),
+        counts=_counts(identified),
+        links=tuple(_link_rows(identified)),
+        humps=tuple(_hump_facts(identified)),
+        plots=tuple(_plots(shown)),
+        friction_plot=torqueplots.friction(identified, run.predictions),
+        version=__version__,
+        python=platform.python_version(),
+        versions=content.dependency_versions(),
     )
 
 
