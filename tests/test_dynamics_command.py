@@ -116,6 +116,42 @@ def test_a_session_without_torques_or_robot_is_named(folder, tmp_path):
     assert "names no known robot" in done.err
 
 
+def told_of(tmp_path, robot, stream):
+    """What identify says of one stream."""
+    exercise_session(robot, {"robot": stream}).save(tmp_path / robot)
+    return run("dynamics", "identify", tmp_path / robot)
+
+
+def test_slow_motions_are_told_to_tell_nothing_of_fast_ones(folder, tmp_path):
+    done = told_of(tmp_path, "ur5e", Session.load(folder).streams["sweeps"])
+    assert done.status == 0
+    assert done.err.startswith("check")
+    assert "this motion was too slow, too small or too short" in done.err
+    assert "visioncal dynamics plan" in done.err
+
+
+def test_another_robot_is_doubted(folder, tmp_path):
+    done = told_of(tmp_path, "ur10e", Session.load(folder).streams["excite"])
+    assert done.status == 0
+    assert "Is it the robot that was recorded" in done.err
+
+
+def test_a_robot_without_inertias_gets_base_parameters(folder, tmp_path):
+    done = told_of(tmp_path, "irb120", Session.load(folder).streams["excite"])
+    assert done.status == 0
+    # Its axes lie otherwise than those that were recorded: no inertias explain the torques.
+    assert done.err.startswith("check")
+
+
+def test_torques_in_thousandths_are_named_though_beyond_all_limits(folder, tmp_path):
+    stream = Session.load(folder).streams["excite"]
+    values = stream.values.copy()
+    values[:, [stream.columns.index(f"tau{it}_nm") for it in range(1, 7)]] *= 1e3
+    done = told_of(tmp_path, "ur5e", type(stream)(stream.columns, values))
+    assert done.status == 2
+    assert "mN m, or mA for A" in done.err
+
+
 def test_calibration_says_that_there_are_no_views(folder, tmp_path):
     done = run("calibrate", folder, "-o", tmp_path / "out")
     assert done.status == 2

@@ -24,6 +24,7 @@ _TORQUE_BAND, _LEAST_HZ = 10.0, 4.0
 _GAP, _GAP_S, _JITTER = 2.5, 0.02, 0.02
 # Torques at rest on an extreme for so many samples on end, within this share of it, are cut off.
 _FLAT_SAMPLES, _FLAT = 5, 1e-6
+_MOST_AT_LIMIT = 0.2
 # Torques that stand out from their neighbours by so many times what is usual, and by this share of
 # their range, are slips of the line.
 _SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
@@ -240,7 +241,9 @@ def _cleaned(
     torques = recorded.torques_nm.copy()
     flat = np.stack([_flat_tops(it) for it in torques.T], axis=1)
     if limits_nm is not None:
-        flat |= np.abs(torques) >= 0.999 * limits_nm
+        beyond = np.abs(torques) >= 0.999 * limits_nm
+        # Drives that are at their limits all the time are none: the torques are of another unit.
+        flat |= beyond & (beyond.mean(axis=0) < _MOST_AT_LIMIT)
     around = median_filter(torques, (_NEIGHBOURS, 1), mode="nearest")
     away = np.abs(torques - around)
     # Of normal noise three in four samples depart from the median of five by less than this.

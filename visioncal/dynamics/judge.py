@@ -6,6 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from visioncal.dynamics.base import random_motion
 from visioncal.dynamics.identified import NOT_TOLD, Identified, Validation
 from visioncal.figures import figure
 from visioncal.files import some_of
@@ -18,6 +19,8 @@ Status: TypeAlias = Literal["good", "check", "bad"]
 _WORSE, _BODIES_WORSE = 1.5, 1.3
 # Beyond this share of a torque's range a prediction is of little use, beyond the other of none.
 _POOR, _USELESS = 0.2, 0.6
+# Known inertias that leave more of the range than this are another robot's.
+_STRANGE = 0.5
 # So many of the base parameters may be noise: those of the wrist weigh little.
 _UNTOLD = 0.5
 _PLAN = "Record the motion that visioncal dynamics plan writes, and fit it together with this one."
@@ -33,7 +36,11 @@ class Judged:
 
 def judge(identified: Identified) -> Judged:
     """Judges a result by what it predicts, and by what the motion told."""
-    found = [*_of_prediction(identified), *_of_parameters(identified)]
+    found = [
+        *_of_prediction(identified),
+        *_of_range(identified),
+        *_of_parameters(identified),
+    ]
     statuses = {status for status, _ in found}
     worst: Status = "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     return Judged(worst, tuple(words for _, words in found))
@@ -87,6 +94,15 @@ def _of_known(identified: Identified, validation: Validation) -> Iterator[tuple[
                 f"That is {figure(times)} times nearer than by the inertias that "
                 f"{identified.robot.name} comes with, in the median of the joints.",
             )
+        strange = known > _STRANGE * validation.torque_nm
+        if strange.any():
+            yield (
+                "check",
+                f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
+                f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the torques' "
+                "range stays unexplained. Is it the robot that was recorded, does it stand upright "
+                "([robot] gravity_m_s2), and what is on its flange?",
+            )
     if bodies is not None:
         worse = bodies > _BODIES_WORSE * validation.rms_nm
         if worse.any():
@@ -95,6 +111,24 @@ def _of_known(identified: Identified, validation: Validation) -> Iterator[tuple[
                 f"{_joints(worse)}: no bodies near the known ones explain the torques as well; "
                 "friction may be of another kind, or a load is on the flange.",
             )
+
+
+def _of_range(identified: Identified) -> Iterator[tuple[Status, str]]:
+    """Whether the motion told what fast motions all around take."""
+    base = identified.base
+    motion = random_motion(base.model, np.random.default_rng(0))
+    x = base.regressor(motion)
+    spread = identified.covariance[: base.rank, : base.rank]
+    sigma = np.sqrt(np.mean(np.einsum("mnp,pq,mnq->mn", x, spread, x, optimize=True), axis=0))
+    share = sigma / np.sqrt(np.mean((x @ identified.values) ** 2, axis=0))
+    if share.max() > _POOR:
+        yield (
+            "check",
+            f"{_joints(share > _POOR)}: what fast motions take (up to "
+            f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) is "
+            f"told to {figure(100.0 * float(share.max()))} % only: this motion was too slow, too "
+            f"small or too short. {_PLAN}",
+        )
 
 
 def _of_parameters(identified: Identified) -> Iterator[tuple[Status, str]]:

@@ -227,7 +227,11 @@ def _covariance(fit: Regression) -> FloatArray:
             rows = block.x[:, joint] * used[:, None] / sigma[joint]
             columns = np.flatnonzero(rows.any(axis=0))
             scores[np.ix_(columns, columns)] += _scores(rows[:, columns], shares)
-    return np.asarray(white @ scores @ white)
+    # By a root, which leaves no variance below zero, however badly parameters are told.
+    sizes = np.sqrt(np.maximum(np.diag(scores), 1e-300))
+    values, vectors = np.linalg.eigh(scores / np.outer(sizes, sizes))
+    root = white @ (sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray(root @ root.T)
 
 
 def _scores(rows: FloatArray, shares: FloatArray) -> FloatArray:
