@@ -286,3 +286,28 @@ def test_gains_need_currents(world, tmp_path):
     path = tmp_path / "loaded"
     done = visioncal("dynamics", "gains", path, "--loaded", path, *known)
     assert (done.status, "tells torques and no currents" in done.err) == (2, True)
+
+
+def test_base_parameters_are_read_as_they_were_kept(run, tmp_path):
+    """Another machine may have kept other columns of the same model."""
+    identified = run.identified
+    other = BaseModel.reduce(identified.base.model, np.random.default_rng(5))
+    assert other.independent.tolist() != identified.base.independent.tolist()
+    turn = other.dependence[:, identified.base.independent]
+    humps = np.eye(len(identified.covariance) - other.rank)
+    across = np.block(
+        [
+            [turn, np.zeros((other.rank, len(humps)))],
+            [np.zeros((len(humps), other.rank)), humps],
+        ]
+    )
+    covariance = across @ identified.covariance @ across.T
+    written = replace(
+        identified, base=other, values=turn @ identified.values, covariance=covariance
+    )
+    written.save(tmp_path / "dynamics.json")
+    again = Identified.load(tmp_path)
+    assert again.base.independent.tolist() == other.independent.tolist()
+    found = run.identification.streams[0].pieces[0].measured.motion.chosen(slice(0, 50))
+    # Both are the same torques, to rounding of sums of some 60 products.
+    assert again.torques(found) == pytest.approx(identified.torques(found), abs=1e-7)

@@ -133,10 +133,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
     robot = Robot.from_document(document["robot"])
     terms = FrictionTerms(**document["friction"])
-    base = BaseModel.reduce(DynamicModel(robot, terms))
-    names = tuple(row["name"] for row in document["base"])
-    if names != base.names:
-        raise ValueError("its base parameters are not those of its robot")
+    base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])
     size = base.rank + 2 * len(document["stribeck"])
     standard = document.get("standard")
     validation = document.get("validation")
@@ -151,6 +148,15 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "validation": None if validation is None else _validation(validation, robot.joint_count),
         "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
+
+
+def _base(model: DynamicModel, names: Sequence[str]) -> BaseModel:
+    """The base parameters that begin as those that were written.
+
+    Which ones are kept may hang on rounding, and so on the machine.
+    """
+    kept = [model.names.index(it.split()[0]) for it in names]
+    return BaseModel.keeping(model, np.array(kept, dtype=np.int64))
 
 
 def _stribeck(rows: Sequence[Mapping[str, Any]], terms: FrictionTerms) -> Stribeck:
