@@ -8,13 +8,15 @@ from rerun.chunk import RrdReader
 from visioncal.recording import paths
 
 
-def column(path: Path, entity: str, component: str) -> dict[int, np.ndarray]:
+def column(
+    path: Path, entity: str, component: str, timeline: str = paths.TIMELINE
+) -> dict[int, np.ndarray]:
     """Reads one component of one entity by the place of the view; static ones have the place 0."""
     found: dict[int, np.ndarray] = {}
     for chunk in RrdReader(path).stream().filter(content=entity):
         batch = chunk.to_record_batch()
         if component in batch.schema.names:
-            keys = range(1) if chunk.is_static else batch.column(paths.TIMELINE).to_pylist()
+            times = range(1) if chunk.is_static else batch.column(timeline).to_numpy().tolist()
             values = map(np.array, batch.column(component).to_pylist())
-            found |= dict(zip(keys, values, strict=True))
+            found |= dict(zip(times, values, strict=True))
     return found

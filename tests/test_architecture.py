@@ -32,6 +32,7 @@ LAYERS = (
     ("session",),
     ("evidence",),
     ("thermal",),
+    ("dynamics",),
     ("calibration",),
     ("compensation",),
     ("compare",),

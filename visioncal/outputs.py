@@ -1,4 +1,4 @@
-"""What `visioncal calibrate`, `align`, `verify` and `plan` write into a folder."""
+"""What `calibrate`, `align`, `verify`, `plan` and `dynamics` write into a folder."""
 
 import json
 import tempfile
@@ -7,9 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from visioncal.calibration import Alignment
+from visioncal.dynamics import FILE as DYNAMICS
+from visioncal.dynamics import Run
+from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.written import MOTION_FILES, motion_files
 from visioncal.errors import DataError
 from visioncal.files import named_errors, write_atomically
-from visioncal.pipeline import Run
+from visioncal.pipeline import Run as Calibrated
 from visioncal.planning.plan import Plan
 from visioncal.planning.written import program_of, stops_table
 from visioncal.session import Session
@@ -22,7 +26,7 @@ STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.r
 
 
 def write_outputs(
-    folder: Path, session: Session | None, run: Run, note: str = ""
+    folder: Path, session: Session | None, run: Calibrated, note: str = ""
 ) -> tuple[Path, ...]:
     """Writes the three files into a folder.
 
@@ -157,6 +161,70 @@ def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[P
         with named_errors(folder / PROGRAM):
             (folder / PROGRAM).unlink(missing_ok=True)
     return written
+
+
+def write_motions(
+    folder: Path, plan: MotionPlan, rate_hz: float, document: Mapping[str, Any]
+) -> tuple[Path, ...]:
+    """Writes planned motions as tables, programs, preview and JSON, together or not at all.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        plan: The motions.
+        rate_hz: Samples a second in the tables.
+        document: The content of plan.json.
+
+    Returns:
+        The files that were written. Robots that are not programmed like a UR get no programs; what
+        an earlier plan left and this one has not is taken away.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.planning.motions import motion_preview
+    from visioncal.recording.motions import write_motion_preview
+    from visioncal.viewer.motions import motion_blueprint
+
+    texts = motion_files(plan, rate_hz)
+    preview = motion_preview(plan)
+
+    def write(aside: Path) -> None:
+        write_motion_preview(aside / PREVIEW, preview, motion_blueprint(preview))
+        for name, text in texts.items():
+            write_atomically(aside / name, text)
+        write_atomically(aside / PLAN, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+    written = _write_together(folder, (PREVIEW, *texts, PLAN), write)
+    for name in MOTION_FILES:
+        if name not in texts:
+            with named_errors(folder / name):
+                (folder / name).unlink(missing_ok=True)
+    return written
+
+
+def write_dynamics(folder: Path, run: Run) -> tuple[Path, ...]:
+    """Writes identified dynamics, their report and recording into a folder, together or not at all.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        run: The result with its evidence.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    from visioncal.recording.dynamics import write_dynamics_recording
+    from visioncal.report.dynamics import write_dynamics_report
+    from visioncal.viewer.dynamics import dynamics_blueprint
+
+    def write(aside: Path) -> None:
+        run.identified.save(aside / DYNAMICS)
+        write_dynamics_report(aside / REPORT, run)
+        write_dynamics_recording(aside / RECORDING, run, dynamics_blueprint(run))
+
+    return _write_together(folder, (RECORDING, REPORT, DYNAMICS), write)
 
 
 def _write_together(

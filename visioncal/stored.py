@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.calibration import Alignment, Calibration, FrameFile, to_document
+from visioncal.dynamics import FILE as DYNAMICS
+from visioncal.dynamics import Identified
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import read_bytes
@@ -77,16 +79,20 @@ def load_placed(path: Path) -> Calibration | FrameFile:
     return FrameFile.load(file) if _holds_frames(file) else load_calibration(path)
 
 
-def load_exportable(path: Path) -> Calibration | FrameFile | Alignment:
-    """Loads what `load_placed` does, or the alignment of a whole cell.
+def load_exportable(path: Path) -> Calibration | FrameFile | Alignment | Identified:
+    """Loads what `load_placed` does, the alignment of a whole cell, or an arm's dynamics.
 
     Args:
-        path: As there, or an alignment.json, which its content tells, a folder with one and no
-            calibration.json, or the recording of a cell.
+        path: As there, or an alignment.json or a dynamics.json, which its content tells, a folder
+            with one and no calibration.json, or the recording of a cell.
 
     Raises:
         DataError: There is none of them, or it cannot be read.
     """
+    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / DYNAMICS).is_file()
+    file = path / DYNAMICS if alone else path
+    if "base" in _content(file) and "transforms" not in _content(file):
+        return Identified.load(file)
     return find_alignment(path) or load_placed(path)
 
 

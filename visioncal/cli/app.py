@@ -12,6 +12,7 @@ from visioncal.cli.convert import convert_command
 from visioncal.cli.correct import correct_command
 from visioncal.cli.demo import demo_command
 from visioncal.cli.diff import diff_command
+from visioncal.cli.dynamics import dynamics_app
 from visioncal.cli.export import export_command
 from visioncal.cli.fixture import fixture_command
 from visioncal.cli.locate import locate_command
@@ -57,6 +58,7 @@ app.command("correct")(correct_command)
 app.command("review")(review_command)
 app.command("simulate")(simulate_command)
 app.add_typer(target_app, name="target")
+app.add_typer(dynamics_app, name="dynamics")
 
 
 def _show_version(wanted: bool) -> None:

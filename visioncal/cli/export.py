@@ -26,7 +26,8 @@ def export_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="An output folder, its calibration.json or alignment.json, a recording (.rrd), or "
+            help="An output folder, its calibration.json, alignment.json or dynamics.json, a "
+            "recording (.rrd), or "
             "a file of frames."
         ),
     ],

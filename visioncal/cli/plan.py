@@ -16,6 +16,7 @@ from visioncal.cli.planned_cell import (
     box_of,
     cell_of,
     find_source,
+    floor_of,
 )
 from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
@@ -82,7 +83,7 @@ def plan_command(
         float(np.deg2rad(tilt_deg)),
         edge_px,
         1e-3 * clearance_mm,
-        _floor(floor),
+        floor_of(floor),
     )
     words = CellWords(
         robot,
@@ -188,9 +189,3 @@ def _span(words: str | None, option: str) -> tuple[float, float] | None:
         return None
     near, far = numbers_in(words, option, "near,far")
     return 1e-3 * near, 1e-3 * far
-
-
-def _floor(words: str) -> float | None:
-    if words.strip().lower() == "none":
-        return None
-    return 1e-3 * numbers_in(words, "--floor", "z")[0]

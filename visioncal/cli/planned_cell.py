@@ -180,6 +180,17 @@ def box_of(words: str, option: str = "--box") -> Box:
     return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
 
 
+def floor_of(words: str) -> float | None:
+    """Reads the height of the floor [mm]: in metres, None for none.
+
+    Raises:
+        DataError: It is no number.
+    """
+    if words.strip().lower() == "none":
+        return None
+    return 1e-3 * numbers_in(words, "--floor", "z")[0]
+
+
 def pose_of(words: str, option: str) -> FloatArray:
     """Reads a rough pose: x, y, z [mm], then angles about the fixed axes x, y, z [deg]; (4, 4).
 

@@ -54,6 +54,38 @@ class Frame:
     exposure_s: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class JointSample:
+    """What joints do at one moment.
+
+    Attributes:
+        stamp_s: When, on the controller's own clock [s].
+        q: (n,) joint angles [rad].
+        dq: (n,) joint speeds [rad/s].
+        currents_a: (n,) motor currents [A].
+    """
+
+    stamp_s: float
+    q: FloatArray
+    dq: FloatArray
+    currents_a: FloatArray
+
+
+class Joints(Protocol):
+    """Joints that tell what they do, many times a second.
+
+    Attributes:
+        name: What and where they are, for people: `UR10e at 192.168.0.10`.
+        rate_hz: How often they tell it.
+    """
+
+    name: str
+    rate_hz: float
+
+    def sample(self) -> JointSample:
+        """Returns the next sample."""
+
+
 class Arm(Protocol):
     """An arm that tells where it is.
 

@@ -61,7 +61,7 @@ class UrArm:
         receive = client_library("rtde_receive", _EXTRA)
         control = None if watch_only else client_library("rtde_control", _EXTRA)
         self._host = resolve(host)
-        condition = _check(self._host, moves=not watch_only)
+        condition = check_controller(self._host, moves=not watch_only)
         self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
         self._states = StateStream(receive, self._host, condition.version)
         self._control: Any = None
@@ -194,14 +194,14 @@ class UrArm:
         if self._moves_before is not None:
             self.halt()
         self._closed = True
-        _keep(self._states.client)
+        keep(self._states.client)
         # Each disconnection sleeps for half a second, so they do it together; a client whose
         # controller is gone may not return at all.
         states = threading.Thread(target=self._states.client.disconnect, daemon=True)
         states.start()
         ends_s = time.monotonic() + _CLOSE_S
         if self._line is not None:
-            _keep(self._control)
+            keep(self._control)
             with suppress(DriverError):
                 self._line.call(self._let_go, limit_s=_CLOSE_S, what="close")
             self._line.end()
@@ -288,8 +288,12 @@ class UrArm:
         )
 
 
-def _check(host: str, *, moves: bool) -> Condition:
-    """Asks everything by plain connections first: the library's constructors wait without end."""
+def check_controller(host: str, *, moves: bool) -> Condition:
+    """Asks everything by plain connections first: the library's constructors wait without end.
+
+    Raises:
+        DriverError: It cannot be reached, is no UR, tells nothing, or could not be moved.
+    """
     condition = read_condition(host)
     if moves:
         condition.check_moves()
@@ -300,7 +304,7 @@ def _check(host: str, *, moves: bool) -> Condition:
     return condition
 
 
-def _keep(client: Any) -> None:  # noqa: ANN401
+def keep(client: Any) -> None:  # noqa: ANN401
     """Keeps a client from being destroyed, ever.
 
     Its destructor disconnects once more, sleeping for half a second with Python's lock held: the

@@ -43,14 +43,21 @@ class StateStream:
         library: The module `rtde_receive`.
         host: The controller's address.
         version: PolyScope's version.
+        rate_hz: How many states a second are asked for.
     """
 
-    def __init__(self, library: ModuleType, host: str, version: tuple[int, int, int]) -> None:
+    def __init__(
+        self,
+        library: ModuleType,
+        host: str,
+        version: tuple[int, int, int],
+        rate_hz: float = _RATE_HZ,
+    ) -> None:
         self._host = host
         self.tells_load = version >= _TELLS_LOAD[version[0]]
         names = [*_VARIABLES, *(_LOAD if self.tells_load else ())]
         try:
-            self.client: Any = library.RTDEReceiveInterface(host, _RATE_HZ, names)
+            self.client: Any = library.RTDEReceiveInterface(host, rate_hz, names)
         except RuntimeError as error:
             raise DriverError(
                 f"The states of the controller at {host} cannot be read: {error}.", culprits=[host]

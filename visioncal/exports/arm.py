@@ -161,7 +161,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         DataError: The source has no calibrated arm, or something was said for which the format
             has no use.
     """
-    _check_said(selection, form)
+    check_said(selection, form)
     nominal = source.robot if isinstance(source, Calibration) else None
     calibrated = isinstance(source, Calibration) and source.arm_is_calibrated
     if not isinstance(source, Calibration) or nominal is None or not calibrated:
@@ -214,8 +214,12 @@ def omission_mm(robot: Robot) -> float:
     return 1e3 * float(np.linalg.norm(away[:, :3, 3], axis=1).max())
 
 
-def _check_said(selection: Selection, form: ArmFormat) -> None:
-    """Refuses what belongs to a transform, or to another format of arms."""
+def check_said(selection: Selection, form: ArmFormat) -> None:
+    """Refuses what belongs to a transform, or to another format of arms.
+
+    Raises:
+        DataError: Something of the kind was said.
+    """
     given = {
         "--edge": selection.edge is not None,
         "--inverse": selection.inverse,

@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 
 from visioncal.calibration import Verdict
+from visioncal.dynamics import Identified
 from visioncal.errors import DataError
 from visioncal.exports.arm import ArmFormat, select_arm
 from visioncal.exports.armfiles import ARMS
 from visioncal.exports.choosing import select, select_all
 from visioncal.exports.content import Selection
 from visioncal.exports.controllers import CONTROLLERS
+from visioncal.exports.dynamics import write_dynamics
 from visioncal.exports.format import ExportFormat
 from visioncal.exports.launch import MOVEIT, ROS_LAUNCH
 from visioncal.exports.lens import CAMERA_INFO, KALIBR
@@ -56,11 +58,11 @@ class Document:
     warnings: tuple[str, ...]
 
 
-def export(source: Source, to: str, selection: Selection = _EVERYTHING) -> str:
+def export(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> str:
     """Writes a result in somebody else's format.
 
     Args:
-        source: A calibration, frames alone, or an aligned cell.
+        source: A calibration, frames alone, an aligned cell, or an arm's identified dynamics.
         to: The name of a format among `EXPORT_FORMATS`.
         selection: Which transform, in which direction, and what its frames are to be called; of
             an arm, in which form.
@@ -75,13 +77,15 @@ def export(source: Source, to: str, selection: Selection = _EVERYTHING) -> str:
     return document(source, to, selection).text
 
 
-def document(source: Source, to: str, selection: Selection = _EVERYTHING) -> Document:
+def document(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> Document:
     """Writes a result as `export` does, with what is to be warned of.
 
     Raises:
         DataError: As `export` has it.
     """
     form = _find(to)
+    if isinstance(source, Identified):
+        return Document(write_dynamics(source, to, selection), ())
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
         omitted = tuple(f"{it}." for it in arm.omitted)

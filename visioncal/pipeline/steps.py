@@ -23,7 +23,7 @@ from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
-from visioncal.session import Session
+from visioncal.session import STREAMS, Session
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by
@@ -70,6 +70,13 @@ class Stage:
 def _read_robot(known: Known) -> Known:
     check_one_of_each(known.session)
     session, document = known.session, known.session.robot_document
+    if not session.views:
+        raise DataError(
+            f"session {session.name!r} has streams and no views.",
+            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
+            "dynamics identify.",
+        )
     robot = None if document is None else Robot.from_document(document)
     known = replace(known, robot=robot)
     known = known.noting((), (*session.warnings, *not_used(known)))

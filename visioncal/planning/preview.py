@@ -4,7 +4,8 @@ import numpy as np
 
 from visioncal.planning.plan import Plan, PlannedStop
 from visioncal.planning.telling import accuracy_words, looks_note, summary_of
-from visioncal.recording.preview import Obstacle, Preview, PreviewStop
+from visioncal.recording.obstacles import Obstacle
+from visioncal.recording.preview import Preview, PreviewStop
 
 
 def preview_of(plan: Plan, name: str) -> Preview:

@@ -71,6 +71,19 @@ PREDICTED_SIGMA = "/plan/sigma_after_so_many_stops_mm"
 PLAN_NOTE = "/notes/plan"
 STOP_NOTE = "/notes/stop"
 
+# A motion, second by second.
+MOTION_TIMELINE = "motion"
+MOTION = "/motion"
+MOTION_KINDS = ("position_deg", "speed_deg_s", "acceleration_deg_s2", "torque_nm")
+
+# A dynamic identification, on the same timeline.
+TORQUES = "/dynamics/torques_nm"
+TORQUE_ERRORS = "/dynamics/errors_nm"
+SPEEDS = "/dynamics/speeds_rad_s"
+DYNAMICS_NOTE = "/notes/dynamics"
+PARAMETERS_NOTE = "/notes/parameters"
+MEASURED_TORQUE, PREDICTED_TORQUE, KNOWN_TORQUE = "measured", "predicted", "known_before"
+
 # A recording at work.
 LIVE_SIGMA = "/live/predicted_sigma_mm"
 LIVE_NOTE = "/notes/recording"
@@ -110,3 +123,8 @@ def magnified_arm(factor: int) -> str:
 def over_joint(joint: int) -> str:
     """The entity of the residuals over the angle of a joint, which is counted from 0."""
     return f"{RESIDUALS}/over_joints/q{joint + 1}"
+
+
+def of_joint(group: str, joint: int) -> str:
+    """The entity of a joint, which is counted from 0, within a group over time."""
+    return f"{group}/joint_{joint + 1}"

@@ -15,6 +15,7 @@ from visioncal.recording import board, colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.charts import Charts
 from visioncal.recording.coverage import corners_chart, directions_chart, rotation_axes_chart
+from visioncal.recording.obstacles import Obstacle, log_obstacles
 from visioncal.recording.recorder import Recorder, beside
 from visioncal.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.recording.workspace import log_map
@@ -27,21 +28,8 @@ from visioncal.types import Camera, FloatArray, Mount, Target
 _AXIS, _LINE, _POINT = 0.12, 0.002, 0.004
 # The way is drawn in steps of so much of a joint's turn [rad].
 _STEP_RAD = 0.05
-# A piece of floor is drawn, so many times as wide as the cell.
-_FLOOR = 1.3
-# And a little lower, so that a board on it is seen [m].
-_BELOW_M = 0.004
 # A lens bends the board's sides: they are drawn with so many points.
 _SIDE_POINTS = 9
-
-
-@dataclass(frozen=True, eq=False)
-class Obstacle:
-    """Something in the way: its centre's frame in the base (4, 4) and its lengths (3,) [m]."""
-
-    name: str
-    base_from_box: FloatArray
-    size_m: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +164,7 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
     sheet = board.sheet(preview.target)
     on_target = rr.CoordinateFrame(paths.TARGET_FRAME)
     stream.log(f"{paths.TARGET}/sheet", on_target, sheet, static=True)
-    _log_obstacles(stream, preview, size_m)
+    log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
     _log_carried(stream, preview, size_m)
     if len(preview.places_m):
         log_map(stream, preview.places_m, preview.places_sigma_mm, size_m)
@@ -191,36 +179,6 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
             color=colours.USED,
         )
         stream.log(paths.PREDICTED_SIGMA, bars, static=True)
-
-
-def _log_obstacles(stream: rr.RecordingStream, preview: Preview, size_m: float) -> None:
-    """Draws the floor around the cell's centre, and the declared boxes."""
-    frame = rr.CoordinateFrame(paths.BASE_FRAME)
-    if preview.floor_m is not None:
-        half = _FLOOR * size_m
-        floor = rr.Boxes3D(
-            centers=[[0.0, 0.0, preview.floor_m - _BELOW_M]],
-            half_sizes=[[half, half, 0.0]],
-            colors=colours.GRID,
-        )
-        stream.log(f"{paths.OBSTACLES}/floor", frame, floor, static=True)
-    for at, box in enumerate(preview.obstacles):
-        drawn = rr.Boxes3D(
-            centers=[np.zeros(3)],
-            half_sizes=[0.5 * np.asarray(box.size_m)],
-            colors=[(*colours.REJECTED, 90)],
-            labels=[box.name],
-            fill_mode="solid",
-        )
-        name = f"box_{at + 1}"
-        pose = rr.Transform3D(
-            translation=box.base_from_box[:3, 3],
-            mat3x3=box.base_from_box[:3, :3],
-            parent_frame=paths.BASE_FRAME,
-            child_frame=name,
-        )
-        entity = f"{paths.OBSTACLES}/{name}"
-        stream.log(entity, pose, rr.CoordinateFrame(name), drawn, static=True)
 
 
 def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) -> None:

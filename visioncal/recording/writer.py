@@ -1,6 +1,6 @@
 """Writes a session to a recording: view by view as it is captured, or as a whole."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -119,6 +119,30 @@ class RecordingWriter:
         with named_errors(self._label):
             log_cell(self._recorder, session, found)
 
+    def add_session(self, session: Session) -> None:
+        """Adds all views of a session.
+
+        Raises:
+            DataError: An image cannot be read, or the file cannot be written.
+        """
+        for view in session.views:
+            known = bool(view.image) and session.images.exists(view.image)
+            cells = [view.cell(column) for column in session.columns]
+            self.add_view(cells, session.images.read(view.image) if known else None)
+
+    def draw(self, log: Callable[[Recorder], None]) -> None:
+        """Adds what is drawn and belongs to no view.
+
+        Args:
+            log: Draws it.
+
+        Raises:
+            DataError: The file cannot be written.
+        """
+        with named_errors(self._label):
+            log(self._recorder)
+            self._recorder.keep()
+
     def _checked(self, cells: Sequence[str], image: bytes | None) -> View:
         """Refuses what could be written but not be read again."""
         where = f"row {len(self._numbers) + 1}"
@@ -212,9 +236,6 @@ def _whole(
         with RecordingWriter(
             aside, session, announced=len(session.views), blueprint=blueprint, label=path
         ) as writer:
-            for view in session.views:
-                known = bool(view.image) and session.images.exists(view.image)
-                cells = [view.cell(column) for column in session.columns]
-                writer.add_view(cells, session.images.read(view.image) if known else None)
+            writer.add_session(session)
             yield writer
         aside.replace(path)

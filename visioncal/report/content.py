@@ -28,7 +28,7 @@ _MOUNTS = {
     "eye-to-hand": "the camera stands still and the robot carries the target",
     "instrument": "a measuring instrument stands still and reads what the robot carries",
 }
-_HEADLINES = {
+HEADLINES = {
     "good": "Good: ready to use",
     "check": "Check: usable once the points below are settled",
     "bad": "Bad: do not use this result",
@@ -106,7 +106,7 @@ class ResidualRow:
 
 def headline(verdict: Verdict) -> str:
     """The verdict in a few words."""
-    return _HEADLINES[verdict.status]
+    return HEADLINES[verdict.status]
 
 
 def readable_time(created: str) -> str:

@@ -19,8 +19,21 @@ from visioncal.robot.files import (
     robot_file,
     robot_names,
 )
+from visioncal.robot.inertia import (
+    INERTIA_KEY,
+    PARAMETER_NAMES,
+    Inertias,
+    entries,
+    matrices,
+    moving,
+    parameters_of,
+    pseudo_inertias,
+)
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
-from visioncal.robot.model import BODY_KEYS, Robot
+from visioncal.robot.logcholesky import LogCholesky
+from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
+from visioncal.robot.momentum import mass_matrices, momenta
+from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.recognising import Recognised, other_convention, recognised_convention
 from visioncal.robot.tables import (
     CONVENTIONS,
@@ -29,7 +42,10 @@ from visioncal.robot.tables import (
     table_document,
     table_from_document,
 )
+from visioncal.robot.torques import body_regressor, joint_torques, torque_regressor
+from visioncal.robot.urdf_bodies import weighed_urdf
 from visioncal.robot.urdfs import corrected_tip, corrected_urdf
+from visioncal.robot.weighing import with_inertias
 from visioncal.robot.weights import WeightFunctions
 from visioncal.robot.writing import (
     small_urdf,
@@ -43,26 +59,42 @@ __all__ = [
     "BODY_KEYS",
     "CONVENTIONS",
     "FUNCTION_NAMES",
+    "INERTIA_KEY",
+    "LINK_KEYS",
     "MASS_KEYS",
     "PARALLEL_RAD",
+    "PARAMETER_NAMES",
+    "RATE_KEYS",
     "ROBOT_SUFFIXES",
     "Chain",
     "Convention",
     "DHTable",
+    "Inertias",
     "Loads",
+    "LogCholesky",
     "Masses",
+    "Rates",
     "Recognised",
     "Robot",
     "WeightFunctions",
     "bends",
     "bent_joints",
+    "body_regressor",
     "convert_table",
     "corrected_tip",
     "corrected_urdf",
+    "entries",
+    "joint_torques",
     "load_robot",
+    "mass_matrices",
+    "matrices",
+    "momenta",
+    "moving",
     "other_convention",
     "parallel_axes",
+    "parameters_of",
     "placed_at",
+    "pseudo_inertias",
     "read_robot_document",
     "recognised_convention",
     "robot_file",
@@ -72,8 +104,11 @@ __all__ = [
     "table_from_document",
     "table_of",
     "table_toml",
+    "torque_regressor",
     "unwritten",
     "ur_flange",
     "ur_kinematics_yaml",
+    "weighed_urdf",
+    "with_inertias",
     "with_zeros",
 ]

@@ -103,6 +103,11 @@ class Chain:
         sine, cosine = self._eccentricity
         return np.asarray(self.functions[:, 1] + sine * np.cos(q) - cosine * np.sin(q))
 
+    def curvatures(self, q: FloatArray) -> FloatArray:
+        """Second derivatives (m, n) of the effective positions by (m, n) `q`."""
+        sine, cosine = self._eccentricity
+        return np.asarray(-sine * np.sin(q) - cosine * np.cos(q))
+
     @property
     def _eccentricity(self) -> FloatArray:
         """(2, n) sine and cosine of the joints; a prismatic one has none."""

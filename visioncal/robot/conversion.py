@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.robot.chain import Chain, chain_document
-from visioncal.robot.loads import MASS_KEYS
-from visioncal.robot.model import BODY_KEYS, Robot
+from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import (
     Convention,
     DHTable,
@@ -199,7 +198,7 @@ def _of_table(
     source = str(robot.document.get("source", ""))
     document = table_document(table, source)
     for row, known in zip(document["joint"], robot.document["joint"], strict=True):
-        row |= {key: known[key] for key in (*BODY_KEYS, *MASS_KEYS) if key in known}
+        row |= {key: known[key] for key in LINK_KEYS if key in known}
     kept = {it: robot.document[it] for it in ("gravity_m_s2",) if it in robot.document}
     return Robot.from_document(document | kept | dict(gravity))
 

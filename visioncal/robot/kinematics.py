@@ -1,13 +1,16 @@
 """Pinocchio's models of an arm: the only place that knows the library, imported when needed."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.files import Table, did_you_mean
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
+from visioncal.robot.inertia import Inertias
 from visioncal.robot.loads import Masses
+from visioncal.robot.rates import Rates
 from visioncal.types import FloatArray
 
 if TYPE_CHECKING:
@@ -144,8 +147,42 @@ def weight_slopes(model: "pin.Model", positions: FloatArray, gravity: FloatArray
     return rows.reshape(len(positions), count, 4 * count)
 
 
-def chain_of_urdf(table: Table) -> tuple[Chain, str, Masses | None]:
-    """Reads the chain from a URDF's root to the tip: the chain, the tip's name, and its masses.
+def regressors(
+    model: "pin.Model", gravity: FloatArray, states: tuple[FloatArray, FloatArray, FloatArray]
+) -> Iterator[FloatArray]:
+    """Walks through the derivatives of the torques by the bodies' inertial parameters.
+
+    Args:
+        model: Of `build_model`.
+        gravity: (3,) in the base's frame [m/s^2].
+        states: (m, n) effective positions, speeds and accelerations.
+
+    Yields:
+        (10 n, n) for each state; the same memory each time, which the next state overwrites.
+    """
+    import pinocchio as pin
+
+    model.gravity.linear = gravity
+    data, compute = model.createData(), pin.computeJointTorqueRegressor
+    # What the function returns is a copy; this is the place where it is computed.
+    found = data.jointTorqueRegressor.T
+    for q, dq, ddq in zip(*states, strict=True):
+        compute(model, data, q, dq, ddq)
+        yield found
+
+
+class UrdfArm(NamedTuple):
+    """What a URDF says of the arm from its root to the tip; None where it tells no mass."""
+
+    chain: Chain
+    tip: str
+    masses: Masses | None
+    inertias: Inertias | None
+    rates: Rates
+
+
+def arm_of_urdf(table: Table) -> UrdfArm:
+    """Reads the arm from a URDF's root to the tip.
 
     Raises:
         DataError: The URDF cannot be parsed or lacks the tip, or a joint before it has more than
@@ -180,16 +217,20 @@ def chain_of_urdf(table: Table) -> tuple[Chain, str, Masses | None]:
         )
     others = [joint for joint in range(1, model.njoints) if joint not in on_way]
     arm = pin.buildReducedModel(model, others, pin.neutral(model))
-    return _chain_of_model(arm, tip), tip, _masses_of_model(arm)
-
-
-def _masses_of_model(model: "pin.Model") -> Masses | None:
-    """What hangs on each joint; None where the URDF tells no mass that moves."""
-    bodies = list(model.inertias)[1:]
+    bodies = list(arm.inertias)[1:]
     kg = np.array([it.mass for it in bodies])
+    rates = _rates_of_model(arm)
     if not kg.any():
-        return None
-    return Masses(kg, np.array([it.lever if it.mass else np.zeros(3) for it in bodies]))
+        return UrdfArm(_chain_of_model(arm, tip), tip, None, None, rates)
+    inertias = Inertias(np.array([it.toDynamicParameters() for it in bodies]))
+    return UrdfArm(_chain_of_model(arm, tip), tip, inertias.masses, inertias, rates)
+
+
+def _rates_of_model(model: "pin.Model") -> Rates:
+    """The limits of the joints' drives; a URDF that does not know one writes zero."""
+    known = [np.where(it > 0.0, it, np.inf) for it in (model.velocityLimit, model.effortLimit)]
+    speed, torque = (np.where(it < np.finfo(float).max, it, np.inf) for it in known)
+    return Rates(speed, np.full(len(speed), np.inf), torque)
 
 
 def _chain_of_model(model: "pin.Model", tip: str) -> Chain:

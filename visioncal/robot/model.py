@@ -13,16 +13,25 @@ import numpy as np
 from visioncal.errors import DataError
 from visioncal.files import Table
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
+from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
 from visioncal.robot.kinematics import (
+    arm_of_urdf,
     build_model,
-    chain_of_urdf,
     flange_poses,
     gravity_torques,
     joint_frames,
     placement_derivatives,
     weight_slopes,
 )
-from visioncal.robot.loads import Loads, Masses, gravity_of, load_torques, masses_of_rows
+from visioncal.robot.loads import (
+    MASS_KEYS,
+    Loads,
+    Masses,
+    gravity_of,
+    load_torques,
+    masses_of_rows,
+)
+from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
 from visioncal.transforms import exp
 from visioncal.types import FloatArray
@@ -33,6 +42,8 @@ if TYPE_CHECKING:
 
 # What a joint's table may say of its link's body.
 BODY_KEYS = ("body_radius_m", "body_offset_m")
+# What a joint's table may say of its link and its drive: all that is no geometry.
+LINK_KEYS = (*BODY_KEYS, *MASS_KEYS, INERTIA_KEY, *RATE_KEYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +59,8 @@ class Robot:
         document: What recreates it: `Robot.from_document(document)`.
         chain: Its geometry.
         masses: What its links weigh; None where that is not known.
+        inertias: The inertial parameters of its links; None where they are not known.
+        rates: The limits of its drives.
         gravity: (3,) in the base's frame [m/s^2].
     """
 
@@ -56,6 +69,8 @@ class Robot:
     document: Mapping[str, Any]
     chain: Chain
     masses: Masses | None
+    inertias: Inertias | None
+    rates: Rates
     gravity: FloatArray
     _model: "pin.Model" = field(repr=False)
 
@@ -67,7 +82,8 @@ class Robot:
             document: A DH table (name, tip, convention, [[joint]], base, flange); or name, tip and
                 the URDF's text; or a chain as `corrected` writes it. A table's or a chain's joints
                 may tell their links' `mass_kg` and its centre `com_m`, in the frame in which the
-                joint's row ends, and any description the `gravity_m_s2` in its base.
+                joint's row ends, their `inertia_kg_m2` about it, and how fast and strong their
+                drives are; any description the `gravity_m_s2` in its base.
 
         Raises:
             DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
@@ -78,7 +94,7 @@ class Robot:
         tip = table.text("tip", "flange")
         table.integer("schema", 1, 1)
         if "urdf" in document:
-            chain, tip, masses = chain_of_urdf(table)
+            chain, tip, masses, inertias, rates = arm_of_urdf(table)
         else:
             if "kind" in document:
                 table.choice("kind", ("chain",))
@@ -87,10 +103,13 @@ class Robot:
             else:
                 rows = table_from_document(document)
                 chain, frames = chain_of_table(rows), row_frames(rows)
-            masses = masses_of_rows([row for _, row in joint_tables(table)], frames)
+            joints = [row for _, row in joint_tables(table)]
+            masses = masses_of_rows(joints, frames)
+            inertias = inertias_of_rows(joints, frames)
+            rates = Rates.of_rows(joints)
         model = build_model(name, tip, chain, masses)
         gravity = gravity_of(document, table.label)
-        return cls(name, tip, dict(document), chain, masses, gravity, model)
+        return cls(name, tip, dict(document), chain, masses, inertias, rates, gravity, model)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -111,6 +130,21 @@ class Robot:
     def upper_rad(self) -> FloatArray:
         """(n,) upper limits [rad]; inf for a joint without limits."""
         return self.chain.upper
+
+    @property
+    def velocity_rad_s(self) -> FloatArray:
+        """(n,) greatest speeds [rad/s]; inf where nothing is said."""
+        return self.rates.velocity
+
+    @property
+    def acceleration_rad_s2(self) -> FloatArray:
+        """(n,) greatest accelerations [rad/s^2]; inf where nothing is said."""
+        return self.rates.acceleration
+
+    @property
+    def torque_nm(self) -> FloatArray:
+        """(n,) greatest torques [N m]; inf where nothing is said."""
+        return self.rates.torque
 
     @property
     def pinocchio_model(self) -> "pin.Model":
@@ -289,11 +323,14 @@ class Robot:
         return Robot.from_document(self.weighted(document))
 
     def weighted(self, document: Mapping[str, Any]) -> dict[str, Any]:
-        """Adds this arm's masses and gravity to the description of a chain with its joints."""
+        """Adds this arm's weight, drives and gravity to the description of its chain."""
         weighted = dict(document)
-        if self.masses is not None:
-            rows = zip(document["joint"], self.masses.rows(), strict=True)
-            weighted["joint"] = [row | own for row, own in rows]
+        bodies = self.masses if self.inertias is None else self.inertias
+        nothing: list[dict[str, Any]] = [{} for _ in document["joint"]]
+        parts = (nothing if bodies is None else bodies.rows(), self.rates.rows())
+        weighted["joint"] = [
+            row | body | rate for row, body, rate in zip(document["joint"], *parts, strict=True)
+        ]
         if "gravity_m_s2" in self.document:
             weighted["gravity_m_s2"] = self.document["gravity_m_s2"]
         return weighted

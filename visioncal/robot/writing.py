@@ -60,8 +60,8 @@ def unwritten(robot: Robot) -> tuple[str, ...]:
 def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     """Writes a URDF of bare links: the joints with their axes and limits, and the tip.
 
-    Joint offsets go into the origins. A URDF has no place for gear ratio and eccentricity; a
-    comment says which are missing.
+    Links have their inertias where the robot tells them. Joint offsets go into the origins. A URDF
+    has no place for gear ratio and eccentricity; a comment says which are missing.
 
     Args:
         robot: The robot.
@@ -74,7 +74,13 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
         f"<robot name={quoteattr(robot.name)}>",
         *comment_lines(robot, notes),
     ]
-    lines += [f"  <link name={quoteattr(link)}/>" for link in [*links, robot.tip]]
+    lines.append(f"  <link name={quoteattr(links[0])}/>")
+    for link, inertial in zip(links[1:], _inertials(robot), strict=True):
+        lines += [f"  <link name={quoteattr(link)}>", *inertial, "  </link>"]
+    lines.append(f"  <link name={quoteattr(robot.tip)}/>")
+    rates = np.column_stack([robot.torque_nm, robot.velocity_rad_s])
+    # A URDF needs both; zero stands for what is not known.
+    rates = np.where(np.isfinite(rates), rates, 0.0)
     for place, joint in enumerate(chain.joint_names):
         limits = (chain.lower[place], chain.upper[place])
         bounded = bool(np.isfinite(limits).all())
@@ -86,13 +92,39 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
         lines.append(f'    <axis xyz="{axis}"/>')
         if bounded:
             lower, upper = map(float, limits)
+            effort, velocity = rates[place].tolist()
             lines.append(
-                f'    <limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/>'
+                f'    <limit lower="{lower!r}" upper="{upper!r}" effort="{effort:g}" '
+                f'velocity="{velocity!r}"/>'
             )
         lines.append("  </joint>")
     lines.append(f'  <joint name={quoteattr(f"{links[-1]}-{robot.tip}")} type="fixed">')
     lines += _joint_lines(links[-1], robot.tip, chain.placements[-1])
     return "\n".join([*lines, "  </joint>", "</robot>", ""])
+
+
+def inertial_lines(kg: float, centre_m: FloatArray, about: FloatArray) -> list[str]:
+    """Writes a body in its link's frame: mass, centre (3,), and inertia (3, 3) about the centre."""
+    xyz = " ".join(repr(it) for it in (centre_m + 0.0).tolist())
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    numbers = about[np.triu_indices(3)].tolist()
+    values = " ".join(f'{name}="{it!r}"' for name, it in zip(names, numbers, strict=True))
+    return [
+        "    <inertial>",
+        f'      <origin xyz="{xyz}" rpy="0.0 0.0 0.0"/>',
+        f'      <mass value="{kg!r}"/>',
+        f"      <inertia {values}/>",
+        "    </inertial>",
+    ]
+
+
+def _inertials(robot: Robot) -> list[list[str]]:
+    """Each link's body as lines; none where the robot tells no inertias."""
+    if robot.inertias is None:
+        return [[] for _ in robot.joint_names]
+    masses = robot.inertias.masses
+    bodies = zip(masses.kg.tolist(), masses.centres_m, robot.inertias.about_centres, strict=True)
+    return [inertial_lines(*it) for it in bodies]
 
 
 def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:

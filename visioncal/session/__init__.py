@@ -5,10 +5,12 @@ from visioncal.session.frames import frame_name
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.observations import Observation
 from visioncal.session.session import Session
-from visioncal.session.streams import Stream
+from visioncal.session.streams import FOLDER as STREAMS
+from visioncal.session.streams import Stream, check_stream, save_stream
 from visioncal.session.table import View
 
 __all__ = [
+    "STREAMS",
     "Declaration",
     "FolderImages",
     "ImageStore",
@@ -17,5 +19,7 @@ __all__ = [
     "Session",
     "Stream",
     "View",
+    "check_stream",
     "frame_name",
+    "save_stream",
 ]

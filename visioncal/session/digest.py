@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date, time
 
 from visioncal.files import sha256
-from visioncal.robot import BODY_KEYS, MASS_KEYS, ROBOT_SUFFIXES
+from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES
 from visioncal.session.images import ImageStore
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
@@ -24,7 +24,7 @@ def digest_facts(
 
     It is equal for every storage of the same facts: folders, their formatting, the spelling of
     numbers and the names of a target's or a robot's file do not enter, their contents do. How thick
-    and how heavy the robot's links are is no fact of what was recorded.
+    and heavy the robot's links are, and how strong its drives, is no fact of what was recorded.
     """
     paths = sorted({view.image for view in views if view.image and images.exists(view.image)})
     facts: dict[str, object] = {
@@ -79,7 +79,7 @@ def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
     if not isinstance(joints, list | tuple):
         return dict(document)
     kept = [
-        {key: value for key, value in joint.items() if key not in (*BODY_KEYS, *MASS_KEYS)}
+        {key: value for key, value in joint.items() if key not in LINK_KEYS}
         if isinstance(joint, Mapping)
         else joint
         for joint in joints

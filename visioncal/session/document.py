@@ -88,12 +88,15 @@ class Declaration(TableModel):
         return self.instrument if len(several) != 1 else next(iter(several.values()))
 
 
-def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
+def read_declaration(
+    document: Mapping[str, Any], label: str, *, observed: bool = True
+) -> Declaration:
     """Checks the content of a session.toml.
 
     Args:
         document: The content, as TOML or JSON gives it.
         label: The file's name, for messages.
+        observed: Whether there are views, which something observed.
 
     Raises:
         DataError: A field is missing, of another type, out of range, or contradicts another; the
@@ -112,7 +115,7 @@ def read_declaration(document: Mapping[str, Any], label: str) -> Declaration:
     except ValidationError as error:
         problems = [(_dotted(entry["loc"]), _in_words(entry)) for entry in error.errors()]
     else:
-        problems = list(_contradictions(declaration))
+        problems = list(_contradictions(declaration, observed))
     if problems:
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
@@ -160,10 +163,10 @@ _MISSING = {
 }
 
 
-def _contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
+def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[str, str]]:
     """Finds fields that are well typed but do not fit together: (dotted path, words)."""
     camera = declaration.camera
-    reads = declaration.instrument is not None or bool(declaration.instruments)
+    reads = declaration.instrument is not None or bool(declaration.instruments) or not observed
     told = declaration.is_network or (reads and not declaration.named("camera"))
     if declaration.mount is None and not told:
         yield "mount", "is missing" + _MISSING["mount"]

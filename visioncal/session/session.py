@@ -18,7 +18,7 @@ from visioncal.session.checks import check_images_can_be_used, view_warnings
 from visioncal.session.digest import digest_facts
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
-from visioncal.session.images import FolderImages, ImageStore
+from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import check_kinds_named, kind_warnings
 from visioncal.session.observations import Observation, observations_of, stop_warnings
 from visioncal.session.saving import placed_files, write_folder
@@ -33,6 +33,9 @@ from visioncal.session.streams import (
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
 from visioncal.types import Camera, CameraKind, Mount, Target
+
+# The columns of a session without views.
+ALONE = ("view",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,8 @@ class Session:
     ) -> "Session":
         """Loads a session's folder, or the `.rrd` recording of one.
 
-        An image that is missing is no error here: the view that needs it is named later.
+        An image that is missing is no error here: the view that needs it is named later. Where
+        there are streams, views.csv may be absent.
 
         Args:
             path: The folder or the recording.
@@ -93,7 +97,12 @@ class Session:
                 culprits=[str(path)],
             )
         document = parse_toml(read_text(path / "session.toml"), "session.toml")
-        columns, rows = parse_csv(read_text(path / "views.csv"), "views.csv")
+        streams = read_streams(path)
+        columns: tuple[str, ...] = ALONE
+        rows: tuple[Row, ...] = ()
+        # What an arm's drives needed is told by streams alone.
+        if not streams or (path / "views.csv").exists():
+            columns, rows = parse_csv(read_text(path / "views.csv"), "views.csv")
         session = _build(
             document,
             columns,
@@ -102,7 +111,16 @@ class Session:
             folder=path,
             target_document=target_document,
         )
-        return session.with_streams(read_streams(path))
+        return session.with_streams(streams)
+
+    @classmethod
+    def of_streams(cls, document: Mapping[str, Any], streams: Mapping[str, Stream]) -> "Session":
+        """Builds a session that has streams and no views, with the checks of `load`.
+
+        Raises:
+            DataError: A field or a column is wrong.
+        """
+        return _build(document, ALONE, (), MemoryImages({})).with_streams(streams)
 
     @classmethod
     def assemble(
@@ -162,10 +180,9 @@ class Session:
         document, texts = placed_files(
             self.declaration, self.document, self.target_document, self.robot_document
         )
-        texts |= {
-            "session.toml": tomli_w.dumps(document),
-            "views.csv": write_csv(self.columns, self.views),
-        }
+        texts["session.toml"] = tomli_w.dumps(document)
+        if self.views or not self.streams:
+            texts["views.csv"] = write_csv(self.columns, self.views)
         texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
         paths = dict.fromkeys(view.image for view in self.views if view.image)
         write_folder(Path(folder), texts, self.images, tuple(paths))
@@ -189,7 +206,7 @@ class Session:
     @cached_property
     def declaration(self) -> Declaration:
         """The content of session.toml, typed: the clock, the priors, the instrument."""
-        return read_declaration(self.document, "session.toml")
+        return read_declaration(self.document, "session.toml", observed=bool(self.views))
 
     @property
     def name(self) -> str:
@@ -347,7 +364,7 @@ def _build(
     robot_document: Mapping[str, Any] | None = None,
 ) -> Session:
     """Checks the facts of a session and puts them together."""
-    declaration = read_declaration(document, "session.toml")
+    declaration = read_declaration(document, "session.toml", observed=bool(rows))
     views = read_views(columns, rows, "views.csv")
     warnings = [
         *declaration_warnings(declaration, "session.toml"),

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.errors import DataError
-from visioncal.files import read_text, sha256, some_of
+from visioncal.files import named_errors, read_text, sha256, some_of, write_atomically
 from visioncal.session import columns as known
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -168,6 +168,18 @@ def write_stream(stream: Stream) -> str:
     """Writes a stream so that reading it gives the same numbers again."""
     rows = (",".join("" if it != it else repr(it) for it in row) for row in stream.values.tolist())
     return "\n".join([",".join(stream.columns), *rows]) + "\n"
+
+
+def save_stream(folder: Path, name: str, stream: Stream) -> None:
+    """Writes a stream beside those of a session's folder.
+
+    Raises:
+        DataError: It cannot be written.
+    """
+    path = folder / FOLDER / f"{name}.csv"
+    with named_errors(path):
+        path.parent.mkdir(exist_ok=True)
+    write_atomically(path, write_stream(stream))
 
 
 def check_stream(name: str, stream: Stream) -> None:

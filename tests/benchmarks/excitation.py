@@ -1,0 +1,110 @@
+"""Exciting motions after 25 s of search, from several seeds.
+
+PYTHONPATH=tests python tests/benchmarks/excitation.py [SEEDS [SECONDS]]
+"""
+
+import sys
+from multiprocessing import Pool
+
+import numpy as np
+from results import write_section
+
+from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.condition import condition_of
+from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
+from visioncal.dynamics.friction import FrictionTerms
+from visioncal.dynamics.limits import Allowed, Share, allowed_motion
+from visioncal.dynamics.model import DynamicModel
+from visioncal.robot import load_robot
+
+SEEDS, SECONDS = 10, 25.0
+ROBOTS = ("ur5e", "ur10e", "panda")
+NO_FRICTION = FrictionTerms(coulomb=False, viscous=False, offset=False)
+
+
+def figures(job: tuple[str, int, float]) -> tuple[float, ...]:
+    """What one search finds: conditions, shares of the limits, distance [mm], starts, seconds."""
+    name, seed, seconds = job
+    allowed = allowed_motion(load_robot(name), Share())
+    found = excite(allowed, ExcitationRequest(seconds=seconds, seed=seed))
+    condition, kept = found.condition, found.kept
+    return (
+        condition.weighted,
+        condition.scaled,
+        condition.raw,
+        links_alone(found),
+        found.random.scaled,
+        *(max(kept.shares[it]) for it in ("range", "speed", "acceleration", "torque")),
+        broken(allowed, found),
+        1e3 * kept.clearance_m,
+        found.starts,
+        found.seconds,
+        found.base.rank,
+    )
+
+
+def links_alone(found: Excitation) -> float:
+    """Condition of the same motion's regressor without friction, columns of unit length."""
+    base = BaseModel.reduce(DynamicModel(found.base.model.robot, NO_FRICTION))
+    return condition_of(base, found.series.sampled(100.0), np.ones(len(found.weights))).scaled
+
+
+def broken(allowed: Allowed, found: Excitation) -> int:
+    """Samples at 1 kHz whose positions, or differences of them, are beyond the data sheet."""
+    q, robot = found.series.sampled(1000.0).q, allowed.robot
+    beyond = [
+        np.any((q < robot.lower_rad) | (q > robot.upper_rad), axis=1),
+        np.any(np.abs(np.diff(q, axis=0)) * 1e3 > robot.velocity_rad_s, axis=1),
+        np.any(np.abs(np.diff(q, 2, axis=0)) * 1e6 > robot.acceleration_rad_s2, axis=1),
+    ]
+    return int(sum(it.sum() for it in beyond))
+
+
+def row(name: str, found: np.ndarray) -> str:
+    """One line of the table: the median and the worst of each condition."""
+    middle, worst = np.median(found, axis=0), found.max(axis=0)
+    cells = [
+        name,
+        f"{middle[13]:.0f}",
+        *(f"{middle[it]:.1f} / {worst[it]:.1f}" for it in (0, 1, 3)),
+        f"{middle[2]:.0f} / {worst[2]:.0f}",
+        f"{middle[4]:.0f}",
+        *(f"{100 * worst[it]:.0f}" for it in (5, 6, 7, 8)),
+        f"{worst[9]:.0f}",
+        f"{found[:, 10].min():.0f}",
+        f"{middle[11]:.0f}",
+        f"{worst[12]:.0f}",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS
+    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else SECONDS
+    jobs = [(name, seed, seconds) for name in ROBOTS for seed in range(seeds)]
+    with Pool(2) as pool:
+        found = np.array(pool.map(figures, jobs, chunksize=1)).reshape(len(ROBOTS), seeds, -1)
+    lines = [
+        f"{seconds:g} s of one core's time from each of {seeds} seeds; motions of 20 s with 5 "
+        "harmonics, for inertias and three terms of friction a joint. Conditions: median / worst "
+        "of the seeds. Weighted: rows divided by the joints' greatest torques, columns of unit "
+        "length; plain: rows as they are, columns of unit length; links alone: plain, without the "
+        "columns of friction; raw: rows and columns as they are. Random motions stay within the "
+        "limits of joints and drives (plain, median of 20). Shares of what is allowed, which is "
+        "90 % of the greatest speeds and accelerations, and torques with a margin of 1.2, at "
+        "1 kHz; beyond: samples at 1 kHz whose differences are beyond the data sheet.",
+        "",
+        "| robot | base | weighted | plain | links alone | raw | random | range % | speed % | "
+        "acceleration % | torque % | beyond | nearest mm | starts | s |",
+        "| --- |" + " ---: |" * 14,
+        *(row(name, it) for name, it in zip(ROBOTS, found, strict=True)),
+    ]
+    text = "\n".join(lines)
+    print(text)
+    write_section(
+        "Exciting motions", "PYTHONPATH=tests python tests/benchmarks/excitation.py", text
+    )
+
+
+if __name__ == "__main__":
+    main()

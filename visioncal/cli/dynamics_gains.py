@@ -1,0 +1,102 @@
+"""`visioncal dynamics gains`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import messages
+from visioncal.cli.dynamics_options import CutoffOption, SessionArgument
+from visioncal.cli.numbers import numbers_in
+from visioncal.cli.stdout import write_stdout
+from visioncal.dynamics import BaseModel, DynamicModel, FrictionTerms, Gains, drive_gains
+from visioncal.dynamics.run import current_streams, robot_of
+from visioncal.errors import DataError
+from visioncal.recording.numbers import matched, significant
+from visioncal.robot import Inertias, matrices
+from visioncal.session import Session
+from visioncal.types import FloatArray
+
+
+def dynamics_gains_command(
+    session: SessionArgument,
+    loaded: Annotated[
+        Path, typer.Option("--loaded", help="A session of the same arm with the body on it.")
+    ],
+    mass_kg: Annotated[float, typer.Option("--mass-kg", help="Of the body [kg].")],
+    com_mm: Annotated[
+        str,
+        typer.Option(
+            "--com-mm", metavar="X,Y,Z", help="Its centre of mass in the flange's frame [mm]."
+        ),
+    ],
+    inertia: Annotated[
+        str,
+        typer.Option(
+            "--inertia",
+            metavar="XX,XY,YY,XZ,YZ,ZZ",
+            help="Its inertia about that centre [kg m^2].",
+        ),
+    ] = "0,0,0,0,0,0",
+    cutoff_hz: CutoffOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+) -> None:
+    """Find how much torque a drive's current makes, by a body that is known.
+
+    Exit status 0: there are gains; 2: there are none, for the reason given.
+    """
+    body = _body(mass_kg, com_mm, inertia)
+    without = Session.load(session)
+    robot = robot_of(without)
+    empty = current_streams(without, robot, cutoff_hz)
+    full = current_streams(Session.load(loaded), robot, cutoff_hz or empty[0].cutoff_hz)
+    base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
+    found = drive_gains(base, empty, full, body)
+    if as_json:
+        document = [_row(name, found, at) for at, name in enumerate(robot.joint_names)]
+        write_stdout(json.dumps(document, indent=2) + "\n")
+        return
+    _tell(robot.joint_names, found)
+
+
+def _body(mass_kg: float, com_mm: str, inertia: str) -> FloatArray:
+    """(10,) the body's inertial parameters in the flange's frame.
+
+    Raises:
+        DataError: There is no such body.
+    """
+    centre = 1e-3 * np.array(numbers_in(com_mm, "--com-mm", "x,y,z"))
+    about = matrices(np.array(numbers_in(inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
+    body = Inertias.of_bodies(np.array([mass_kg]), centre[None], about[None])
+    if not (mass_kg > 0.0 and body.consistent):
+        raise DataError(
+            f"--mass-kg {mass_kg:g} and --inertia {inertia} are those of no body.",
+            culprits=["--mass-kg", "--inertia"],
+            next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
+            "for a body as small as a point.",
+        )
+    return np.asarray(body.values[0])
+
+
+def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
+    """What is told of a drive; nothing where that is not told."""
+    if not found.told[at]:
+        return {"joint": name}
+    gain, sigma = float(found.nm_per_a[at]), float(found.sigma[at])
+    return {"joint": name, "nm_per_a": gain, "sigma_nm_per_a": sigma}
+
+
+def _tell(names: tuple[str, ...], found: Gains) -> None:
+    for name, gain, sigma, told in zip(
+        names, found.nm_per_a.tolist(), found.sigma.tolist(), found.told, strict=True
+    ):
+        words = "not told: the body hardly moves it"
+        if told:
+            words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
+        messages().print(escape(f"{name}: {words}"))
+    if found.told.all():
+        gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
+        write_stdout(f"--gains {gains}\n")

@@ -1,0 +1,210 @@
+"""`visioncal dynamics identify` and `validate`."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from visioncal.calibration import Verdict
+from visioncal.cli.console import messages, print_verdict
+from visioncal.cli.dynamics_options import (
+    AgainstOption,
+    CutoffOption,
+    GainsOption,
+    SessionArgument,
+    StreamOption,
+    identified_of,
+    number_list,
+)
+from visioncal.cli.stdout import write_stdout
+from visioncal.dynamics.document import stribeck_rows, to_document
+from visioncal.dynamics.friction import FrictionTerms
+from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
+from visioncal.dynamics.identify import SLOW_RAD_S, Options
+from visioncal.dynamics.judge import judge
+from visioncal.dynamics.run import Request, identify_session, validate_session
+from visioncal.dynamics.validate import Prediction, validate
+from visioncal.errors import DataError
+from visioncal.figures import figure
+from visioncal.outputs import write_dynamics
+from visioncal.session import Session
+
+_FRICTION = ("coulomb", "viscous", "offset")
+
+
+def dynamics_identify_command(
+    session: SessionArgument,
+    stream: StreamOption = None,
+    validate_on: Annotated[
+        str | None,
+        typer.Option(help="A stream to predict. Default: the last 30 % of the fastest motion."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help=f"A folder for {FILE}, report and recording."),
+    ] = None,
+    friction: Annotated[
+        str,
+        typer.Option(help=f"What joints have of their own: {', '.join(_FRICTION)}; or none."),
+    ] = "coulomb,viscous,offset",
+    rotors: Annotated[
+        bool | None,
+        typer.Option(
+            "--rotors/--no-rotors",
+            help="Motors' inertia in the torques, or none in those of sensors behind the gears. "
+            "Default: as unseen torques have it.",
+        ),
+    ] = None,
+    stribeck: Annotated[
+        bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
+    ] = True,
+    cutoff_hz: CutoffOption = None,
+    gains: GainsOption = None,
+    unchecked: Annotated[
+        bool,
+        typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help=f"Print {FILE}.")] = False,
+) -> None:
+    """Identify an arm's inertias and friction from the torques of its motions.
+
+    Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
+    """
+    options = Options(terms=_terms(friction), stribeck=stribeck, checked=not unchecked)
+    request = Request(
+        tuple(stream or ()),
+        validate_on or "",
+        cutoff_hz,
+        number_list(gains, "--gains"),
+        options,
+        rotors,
+    )
+    run = identify_session(Session.load(session), request)
+    identified = run.identified
+    written = () if output is None else write_dynamics(output, run)
+    if as_json:
+        write_stdout(json.dumps(to_document(identified), indent=2, allow_nan=False) + "\n")
+        return
+    _tell(identified)
+    for path in written:
+        messages().print(escape(f"wrote {path}"))
+    if not written:
+        messages().print("nothing was written: -o names a folder for it")
+
+
+def dynamics_validate_command(
+    session: SessionArgument,
+    against: AgainstOption = None,
+    stream: StreamOption = None,
+    cutoff_hz: CutoffOption = None,
+    gains: GainsOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+) -> None:
+    """Predict the torques of other motions, and say how near that comes.
+
+    Exit status 0: there are figures; 2: there are none, for the reason given.
+    """
+    identified = identified_of(against, "validate")
+    request = Request(tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"))
+    predictions = validate_session(Session.load(session), identified, request)
+    if as_json:
+        write_stdout(json.dumps([_figures(it) for it in predictions], indent=2) + "\n")
+        return
+    for prediction in predictions:
+        messages().print(escape(prediction.label))
+        _tell_prediction(identified, prediction)
+
+
+def _terms(words: str) -> FrictionTerms:
+    """The terms of friction that the user names.
+
+    Raises:
+        DataError: There is no such term.
+    """
+    names = [] if words == "none" else [it.strip() for it in words.split(",")]
+    wrong = [it for it in names if it not in _FRICTION]
+    if wrong:
+        raise DataError(
+            f"--friction names {', '.join(wrong)}; the terms are {', '.join(_FRICTION)}, or none.",
+            culprits=["--friction"],
+        )
+    coulomb, viscous, offset = (it in names for it in _FRICTION)
+    return FrictionTerms(coulomb, viscous, offset, slow_rad_s=SLOW_RAD_S)
+
+
+def _tell(identified: Identified) -> None:
+    console, judged = messages(), judge(identified)
+    print_verdict(Verdict(judged.status, judged.reasons), f"dynamics of {identified.robot.name}")
+    for stream in identified.streams:
+        left = f", {stream.left_out} torques left out" if stream.left_out else ""
+        console.print(
+            escape(
+                f"{stream.label}: {stream.samples} samples at {figure(2 * stream.cutoff_hz)} Hz of "
+                f"a motion up to {figure(stream.band_hz)} Hz{left}"
+            )
+        )
+        for note in stream.notes:
+            console.print(f"  - {escape(note)}")
+    counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
+    told = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
+    console.print(
+        f"{identified.base.rank} base parameters: {told}, {counts[-1][1]} {counts[-1][0]}, "
+        f"{identified.determined.count(NOT_TOLD)} {NOT_TOLD}"
+    )
+    console.print(_joint_table(identified))
+    console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
+
+
+def _joint_table(identified: Identified) -> Table:
+    """What each joint's torques and friction came to."""
+    names = [identified.base.model.names[it] for it in identified.base.independent]
+    values = dict(zip(names, identified.values.tolist(), strict=True))
+    humps = {row["joint"]: row for row in stribeck_rows(identified)}
+    joints = range(1, identified.robot.joint_count + 1)
+    columns: dict[str, list[float | None]] = {"fitted": [*identified.streams[0].rms_nm]}
+    validation = identified.validation
+    if validation is not None:
+        columns["predicted"] = [*validation.rms_nm]
+        columns["of range, %"] = [*(100.0 * validation.shares)]
+        if validation.known_rms_nm is not None:
+            columns["before"] = [*validation.known_rms_nm]
+    for symbol in ("Fc", "Fv", "Ia"):
+        columns[symbol] = [values.get(f"{symbol}{it}") for it in joints]
+    columns["Fs/Fc"] = [humps.get(it, {}).get("static_over_coulomb") for it in joints]
+    columns["vs"] = [humps.get(it, {}).get("speed_rad_s") for it in joints]
+    told = {name: it for name, it in columns.items() if any(value is not None for value in it)}
+    table = Table("joint", *told, box=None)
+    for at, joint in enumerate(joints):
+        row = [None if it[at] is None else figure(float(it[at] or 0.0)) for it in told.values()]
+        table.add_row(str(joint), *row)
+    return table
+
+
+def _tell_prediction(identified: Identified, prediction: Prediction) -> None:
+    found = validate(identified, prediction)
+    fitted = identified.streams[0].rms_nm
+    table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
+    for joint, name in enumerate(identified.robot.joint_names):
+        table.add_row(
+            name,
+            figure(float(found.rms_nm[joint])),
+            f"{figure(100.0 * float(found.shares[joint]))} %",
+            figure(float(fitted[joint])),
+        )
+    messages().print(table)
+
+
+def _figures(prediction: Prediction) -> dict[str, str | Sequence[float]]:
+    rms_nm = prediction.rms_nm(prediction.predicted_nm)
+    figures: dict[str, str | Sequence[float]] = {
+        "stream": prediction.label,
+        "rms_nm": rms_nm.tolist(),
+        "torque_nm": prediction.torque_nm.tolist(),
+    }
+    if prediction.consistent_nm is not None:
+        figures["consistent_rms_nm"] = prediction.rms_nm(prediction.consistent_nm).tolist()
+    return figures

@@ -1,0 +1,83 @@
+"""`visioncal dynamics payload`."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from visioncal.cli.dynamics_options import (
+    AgainstOption,
+    CutoffOption,
+    GainsOption,
+    SessionArgument,
+    StreamOption,
+    identified_of,
+    number_list,
+)
+from visioncal.cli.stdout import write_stdout
+from visioncal.dynamics import Payload, estimate_payload
+from visioncal.dynamics.run import Request, conditioned_streams
+from visioncal.recording.numbers import matched, significant
+from visioncal.session import Session
+from visioncal.types import FloatArray
+
+
+def dynamics_payload_command(
+    session: SessionArgument,
+    against: AgainstOption = None,
+    stream: StreamOption = None,
+    cutoff_hz: CutoffOption = None,
+    gains: GainsOption = None,
+    same_friction: Annotated[
+        bool,
+        typer.Option(
+            "--same-friction", help="Friction is as it was without the payload, however it presses."
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
+) -> None:
+    """Weigh what the arm carries, by how much more its drives gave than without it.
+
+    Exit status 0: there are figures; 2: there are none, for the reason given.
+    """
+    identified = identified_of(against, "payload")
+    torque_nm_a = number_list(gains, "--gains")
+    request = Request(tuple(stream or ()), "", cutoff_hz, torque_nm_a)
+    loaded = conditioned_streams(Session.load(session), identified, request)
+    found = estimate_payload(identified, loaded, friction_changes=not same_friction)
+    if as_json:
+        write_stdout(json.dumps(found.document(), indent=2) + "\n")
+        return
+    write_stdout("\n".join([*_lines(found), ""]))
+
+
+def _lines(found: Payload) -> list[str]:
+    mass = f"{matched(found.mass_kg, found.mass_sigma_kg)} kg"
+    centre = _listed(1e3 * found.centre_m, 1e3 * found.centre_sigma_m)
+    lines = [
+        f"mass {mass} (sigma {significant(found.mass_sigma_kg)})",
+        f"centre {centre} mm in the flange's frame",
+    ]
+    if found.consistent:
+        inertia = ", ".join(f"{it:.4g}" for it in found.inertia_kg_m2)
+        lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
+    else:
+        lines.append("its inertia is lost in the noise")
+    left = ", ".join(significant(it) for it in found.rms_nm.tolist())
+    lines.append(f"unexplained {left} N m, joint by joint")
+    return [*lines, f"on a UR: {_ur_words(found)}"]
+
+
+def _listed(values: FloatArray, sigmas: FloatArray) -> str:
+    told = zip(values.tolist(), sigmas.tolist(), strict=True)
+    return ", ".join(f"{matched(it, sigma)} (sigma {significant(sigma)})" for it, sigma in told)
+
+
+def _ur_words(found: Payload) -> str:
+    """The payload as a UR's program sets it, in kg, m and kg m^2."""
+    centre = ", ".join(f"{it:.5f}" for it in found.centre_m)
+    if not found.consistent:
+        return f"set_target_payload({found.mass_kg:.4f}, [{centre}])"
+    xx, xy, yy, xz, yz, zz = found.inertia_kg_m2.tolist()
+    inertia = ", ".join(f"{it:.6f}" for it in (xx, yy, zz, xy, xz, yz))
+    return f"set_target_payload({found.mass_kg:.4f}, [{centre}], [{inertia}])"

@@ -1,0 +1,65 @@
+"""`visioncal dynamics record`."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from visioncal.capture.motions import record_motion
+from visioncal.cli.console import messages
+from visioncal.cli.interrupts import ended_like_ctrl_c
+from visioncal.drivers.ur_motion import UrMotion
+from visioncal.errors import DataError
+from visioncal.files import check_free
+from visioncal.session import STREAMS, Session, Stream, check_stream, save_stream
+
+
+def dynamics_record_command(
+    out: Annotated[
+        Path, typer.Argument(help="The session's folder; made, or given another stream.")
+    ],
+    arm: Annotated[str, typer.Option(help="The arm: ur:HOST.")],
+    stream: Annotated[str, typer.Option(help="What to call the motion.")] = "excite",
+    robot: Annotated[
+        str | None, typer.Option(help="Its model; by default what the controller says.")
+    ] = None,
+    rest_s: Annotated[
+        float, typer.Option(min=0.5, help="At rest for so many seconds, the motion is over.")
+    ] = 3.0,
+) -> None:
+    """Record a motion's angles, speeds and motor currents at the controller's full rate.
+
+    The motion is another's: start its program (such as excitation.script of `dynamics plan`) on the
+    pendant once this command waits for it. Exit status 0: it is recorded; 2: it is not.
+    """
+    kind, _, host = arm.partition(":")
+    if kind != "ur" or not host:
+        raise DataError(
+            f"--arm is {arm!r}; ur:HOST is needed, as ur:192.168.0.10.",
+            culprits=["--arm"],
+            next_step="Other arms' recordings go into streams/NAME.csv of a session.",
+        )
+    path = out / STREAMS / f"{stream}.csv"
+    check_free(path, force=False, replaceable=False)
+    with ended_like_ctrl_c(), closing(UrMotion(host)) as joints:
+        found = record_motion(joints, rest_s=rest_s, told=messages().print)
+        model = robot or joints.model
+    check_stream(stream, found)
+    _keep(out, stream, found, model)
+    messages().print(
+        escape(
+            f"wrote {len(found)} samples to {path}. They hold currents: identify needs --gains, "
+            "which visioncal dynamics gains finds"
+        )
+    )
+
+
+def _keep(out: Path, name: str, stream: Stream, model: str) -> None:
+    """Writes a session with the stream, or adds the stream to the one that is there."""
+    if (out / "session.toml").is_file():
+        save_stream(out, name, stream)
+        return
+    document = {"schema": 1, "name": out.name or "motions", "robot": {"model": model}}
+    Session.of_streams(document, {name: stream}).save(out)

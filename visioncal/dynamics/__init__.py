@@ -1,0 +1,53 @@
+"""Dynamics: the torques that an arm needs, and the parameters that measured ones tell."""
+
+from visioncal.dynamics.arm import ArmDynamics
+from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.curves import friction_at, left_for_friction
+from visioncal.dynamics.document import stribeck_rows
+from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
+from visioncal.dynamics.friction import Friction, FrictionTerms, sign
+from visioncal.dynamics.gains import Gains, drive_gains
+from visioncal.dynamics.identified import FILE, Identified
+from visioncal.dynamics.judge import judge
+from visioncal.dynamics.limits import Missing, Share, allowed_motion
+from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.motion import Measured, Motion
+from visioncal.dynamics.observer import MomentumObserver, external_torques
+from visioncal.dynamics.payload import Payload, estimate_payload
+from visioncal.dynamics.run import Run
+from visioncal.dynamics.sweeps import SweepRequest, Sweeps, plan_sweeps
+from visioncal.dynamics.validate import Prediction
+
+__all__ = [
+    "FILE",
+    "ArmDynamics",
+    "BaseModel",
+    "DynamicModel",
+    "Excitation",
+    "ExcitationRequest",
+    "Friction",
+    "FrictionTerms",
+    "Gains",
+    "Identified",
+    "Measured",
+    "Missing",
+    "MomentumObserver",
+    "Motion",
+    "Payload",
+    "Prediction",
+    "Run",
+    "Share",
+    "SweepRequest",
+    "Sweeps",
+    "allowed_motion",
+    "drive_gains",
+    "estimate_payload",
+    "excite",
+    "external_torques",
+    "friction_at",
+    "judge",
+    "left_for_friction",
+    "plan_sweeps",
+    "sign",
+    "stribeck_rows",
+]

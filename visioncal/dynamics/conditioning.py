@@ -1,0 +1,280 @@
+"""From what a controller recorded to motions and torques that a regression can take."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from visioncal.dynamics.lowpass import LowPass
+from visioncal.dynamics.motion import Measured, Motion
+from visioncal.dynamics.reading import Recorded
+from visioncal.dynamics.smoothing import WIDER, band_of, smoothed_motion, window_of
+from visioncal.errors import DataError
+from visioncal.files import some_of
+from visioncal.types import FloatArray, Mask
+
+# Torques of a rigid arm have all but their friction's corners within so many times the band of its
+# motion; below so many a second there is little to tell noise by [Hz].
+_TORQUE_BAND, _LEAST_HZ = 10.0, 4.0
+# Samples farther apart than so many times the usual, and than so much [s], have others missing
+# between them; steps that differ by more than this share of the usual are resampled.
+_GAP, _GAP_S, _JITTER = 2.5, 0.02, 0.02
+# Torques at rest on an extreme for so many samples on end, within this share of it, are cut off.
+_FLAT_SAMPLES, _FLAT = 5, 1e-6
+_MOST_AT_LIMIT = 0.2
+# Torques that stand out from their neighbours by so many times what is usual, and by this share of
+# their range, are slips of the line.
+_SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
+# So many samples' regressors are held at a time.
+_SAMPLES_AT_ONCE = 20_000
+# An output that rests on bad samples by more than this share is not used.
+_TOUCHED = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Evenly sampled motion and torques without a gap, and how they are to be filtered.
+
+    Attributes:
+        measured: The samples.
+        bad: (m, n) torques that are none.
+        lowpass: For torques and regressor alike.
+    """
+
+    measured: Measured
+    bad: Mask
+    lowpass: LowPass
+
+    @property
+    def times_s(self) -> FloatArray:
+        """(k,) when the filtered samples are [s]."""
+        begin, count = self.lowpass.half, self.lowpass.count(len(self.measured))
+        return self.measured.motion.times_s[begin :: self.lowpass.step][:count]
+
+    @property
+    def torques_nm(self) -> FloatArray:
+        """(k, n) filtered torques [N m]."""
+        return self.lowpass(self.measured.torques_nm)
+
+    def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
+        """Filters what is computed of a motion (m, ...), a part of it at a time: (k, ...)."""
+        step, width = self.lowpass.step, len(self.lowpass.taps)
+        total, parts = self.lowpass.count(len(self.measured)), []
+        at_once = max(_SAMPLES_AT_ONCE // step, 1)
+        for begin in range(0, total, at_once):
+            end = min(begin + at_once, total)
+            rows = slice(begin * step, (end - 1) * step + width)
+            parts.append(self.lowpass(columns(self.measured.motion.chosen(rows))))
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    @property
+    def used(self) -> Mask:
+        """(k, n) which of the filtered torques rest on good samples."""
+        if not self.bad.any():
+            return np.ones((len(self.times_s), self.bad.shape[1]), dtype=bool)
+        return np.asarray(self.lowpass.touched(self.bad) <= _TOUCHED)
+
+
+@dataclass(frozen=True, eq=False)
+class Conditioned:
+    """A stream, ready for a regression.
+
+    Attributes:
+        label: Its place, for messages.
+        pieces: What lies between its gaps.
+        band_hz: Highest frequency of the motion [Hz].
+        cutoff_hz: Where the low-pass is 6 dB down [Hz].
+        rate_hz: Samples a second.
+        notes: What was found in the samples and done about it, in words.
+    """
+
+    label: str
+    pieces: tuple[Piece, ...]
+    band_hz: float
+    cutoff_hz: float
+    rate_hz: float
+    notes: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """How many filtered samples there are."""
+        return sum(len(it.times_s) for it in self.pieces)
+
+    @property
+    def times_s(self) -> FloatArray:
+        """(k,) when the filtered samples are [s]."""
+        return np.concatenate([it.times_s for it in self.pieces])
+
+    @property
+    def torques_nm(self) -> FloatArray:
+        """(k, n) filtered torques [N m]."""
+        return np.concatenate([it.torques_nm for it in self.pieces])
+
+    @property
+    def used(self) -> Mask:
+        """(k, n) which of the filtered torques rest on good samples."""
+        return np.concatenate([it.used for it in self.pieces])
+
+    @property
+    def correlation(self) -> FloatArray:
+        """What the filter leaves of white noise from one sample to the next, and so on."""
+        return self.pieces[0].lowpass.correlation
+
+    def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
+        """Filters what is computed of the motion, as the torques are: (k, ...)."""
+        parts = [it.filtered(columns) for it in self.pieces]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    @classmethod
+    def unfiltered(cls, measured: Measured, label: str = "samples") -> Self:
+        """Takes samples that need no filter as they are."""
+        steps = np.diff(measured.motion.times_s)
+        rate_hz = 1.0 / float(np.median(steps))
+        bad = np.zeros(measured.torques_nm.shape, dtype=bool)
+        piece = Piece(measured, bad, LowPass.none())
+        return cls(label, (piece,), 0.5 * rate_hz, 0.5 * rate_hz, rate_hz, ())
+
+
+def condition(
+    recorded: Recorded, cutoff_hz: float | None = None, limits_nm: FloatArray | None = None
+) -> Conditioned:
+    """Resamples, differentiates and filters a stream.
+
+    Torques and regressor go through the same low-pass, which therefore moves no parameter (Gautier
+    1997, parallel filtering). It shifts nothing in time.
+
+    Args:
+        recorded: The stream's samples.
+        cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's band where None.
+        limits_nm: (n,) torques beyond which the drives give none [N m], where known.
+
+    Raises:
+        DataError: No part without gaps is as long as the filters.
+    """
+    notes: list[str] = []
+    torques, bad = _cleaned(recorded, limits_nm, notes)
+    recorded = replace(recorded, torques_nm=torques)
+    parts = list(_even_parts(recorded, bad, notes))
+    longest = max(parts, key=lambda it: len(it[0]))[0]
+    rate_hz = (len(longest) - 1) / float(longest.times_s[-1] - longest.times_s[0])
+    band_hz = band_of(longest.q, rate_hz)
+    cutoff = max(_TORQUE_BAND * band_hz, _LEAST_HZ) if cutoff_hz is None else cutoff_hz
+    cutoff = min(cutoff, 0.25 * rate_hz)
+    lowpass = LowPass.of(cutoff, rate_hz)
+    window = window_of(max(WIDER * band_hz, cutoff), rate_hz, len(longest))
+    pieces, good = [], True
+    for part, wrong in parts:
+        if len(part) < len(lowpass.taps) + 2 * window:
+            continue
+        motion, agree = smoothed_motion(part.times_s, part.q, part.dq, window)
+        good &= agree
+        inner = slice(window // 2, -(window // 2))
+        measured = Measured(motion.chosen(inner), part.torques_nm[inner])
+        pieces.append(Piece(measured, wrong[inner], lowpass))
+    if not pieces:
+        span_s = (len(lowpass.taps) + 2 * window) / rate_hz
+        raise DataError(
+            f"{recorded.label}: the longest part without gaps lasts {len(longest) / rate_hz:.3g} s,"
+            f" and {span_s:.3g} s are needed to filter at {cutoff:.3g} Hz.",
+            culprits=[recorded.label],
+            next_step="Record for longer without losing samples; 10 to 30 s are usual.",
+        )
+    if not good:
+        notes.append(
+            f"{recorded.label}: dq1_rad_s ... are not the speeds at which q1_rad ... change; they "
+            "were left out. Are they in rad/s, measured, and not delayed?"
+        )
+    return Conditioned(recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes))
+
+
+def _even_parts(recorded: Recorded, bad: Mask, notes: list[str]) -> Iterator[tuple[Recorded, Mask]]:
+    """The parts between gaps, each on an even clock."""
+    steps = np.diff(recorded.times_s)
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(steps > max(_GAP * usual, _GAP_S))
+    if len(gaps):
+        places = [f"{recorded.times_s[it] - recorded.times_s[0]:.2f} s" for it in gaps]
+        notes.append(
+            f"{recorded.label}: samples are missing for up to {steps[gaps].max():.3g} s behind "
+            f"{some_of(places, 3)}; nothing is interpolated there."
+        )
+    inner = np.delete(steps, gaps)
+    jitter = float(np.std(inner)) / usual
+    if jitter > _JITTER:
+        notes.append(
+            f"{recorded.label}: steps of its clock differ by {100.0 * jitter:.0f} % (from "
+            f"{1e3 * inner.min():.3g} to {1e3 * inner.max():.3g} ms); it was resampled evenly."
+        )
+    bounds = [0, *(gaps + 1), len(recorded)]
+    for begin, end in pairwise(bounds):
+        if end - begin > 2:
+            yield _even(recorded, bad, slice(begin, end), jitter > _JITTER)
+
+
+def _even(recorded: Recorded, bad: Mask, rows: slice, resampled: bool) -> tuple[Recorded, Mask]:
+    """A part, brought to a clock with even steps where it has none."""
+    times_s = recorded.times_s[rows]
+    even = np.linspace(times_s[0], times_s[-1], len(times_s))
+
+    def at(values: FloatArray) -> FloatArray:
+        if not resampled:
+            return values[rows]
+        return np.stack([np.interp(even, times_s, it) for it in values[rows].T], axis=1)
+
+    part = replace(
+        recorded,
+        times_s=even,
+        q=at(recorded.q),
+        dq=None if recorded.dq is None else at(recorded.dq),
+        torques_nm=at(recorded.torques_nm),
+    )
+    return part, np.asarray(at(bad.astype(float)) > 0.0)
+
+
+def _cleaned(
+    recorded: Recorded, limits_nm: FloatArray | None, notes: list[str]
+) -> tuple[FloatArray, Mask]:
+    """Torques with single slips taken out, and which of them are none."""
+    torques = recorded.torques_nm.copy()
+    flat = np.stack([_flat_tops(it) for it in torques.T], axis=1)
+    if limits_nm is not None:
+        beyond = np.abs(torques) >= 0.999 * limits_nm
+        # Drives that are at their limits all the time are none: the torques are of another unit.
+        flat |= beyond & (beyond.mean(axis=0) < _MOST_AT_LIMIT)
+    around = median_filter(torques, (_NEIGHBOURS, 1), mode="nearest")
+    away = np.abs(torques - around)
+    # Of normal noise three in four samples depart from the median of five by less than this.
+    usual = np.quantile(away, 0.75, axis=0)
+    range_nm = np.quantile(torques, 0.999, axis=0) - np.quantile(torques, 0.001, axis=0)
+    spikes = (away > np.maximum(_SPIKE * usual, _SPIKE_SHARE * range_nm)) & ~flat
+    spikes &= spikes.mean(axis=0) < _TOUCHED
+    torques[spikes] = around[spikes]
+    for what, wrong, done in (
+        ("at rest on an extreme value (saturated)", flat, "what rests on them is left out"),
+        ("far off from their neighbours", spikes, "these are used in their place"),
+    ):
+        if wrong.any():
+            told = [f"tau{at + 1} ({n} times)" for at, n in enumerate(wrong.sum(axis=0)) if n]
+            notes.append(f"{recorded.label}: torques are {what}: {some_of(told)}; {done}.")
+    return torques, np.asarray(flat)
+
+
+def _flat_tops(values: FloatArray) -> Mask:
+    """Where torques (m,) stay at their highest or lowest for longer than anywhere else."""
+    flat = np.zeros(len(values), dtype=bool)
+    span = float(np.ptp(values))
+    same = np.abs(np.diff(values)) <= _FLAT * span
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    runs = bounds.reshape(-1, 2)
+    lengths = runs[:, 1] - runs[:, 0] + 1
+    if not len(runs):
+        return flat
+    top = np.minimum(values.max() - values[runs[:, 0]], values[runs[:, 0]] - values.min())
+    extreme = top <= 1e-3 * span
+    others = int(lengths[~extreme].max(initial=1))
+    for begin, end in runs[extreme & (lengths >= max(_FLAT_SAMPLES, 3 * others))]:
+        flat[begin : end + 1] = True
+    return flat

@@ -1,0 +1,283 @@
+"""Exciting motions: those that tell an arm's base parameters best.
+
+Swevers, Verdonck and De Schutter (2007, Dynamic model identification for industrial robots): the
+coefficients of finite Fourier series are optimised for the condition of the regressor, within the
+limits of joints, drives and cell. Here the condition is made smooth, and sharper from round to
+round; descents start from random motions until the time is up, and the best one is kept that a
+look at a thousand samples a second finds within all limits.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import minimize
+
+from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.condition import Condition, condition_of
+from visioncal.dynamics.fourier import Harmonics, Series
+from visioncal.dynamics.friction import FrictionTerms
+from visioncal.dynamics.kept import CHECK_HZ, Kept, kept_limits
+from visioncal.dynamics.limits import Allowed
+from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.objective import Objective
+from visioncal.errors import DataError, DegenerateError
+from visioncal.estimator.linalg import one_blas_thread
+from visioncal.files import some_of
+from visioncal.types import FloatArray, Progress
+
+# How long a motion may be [s], and of how many harmonics: fewer cannot tell the parameters of six
+# joints, more have speeds that shake the arm.
+SHORTEST_S, LONGEST_S = 10.0, 30.0
+FEWEST, MOST = 3, 10
+# Sharpness of the condition and price of breaches, round by round.
+_ROUNDS = ((1.0, 10.0), (4.0, 40.0), (12.0, 160.0), (30.0, 640.0))
+_MEMORY = 20
+# Random motions use this share of the limits, and start from one of so many random postures.
+_MODEST, _POSTURES = 0.5, 2000
+# A motion that breaks a limit is made smaller by this, so many times, before it is given up.
+_SMALLER, _TRIES = 0.97, 5
+# Figures do not change with more samples than these.
+_FIGURES_HZ = 100.0
+# Random motions whose condition is told, to compare with.
+_COMPARED = 20
+# Broken limits that a message names.
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class ExcitationRequest:
+    """What motion is wished.
+
+    Attributes:
+        period_s: How long it lasts [s].
+        harmonics: How many harmonics of that period it has.
+        terms: The friction that is to be told besides the inertias.
+        seconds: How long it is searched for [s of one core's time]; the first descent is ended
+            even if it takes longer.
+        seed: Of the random motions that the search starts from.
+        starts: The most of them.
+        steps: The most of each round of a descent.
+    """
+
+    period_s: float = 20.0
+    harmonics: int = 5
+    terms: FrictionTerms = field(default_factory=FrictionTerms)
+    seconds: float = 25.0
+    seed: int = 0
+    starts: int = 1000
+    steps: int = 80
+
+    def __post_init__(self) -> None:
+        if not SHORTEST_S <= self.period_s <= LONGEST_S:
+            why = "is too short" if self.period_s < SHORTEST_S else "is too long"
+            raise DataError(
+                f"a motion of {self.period_s:g} s {why}; {SHORTEST_S:g} to {LONGEST_S:g} s is "
+                "needed.",
+                culprits=["--duration"],
+            )
+        if not FEWEST <= self.harmonics <= MOST:
+            raise DataError(
+                f"a motion of {self.harmonics} harmonics is wished; {FEWEST} to {MOST} is needed.",
+                culprits=["--harmonics"],
+            )
+        if not 0.0 <= self.seconds < np.inf or min(self.starts, self.steps) < 1:
+            raise DataError(
+                f"a search of {self.seconds:g} s from {self.starts} starts with {self.steps} steps "
+                "is wished; 0 s or more, a start and a step are needed.",
+                culprits=["--seconds"],
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """An exciting motion.
+
+    Attributes:
+        request: What was wished.
+        base: The parameters that it tells.
+        weights: (n,) inverse of the joints' torque noise: the share that they have of the greatest
+            torque, or one each where that is not known.
+        series: The motion.
+        condition: Of its regressor.
+        random: The median of random motions within the limits of joints and drives.
+        kept: What it uses of the limits, at a thousand samples a second.
+        starts: How many descents were made.
+        seconds: How long the search took [s of one core's time].
+    """
+
+    request: ExcitationRequest
+    base: BaseModel
+    weights: FloatArray
+    series: Series
+    condition: Condition
+    random: Condition
+    kept: Kept
+    starts: int
+    seconds: float
+
+
+def excite(
+    allowed: Allowed, request: ExcitationRequest, progress: Progress | None = None
+) -> Excitation:
+    """Searches for the motion that tells the base parameters best.
+
+    Args:
+        allowed: What it must keep.
+        request: What is wished.
+        progress: Called as the search goes on.
+
+    Returns:
+        The best motion found that keeps all limits.
+
+    Raises:
+        DegenerateError: No motion was found that does.
+    """
+    with one_blas_thread():
+        return _Search(allowed, request, progress).run()
+
+
+class _Search:
+    """Descents from random motions, and the best of their ends."""
+
+    def __init__(
+        self, allowed: Allowed, request: ExcitationRequest, progress: Progress | None
+    ) -> None:
+        self._allowed, self._request, self._progress = allowed, request, progress
+        self._begin = time.process_time()
+        known = np.isfinite(allowed.torque).all()
+        self._weights = 1.0 / allowed.torque if known else np.ones(len(allowed.torque))
+        self._base = BaseModel.reduce(DynamicModel(allowed.robot, request.terms))
+        self._harmonics = Harmonics(request.period_s, request.harmonics)
+        self._objective = Objective(allowed, self._base, self._weights, self._harmonics)
+        self._rng = np.random.default_rng(request.seed)
+        self._best: tuple[Condition, Series, Kept] | None = None
+        self._breaches: tuple[str, ...] = ()
+
+    def run(self) -> Excitation:
+        request, starts = self._request, 0
+        while starts < request.starts and (starts == 0 or self._left_s > 0.0):
+            self._keep(self._descend(self._start(), hurry=starts > 0))
+            starts += 1
+        if self._best is None:
+            raise DegenerateError(
+                f"robot {self._allowed.robot.name}: no motion was found that keeps the limits; of "
+                f"the last one tried, {some_of(self._breaches, _NAMED)}.",
+                culprits=self._breaches,
+                next_step="Search for longer (--seconds), or leave the motion more room: "
+                "--duration, --margin-deg, --clearance-mm, --floor.",
+            )
+        condition, series, kept = self._best
+        found = (series, condition, self._random(), kept, starts)
+        return Excitation(
+            request, self._base, self._weights, *found, time.process_time() - self._begin
+        )
+
+    @property
+    def _left_s(self) -> float:
+        return self._request.seconds - (time.process_time() - self._begin)
+
+    def _descend(self, free: FloatArray, *, hurry: bool) -> FloatArray:
+        """Goes down from a motion, round by round; in a hurry it stops when the time is up."""
+
+        def look(_: FloatArray) -> None:
+            if self._progress is not None:
+                seconds = self._request.seconds
+                self._progress("excitation", int(seconds - max(self._left_s, 0.0)), int(seconds))
+            if hurry and self._left_s <= 0.0:
+                raise StopIteration
+
+        for sharpness, price in _ROUNDS:
+            if hurry and self._left_s <= 0.0:
+                break
+            found = minimize(
+                self._objective.value,
+                free,
+                args=(sharpness, price),
+                jac=True,
+                method="L-BFGS-B",
+                callback=look,
+                options={"maxiter": self._request.steps, "maxcor": _MEMORY},
+            )
+            free = found.x
+        return free
+
+    def _keep(self, free: FloatArray) -> None:
+        """Takes a motion for the best one if it is, and keeps the limits or can be made to."""
+        series = _within(self._allowed, self._objective.series(free))
+        for _ in range(_TRIES):
+            condition = self._figures(series)
+            if self._best is not None and condition.weighted >= self._best[0].weighted:
+                return
+            kept = kept_limits(self._allowed, series.sampled(CHECK_HZ))
+            self._breaches = kept.breaches
+            if not kept.breaches:
+                self._best = condition, series, kept
+                return
+            series = series.shrunk(_SMALLER)
+
+    def _figures(self, series: Series) -> Condition:
+        return condition_of(self._base, series.sampled(_FIGURES_HZ), self._weights)
+
+    def _start(self) -> FloatArray:
+        return self._modest(self._posture())
+
+    def _posture(self) -> FloatArray:
+        """A random posture that is clear of everything (n,) [rad]."""
+        allowed = self._allowed
+        turn = np.minimum(np.pi, allowed.half)
+        seen: Sequence[int] = ()
+        drawn = self._rng.uniform(-turn, turn, (_POSTURES, len(turn))) + allowed.middle
+        for posture in drawn:
+            contact = int(allowed.collisions.first_contact(posture[None])[0])
+            if contact < 0:
+                return np.asarray(posture)
+            seen = (*seen, contact)
+        names = allowed.collisions.names[int(np.bincount(seen).argmax())]
+        raise DegenerateError(
+            f"robot {allowed.robot.name}: none of {_POSTURES} postures within the limits is clear; "
+            f"{' and '.join(names)} are too near one another in most.",
+            culprits=names,
+            next_step="Look at --floor, --box and --clearance-mm, and at the base's frame.",
+        )
+
+    def _modest(self, posture: FloatArray) -> FloatArray:
+        """A random motion (k,) from a posture, well within the limits of joints and drives."""
+        allowed, resting = self._allowed, self._harmonics.resting
+        orders = np.arange(1.0, self._harmonics.count + 1.0)
+        sizes = 1.0 / np.concatenate([[np.inf], orders, orders])
+        free = self._rng.normal(size=(len(posture), len(sizes))) * sizes @ resting
+        moved = Series(self._harmonics, free).sampled(_FIGURES_HZ)
+        room = np.minimum(allowed.upper - posture, posture - allowed.lower)
+        shares = [
+            limit / np.abs(values).max(axis=0)
+            for values, limit in (
+                (moved.q, room),
+                (moved.dq, allowed.speed),
+                (moved.ddq, allowed.acceleration),
+                (moved.q, np.full(len(posture), np.pi)),
+            )
+        ]
+        scaled = _MODEST * np.min(shares, axis=0)[:, None] * free
+        return np.asarray(scaled + np.outer(posture, resting[0])).ravel()
+
+    def _random(self) -> Condition:
+        """The median condition of random motions, which nobody optimised."""
+        drawn = [self._figures(self._objective.series(self._start())) for _ in range(_COMPARED)]
+        figures = np.median([(it.weighted, it.scaled, it.raw) for it in drawn], axis=0)
+        return Condition(*figures.tolist())
+
+
+def _within(allowed: Allowed, series: Series) -> Series:
+    """Makes a motion smaller until it keeps the limits of joints' ranges, speeds, accelerations."""
+    motion, middle = series.sampled(CHECK_HZ), series.coefficients[0]
+    far, low = motion.q.max(axis=0) - middle, middle - motion.q.min(axis=0)
+    with np.errstate(divide="ignore"):
+        shares = [
+            (allowed.upper - middle) / far,
+            (middle - allowed.lower) / low,
+            allowed.speed / np.abs(motion.dq).max(axis=0),
+            allowed.acceleration / np.abs(motion.ddq).max(axis=0),
+        ]
+    return series.shrunk(float(np.clip(np.min(shares), 0.0, 1.0)))

@@ -1,0 +1,97 @@
+"""Joint motions as finite Fourier series that begin and end at rest.
+
+Swevers, Ganseman, Tuekel, De Schutter and Van Brussel (1997, Optimal robot excitation and
+identification): a periodic motion of few harmonics is known exactly from its coefficients, and its
+band is narrow. Rest at the beginning, and so at the end, are two linear equations in a joint's
+coefficients; they are eliminated, not penalised.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import null_space
+
+from visioncal.dynamics.motion import Motion
+from visioncal.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Harmonics:
+    """The functions of which one joint's motion is made.
+
+    Attributes:
+        period_s: When the motion is back at its beginning [s].
+        count: How many harmonics of that period there are.
+    """
+
+    period_s: float
+    count: int
+
+    @cached_property
+    def resting(self) -> FloatArray:
+        """(1 + 2 count, 2 count - 1) orthonormal basis of the coefficients that begin at rest."""
+        _, speed, acceleration = self._functions(np.zeros(1))
+        return np.asarray(null_space(np.vstack([speed, acceleration])))
+
+    def basis(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Positions, speeds and accelerations (m, 2 count - 1) for a unit of each free number."""
+        q, dq, ddq = (it @ self.resting for it in self._functions(times_s))
+        return q, dq, ddq
+
+    def _functions(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(m, 1 + 2 count) each: one, the sines and the cosines, and their derivatives."""
+        rates = 2.0 * np.pi / self.period_s * np.arange(1, self.count + 1)
+        phases = np.asarray(times_s)[:, None] * rates
+        sine, cosine = np.sin(phases), np.cos(phases)
+        one = np.ones((len(phases), 1))
+        return (
+            np.hstack([one, sine, cosine]),
+            np.hstack([0.0 * one, rates * cosine, -rates * sine]),
+            np.hstack([0.0 * one, -(rates**2) * sine, -(rates**2) * cosine]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """The motion of n joints.
+
+    Attributes:
+        harmonics: The functions that it is made of.
+        free: (n, 2 count - 1) each joint's numbers in the basis of those that begin at rest [rad].
+    """
+
+    harmonics: Harmonics
+    free: FloatArray
+
+    @property
+    def coefficients(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (n,), sines (n, count) and cosines (n, count) of each joint's position [rad]."""
+        full, count = self.free @ self.harmonics.resting.T, self.harmonics.count
+        return full[:, 0], full[:, 1 : 1 + count], full[:, 1 + count :]
+
+    @property
+    def start(self) -> FloatArray:
+        """(n,) where it begins and ends [rad]."""
+        mean, _, cosines = self.coefficients
+        return np.asarray(mean + cosines.sum(axis=1))
+
+    def motion(self, times_s: FloatArray) -> Motion:
+        """Where the joints are at (m,) times [s], and how they move."""
+        q, dq, ddq = (it @ self.free.T for it in self.harmonics.basis(times_s))
+        return Motion(np.asarray(times_s, dtype=float), q, dq, ddq)
+
+    def sampled(self, rate_hz: float) -> Motion:
+        """The motion from its beginning to its end, evenly sampled."""
+        return self.motion(even_times(self.harmonics.period_s, rate_hz))
+
+    def shrunk(self, share: float) -> "Series":
+        """The same motion about the same middle, so many times as far."""
+        # The mean alone is in the span of the free numbers: rest does not limit it.
+        middle = np.outer(self.coefficients[0], self.harmonics.resting[0])
+        return Series(self.harmonics, middle + share * (self.free - middle))
+
+
+def even_times(duration_s: float, rate_hz: float) -> FloatArray:
+    """(m,) times from zero to a duration, at a rate or a little more, so that both ends are met."""
+    return np.linspace(0.0, duration_s, 1 + int(np.ceil(duration_s * rate_hz - 1e-9)))

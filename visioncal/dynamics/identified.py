@@ -1,0 +1,175 @@
+"""The result of dynamic identification."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.consistent import Consistent
+from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.stribeck import Stribeck
+from visioncal.errors import DataError
+from visioncal.files import read_bytes, write_atomically
+from visioncal.robot import Inertias, Robot
+from visioncal.types import FloatArray
+
+FILE = "dynamics.json"
+# A parameter is told to so many percent of itself, or worse, or not at all.
+CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
+NOT_TOLD = "not at all"
+
+
+@dataclass(frozen=True, eq=False)
+class StreamFacts:
+    """What is told of a stream that was fitted.
+
+    Attributes:
+        label: Its place.
+        samples: How many filtered samples it has.
+        left_out: How many of these torques were left out, as outliers or as none.
+        band_hz: Highest frequency of the motion [Hz].
+        cutoff_hz: Where the low-pass is 6 dB down [Hz].
+        rate_hz: Samples a second before the filter.
+        noise_nm: (n,) noise of the filtered torques [N m].
+        rms_nm: (n,) their residuals, as a root mean square [N m].
+        torque_nm: (n,) how far they range, as a standard deviation [N m].
+        notes: What was found in its samples, in words.
+    """
+
+    label: str
+    samples: int
+    left_out: int
+    band_hz: float
+    cutoff_hz: float
+    rate_hz: float
+    noise_nm: FloatArray
+    rms_nm: FloatArray
+    torque_nm: FloatArray
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """How torques are predicted that were not fitted.
+
+    Attributes:
+        label: Of which samples, in words.
+        rms_nm: (n,) error, as a root mean square [N m].
+        torque_nm: (n,) how far the torques range, as a standard deviation [N m].
+        noise_nm: (n,) noise of the torques by the fit [N m].
+        consistent_rms_nm: (n,) error with the standard parameters of bodies; None without these.
+        known_rms_nm: (n,) error with the robot's own inertias and the friction that goes best with
+            them; None where it has none.
+    """
+
+    label: str
+    rms_nm: FloatArray
+    torque_nm: FloatArray
+    noise_nm: FloatArray
+    consistent_rms_nm: FloatArray | None = None
+    known_rms_nm: FloatArray | None = None
+
+    @property
+    def shares(self) -> FloatArray:
+        """(n,) error over the range of the torque."""
+        return np.asarray(self.rms_nm / np.maximum(self.torque_nm, 1e-12))
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What torques say of an arm; `save` writes it as dynamics.json.
+
+    Attributes:
+        robot: The arm as it was known before.
+        base: Its model in base parameters.
+        values: (b,) these.
+        covariance: (b + 2 a, b + 2 a) of these, of a humps of dry friction [N m], and of the
+            logarithms of their speeds.
+        stribeck: The humps.
+        consistent: Standard parameters of bodies; None where the robot's inertias are not known.
+        streams: What was fitted.
+        validation: How torques are predicted that were not fitted; None where there were none.
+        facts: Whence it comes: session, digest, when.
+    """
+
+    robot: Robot
+    base: BaseModel
+    values: FloatArray
+    covariance: FloatArray
+    stribeck: Stribeck
+    consistent: Consistent | None
+    streams: tuple[StreamFacts, ...]
+    validation: Validation | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Loads a dynamics.json, or that of a folder.
+
+        Raises:
+            DataError: It is missing or is none.
+        """
+        from visioncal.dynamics.document import fields_from_document
+
+        path = Path(path)
+        path = path / FILE if path.is_dir() else path
+        try:
+            return cls(**fields_from_document(json.loads(read_bytes(path))))
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(
+                f"{path} is no {FILE} of this version: {error}.",
+                culprits=[str(path)],
+                next_step="Write one with visioncal dynamics identify.",
+            ) from error
+
+    def save(self, path: Path | str) -> None:
+        """Writes it, whole or not at all.
+
+        Raises:
+            DataError: The file cannot be written.
+        """
+        from visioncal.dynamics.document import to_document
+
+        text = json.dumps(to_document(self), indent=2, allow_nan=False)
+        write_atomically(Path(path), f"{text}\n")
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(b,) of the base parameters."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[: self.base.rank]))
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """How well each base parameter is told: to `2 %` of itself, `10 %`, worse, or not."""
+        shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)
+        return tuple(next((word for most, word in CLASSES if it < most), NOT_TOLD) for it in shares)
+
+    @cached_property
+    def inertias(self) -> Inertias | None:
+        """Of the links, as bodies; None where the robot's were not known before."""
+        return None if self.consistent is None else self.consistent.inertias(self.robot.joint_count)
+
+    def torques(self, motion: Motion) -> FloatArray:
+        """(m, n) what the drives have to give, by the base parameters [N m]."""
+        return np.asarray(self.base.regressor(motion) @ self.values + self.stribeck.torques(motion))
+
+    def consistent_torques(self, motion: Motion) -> FloatArray:
+        """(m, n) the same by the standard parameters of bodies [N m].
+
+        Raises:
+            DataError: There are none.
+        """
+        if self.consistent is None:
+            raise DataError(
+                f"dynamics: nothing was known of the inertias of {self.robot.name}, so there are "
+                "no standard parameters.",
+                culprits=[self.robot.name],
+                next_step="Tell mass_kg, com_m and inertia_kg_m2 of its joints.",
+            )
+        values = self.base.of(self.consistent.values)
+        return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))

@@ -1,0 +1,220 @@
+"""What a motion must keep: the limits of joints and drives, and its distance from all things."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.dynamics.motion import Motion
+from visioncal.errors import DataError
+from visioncal.files import some_of
+from visioncal.robot import Inertias, Robot, joint_torques, moving
+from visioncal.robot.bodies import Body, arm_bodies
+from visioncal.robot.collision import Collisions
+from visioncal.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of its limits a motion may use.
+
+    Attributes:
+        margin_rad: Distance of the joints from the ends of their ranges [rad].
+        speed: Of the greatest speeds.
+        acceleration: Of the greatest accelerations.
+        torque: How many times larger the torques may be than the nominal inertias have them.
+        clearance_m: Distance of the arm from itself, the floor and all bodies [m].
+        floor_m: Height of the floor in the base [m]; None for none.
+    """
+
+    margin_rad: float = 0.05
+    speed: float = 0.9
+    acceleration: float = 0.9
+    torque: float = 1.2
+    clearance_m: float = 0.03
+    floor_m: float | None = 0.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("margin_rad", 0.0, np.pi),
+            ("speed", 0.01, 1.0),
+            ("acceleration", 0.01, 1.0),
+            ("torque", 1.0, 10.0),
+            ("clearance_m", 0.0, 10.0),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise DataError(f"limits: {name} is {value}; {low:g} to {high:g} is needed.")
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What stands for limits that the robot's description does not tell; None where none is given.
+
+    Attributes:
+        range_rad: Farthest position to either side [rad].
+        speed_rad_s: Greatest speed [rad/s].
+        acceleration_rad_s2: Greatest acceleration [rad/s^2].
+    """
+
+    range_rad: float | None = None
+    speed_rad_s: float | None = None
+    acceleration_rad_s2: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Allowed:
+    """What an arm may do, with all margins taken off.
+
+    Attributes:
+        robot: The arm.
+        lower: (n,) least positions [rad].
+        upper: (n,) greatest positions [rad].
+        speed: (n,) greatest speeds [rad/s].
+        acceleration: (n,) greatest accelerations [rad/s^2].
+        torque: (n,) greatest torques, as the nominal inertias have them [N m]; inf where they are
+            not known.
+        inertias: Nominal, with what the arm carries; None where they are not known.
+        bodies: The arm's, and those in the cell.
+        share: The margins.
+    """
+
+    robot: Robot
+    lower: FloatArray
+    upper: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    torque: FloatArray
+    inertias: Inertias | None
+    bodies: tuple[Body, ...]
+    share: Share
+
+    @cached_property
+    def collisions(self) -> Collisions:
+        """The distances of the cell; one object a thread."""
+        share = self.share
+        return Collisions(self.robot, self.bodies, share.clearance_m, share.floor_m)
+
+    @property
+    def middle(self) -> FloatArray:
+        """(n,) middle of the ranges [rad]."""
+        return 0.5 * (self.lower + self.upper)
+
+    @property
+    def half(self) -> FloatArray:
+        """(n,) half of the ranges [rad]."""
+        return 0.5 * (self.upper - self.lower)
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """What cannot be looked at for want of knowledge, in words."""
+        if self.inertias is None:
+            return (
+                f"torques: the description of {self.robot.name} tells no inertias of its links",
+            )
+        unknown = [
+            name
+            for name, limit in zip(self.robot.joint_names, self.torque, strict=True)
+            if not np.isfinite(limit)
+        ]
+        if unknown:
+            return (f"torques: no greatest torque is told of {some_of(unknown)}",)
+        return ()
+
+    def torques(self, motion: Motion) -> FloatArray | None:
+        """Torques (m, n) of the nominal arm [N m]; None where its inertias are not known."""
+        if self.inertias is None:
+            return None
+        return joint_torques(self.robot, self.inertias, motion.q, motion.dq, motion.ddq)
+
+
+def allowed_motion(
+    robot: Robot,
+    share: Share,
+    *,
+    missing: Missing | None = None,
+    bodies: Sequence[Body] = (),
+    payload: FloatArray | None = None,
+) -> Allowed:
+    """Collects what an arm may do.
+
+    Args:
+        robot: The arm.
+        share: The margins.
+        missing: What stands for limits that its description does not tell.
+        bodies: What it carries, and what stands in the cell.
+        payload: (10,) inertial parameters of what it carries, in the flange's frame, about its
+            origin; None for nothing.
+
+    Raises:
+        DataError: A limit is not told, or nothing is left of one.
+    """
+    missing = missing or Missing()
+    given = np.full(robot.joint_count, np.inf if missing.range_rad is None else missing.range_rad)
+    lower = np.where(np.isfinite(robot.lower_rad), robot.lower_rad, -given)
+    upper = np.where(np.isfinite(robot.upper_rad), robot.upper_rad, given)
+    rates = [
+        np.where(np.isfinite(told), told, np.inf if instead is None else instead)
+        for told, instead in (
+            (robot.velocity_rad_s, missing.speed_rad_s),
+            (robot.acceleration_rad_s2, missing.acceleration_rad_s2),
+        )
+    ]
+    _check_told(robot, np.minimum(-lower, upper), *rates)
+    allowed = Allowed(
+        robot,
+        lower + share.margin_rad,
+        upper - share.margin_rad,
+        share.speed * rates[0],
+        share.acceleration * rates[1],
+        robot.torque_nm / share.torque,
+        robot.inertias,
+        (*arm_bodies(robot), *bodies),
+        share,
+    )
+    _check_left(allowed)
+    return allowed if payload is None else _carrying(allowed, payload)
+
+
+def _check_told(robot: Robot, reach: FloatArray, speed: FloatArray, hard: FloatArray) -> None:
+    for values, what, keys, option in (
+        (reach, "positions", "lower_deg and upper_deg", "--range-deg"),
+        (speed, "speed", "velocity_rad_s", "--speed-deg"),
+        (hard, "acceleration", "acceleration_rad_s2", "--acceleration-deg"),
+    ):
+        lacking = [
+            name
+            for name, value in zip(robot.joint_names, values, strict=True)
+            if not np.isfinite(value)
+        ]
+        if lacking:
+            raise DataError(
+                f"robot {robot.name}: its description tells no limits of {what} for "
+                f"{some_of(lacking)}; a motion is planned within limits only.",
+                culprits=lacking,
+                next_step=f"Write {keys} into its description (a <limit> into a URDF), or give "
+                f"{option}.",
+            )
+
+
+def _check_left(allowed: Allowed) -> None:
+    for place, name in enumerate(allowed.robot.joint_names):
+        left = float(allowed.upper[place] - allowed.lower[place])
+        if left <= 0.0:
+            margin_deg = np.rad2deg(allowed.share.margin_rad)
+            raise DataError(
+                f"robot {allowed.robot.name}: of the range of {name} "
+                f"{np.rad2deg(left) + 2.0 * margin_deg:.1f} deg are left, and a margin of "
+                f"{margin_deg:.1f} deg is wished on both sides.",
+                culprits=[name],
+                next_step="Make the margin smaller (--margin-deg), or mend the limits.",
+            )
+
+
+def _carrying(allowed: Allowed, payload: FloatArray) -> Allowed:
+    if allowed.inertias is None:
+        return allowed
+    values = allowed.inertias.values.copy()
+    values[-1] += moving(allowed.robot.chain.placements[-1]) @ payload
+    return replace(allowed, inertias=Inertias(values))

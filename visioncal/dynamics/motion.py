@@ -1,0 +1,49 @@
+"""How an arm moved, and what its joints needed for it."""
+
+from dataclasses import dataclass
+
+from visioncal.types import FloatArray, IntArray, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Where n joints were at m times, and how they moved.
+
+    Attributes:
+        times_s: (m,) ascending [s].
+        q: (m, n) joint angles [rad].
+        dq: (m, n) their speeds [rad/s].
+        ddq: (m, n) their accelerations [rad/s^2].
+    """
+
+    times_s: FloatArray
+    q: FloatArray
+    dq: FloatArray
+    ddq: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def chosen(self, rows: slice | IntArray | Mask) -> "Motion":
+        """Some of the samples."""
+        return Motion(self.times_s[rows], self.q[rows], self.dq[rows], self.ddq[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A motion, and the torques that were measured during it.
+
+    Attributes:
+        motion: How the arm moved.
+        torques_nm: (m, n) of its joints [N m].
+    """
+
+    motion: Motion
+    torques_nm: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.motion)
+
+    def chosen(self, rows: slice | IntArray | Mask) -> "Measured":
+        """Some of the samples."""
+        return Measured(self.motion.chosen(rows), self.torques_nm[rows])

@@ -1,0 +1,139 @@
+"""What a stream says of an arm's motion and of its drives."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.session import Stream
+from visioncal.types import FloatArray
+
+_NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)
+# Fewer samples than these are no motion.
+_LEAST_SAMPLES = 200
+_HOW = (
+    "A stream for dynamics has stamp_s, q1_rad ..., and tau1_nm ... or current1_a ... of every "
+    "joint, from the base to the tip; dq1_rad_s ... where the controller reports speeds."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """The samples of a stream in which all that counts is filled.
+
+    Attributes:
+        label: The stream's place, for messages: `streams/robot.csv`.
+        times_s: (m,) when [s].
+        q: (m, n) joint angles [rad].
+        dq: (m, n) speeds as the controller reports them [rad/s]; None where it does not.
+        torques_nm: (m, n) of the joints [N m].
+        of_currents: Whether the torques are currents times gains.
+    """
+
+    label: str
+    times_s: FloatArray
+    q: FloatArray
+    dq: FloatArray | None
+    torques_nm: FloatArray
+    of_currents: bool = False
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    @property
+    def joint_count(self) -> int:
+        """The number n of joints."""
+        return int(self.q.shape[1])
+
+    def part(self, begin: float, end: float) -> "Recorded":
+        """The samples between two shares of the whole, 0 to 1."""
+        rows = slice(round(begin * len(self)), round(end * len(self)))
+        return replace(
+            self,
+            times_s=self.times_s[rows],
+            q=self.q[rows],
+            dq=None if self.dq is None else self.dq[rows],
+            torques_nm=self.torques_nm[rows],
+        )
+
+
+def read_recorded(
+    stream: Stream, label: str, count: int, gains_nm_a: Sequence[float] = ()
+) -> Recorded:
+    """Takes out of a stream what identification needs.
+
+    Args:
+        stream: The stream.
+        label: Its place, for messages.
+        count: The robot's number of joints.
+        gains_nm_a: (count,) torque for a current, on the joints' side, where currents were
+            recorded in the place of torques [N m/A].
+
+    Raises:
+        DataError: Columns of a joint are missing or there are those of more joints than the robot
+            has, currents have no gains, or too few samples are filled.
+    """
+    names = {it: _names(it, count) for it in ("q", "tau", "current", "dq")}
+    there = {it: [name in stream for name in names[it]] for it in names}
+    _check_joints(stream, label, count)
+    of_currents = not any(there["tau"]) and any(there["current"])
+    drive = "current" if of_currents else "tau"
+    missing = [
+        name
+        for group in ("q", drive)
+        for name, is_there in zip(names[group], there[group], strict=True)
+        if not is_there
+    ]
+    if missing:
+        raise DataError(
+            f"{label} lacks {', '.join(missing)}: the robot has {count} joints.",
+            culprits=[f"{label}, {it}" for it in missing],
+            next_step=_HOW,
+        )
+    gains = _gains(label, count, gains_nm_a) if of_currents else np.ones(count)
+    with_dq = all(there["dq"])
+    columns = [*names["q"], *names[drive], *(names["dq"] if with_dq else [])]
+    times_s, values = stream.group(columns)
+    if len(times_s) < _LEAST_SAMPLES:
+        raise DataError(
+            f"{label} has {len(times_s)} samples with angles and torques of all joints, and at "
+            f"least {_LEAST_SAMPLES} are needed.",
+            culprits=[label],
+            next_step=_HOW,
+        )
+    q, torques, dq = (values[:, at * count : (at + 1) * count] for at in range(3))
+    return Recorded(label, times_s, q, dq if with_dq else None, gains * torques, of_currents)
+
+
+def _names(kind: str, count: int) -> list[str]:
+    unit = {"q": "rad", "dq": "rad_s", "tau": "nm", "current": "a"}[kind]
+    return [f"{kind}{joint}_{unit}" for joint in range(1, count + 1)]
+
+
+def _check_joints(stream: Stream, label: str, count: int) -> None:
+    """Refuses columns of joints that the robot does not have."""
+    known = {name for kind in ("q", "dq", "tau", "current") for name in _names(kind, count)}
+    beyond = [it for it in stream.columns if _NUMBERED.fullmatch(it) and it not in known]
+    if beyond:
+        raise DataError(
+            f"{label} has {', '.join(beyond)}, but the robot has {count} joints.",
+            culprits=[f"{label}, {it}" for it in beyond],
+            next_step="Name the robot that was recorded under [robot] in session.toml, or leave "
+            "the columns of other axes out.",
+        )
+
+
+def _gains(label: str, count: int, gains_nm_a: Sequence[float]) -> FloatArray:
+    gains = np.asarray(gains_nm_a, dtype=float)
+    if gains.shape == (count,) and np.isfinite(gains).all() and (gains > 0.0).all():
+        return gains
+    raise DataError(
+        f"{label} holds currents and no torques; {count} gains above 0 [N m/A] are needed to turn "
+        f"them into torques, not {list(gains_nm_a)}.",
+        culprits=[label],
+        next_step="Give them with --gains K1,K2,...: the motor's torque constant times the gear's "
+        "ratio. From motion alone gains and masses cannot be told apart; visioncal dynamics gains "
+        "finds them by a known body on the flange.",
+    )

@@ -1,0 +1,284 @@
+"""`visioncal dynamics identify`: from a session to its dynamics, and their proof."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from visioncal.dynamics.conditioning import Conditioned, condition
+from visioncal.dynamics.identified import Identified
+from visioncal.dynamics.identify import Identification, Options, identify
+from visioncal.dynamics.reading import Recorded, read_recorded
+from visioncal.dynamics.validate import Prediction, friction_of_known, predict, validate
+from visioncal.errors import DataError, DegenerateError
+from visioncal.files import did_you_mean
+from visioncal.robot import Robot
+from visioncal.session import STREAMS, Session
+from visioncal.types import FloatArray
+
+# The share of a motion's end that is predicted where no other motion is named.
+HELD_OUT = 0.3
+# Rotors are there where with them an error of some joint's unseen torques falls to this share.
+_ROTORS = 0.75
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    Attributes:
+        streams: Names of the streams to fit; all with torques or currents where empty.
+        validate_on: The stream to predict; the end of the fastest motion where empty.
+        cutoff_hz: Of the low-pass [Hz]; by the motion where None.
+        gains_nm_a: Torque for a current, by joint, where currents were recorded [N m/A].
+        options: What is estimated.
+        rotors: Whether that are rotors, too; None where the torques shall tell: those behind the
+            gears have none in them.
+    """
+
+    streams: tuple[str, ...] = ()
+    validate_on: str = ""
+    cutoff_hz: float | None = None
+    gains_nm_a: tuple[float, ...] = ()
+    options: Options = field(default_factory=Options)
+    rotors: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """Streams without the end of the fastest motion, and that."""
+
+    rest: tuple[Conditioned, ...]
+    unseen: Conditioned
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A result with its evidence.
+
+    Attributes:
+        session: What it was identified from.
+        identified: The result.
+        identification: How it was fitted.
+        predicted: Torques that were not fitted, measured and predicted; None where there are none.
+        fitted: Those that were.
+    """
+
+    session: Session
+    identified: Identified
+    identification: Identification
+    predicted: Prediction | None
+    fitted: tuple[Prediction, ...]
+
+    @property
+    def predictions(self) -> tuple[Prediction, ...]:
+        """All of them, those that were not fitted last."""
+        return self.fitted if self.predicted is None else (*self.fitted, self.predicted)
+
+
+def identify_session(session: Session, request: Request | None = None) -> Run:
+    """Identifies the dynamics of a session's arm.
+
+    Args:
+        session: With streams of angles and torques.
+        request: What is asked for.
+
+    Raises:
+        DataError: The session has no robot or no such stream, or a stream is wrong.
+        DegenerateError: The motion cannot tell all base parameters.
+    """
+    request = Request() if request is None else request
+    robot = robot_of(session)
+    names = [it for it in torque_streams(session, request.streams) if it != request.validate_on]
+    if not names:
+        raise DataError(
+            f"session {session.name!r}: {request.validate_on} is its only stream of torques, and "
+            "what is fitted is no proof.",
+            culprits=[request.validate_on],
+            next_step="Leave --validate-on out: then the end of the motion is predicted.",
+        )
+    recorded = [_read(session, robot, it, request) for it in names]
+    streams = [_conditioned(robot, it, request) for it in recorded]
+    split = _split(robot, recorded, streams, request)
+    options = _with_rotors(robot, split, request)
+    whole = identify(robot, streams, options)
+    proof = None
+    if request.validate_on:
+        other = _read(session, robot, request.validate_on, request)
+        proof = _predicted(whole, _conditioned(robot, other, request))
+    elif split is not None:
+        of_rest = identify(robot, split.rest, replace(options, checked=False))
+        proof = _predicted(of_rest, split.unseen, "the last 30 % of ")
+    identified = replace(
+        whole.identified,
+        validation=None if proof is None else validate(whole.identified, proof),
+        facts={
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "session": {"name": session.name, "sha256": session.digest()},
+        },
+    )
+    friction = friction_of_known(whole)
+    fitted = tuple(predict(identified, it, friction) for it in streams)
+    return Run(session, identified, whole, proof, fitted)
+
+
+def validate_session(
+    session: Session, identified: Identified, request: Request
+) -> list[Prediction]:
+    """Predicts the torques of a session's streams by dynamics that were identified before.
+
+    Raises:
+        DataError: The robot is another one, there is no such stream, or a stream is wrong.
+    """
+    return [predict(identified, it) for it in conditioned_streams(session, identified, request)]
+
+
+def conditioned_streams(
+    session: Session, identified: Identified, request: Request
+) -> list[Conditioned]:
+    """Reads a session's streams, filtered as those from which an arm was identified.
+
+    Raises:
+        DataError: The robot is another one, there is no such stream, or a stream is wrong.
+    """
+    robot = identified.robot
+    names = torque_streams(session, request.streams)
+    recorded = [_read(session, robot, it, request) for it in names]
+    cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
+    filtered = replace(request, cutoff_hz=cutoff_hz)
+    return [_conditioned(robot, it, filtered) for it in recorded]
+
+
+def current_streams(
+    session: Session, robot: Robot, cutoff_hz: float | None = None
+) -> list[Conditioned]:
+    """Reads a session's streams of currents, for drives whose gains are not known.
+
+    Args:
+        session: The session.
+        robot: Its arm.
+        cutoff_hz: Of the low-pass [Hz]; by the motion where None.
+
+    Returns:
+        The streams, whose torques are currents [A].
+
+    Raises:
+        DataError: There is no stream of currents, or one is wrong.
+    """
+    request = Request(cutoff_hz=cutoff_hz, gains_nm_a=(1.0,) * robot.joint_count)
+    recorded = [_read(session, robot, it, request) for it in torque_streams(session)]
+    recorded = [it for it in recorded if it.of_currents]
+    if not recorded:
+        raise DataError(
+            f"session {session.name!r} tells torques and no currents.",
+            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            next_step="Drives whose torques are told need no gains: visioncal dynamics identify.",
+        )
+    return [condition(it, cutoff_hz) for it in recorded]
+
+
+def robot_of(session: Session) -> Robot:
+    """The session's robot.
+
+    Raises:
+        DataError: It names none that is known.
+    """
+    if session.robot_document is None:
+        raise DataError(
+            f"session {session.name!r} names no known robot.",
+            culprits=["session.toml: robot"],
+            next_step=" ".join(session.warnings) or 'Add [robot] with model = "ur10e", or a path.',
+        )
+    return Robot.from_document(session.robot_document)
+
+
+def torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
+    """Names of the streams that have torques or currents, or of those that are wanted.
+
+    Raises:
+        DataError: There is none.
+    """
+    for name in wanted:
+        if name not in session.streams:
+            raise DataError(
+                f"session {session.name!r} has no stream {name!r}; it has "
+                f"{', '.join(session.streams) or 'none'}.",
+                culprits=[name],
+                next_step=did_you_mean(name, session.streams),
+            )
+    if wanted:
+        return list(dict.fromkeys(wanted))
+    drives = ("tau1_nm", "current1_a")
+    found = [name for name, it in session.streams.items() if any(one in it for one in drives)]
+    if not found:
+        raise DataError(
+            f"session {session.name!r} has no stream with torques or currents: "
+            f"{', '.join(session.streams) or 'it has no streams'}.",
+            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            next_step=f"Put them into {STREAMS}/NAME.csv: stamp_s, q1_rad ..., and tau1_nm ... or "
+            "current1_a ....",
+        )
+    return found
+
+
+def _read(session: Session, robot: Robot, name: str, request: Request) -> Recorded:
+    (name,) = torque_streams(session, [name])
+    label = f"{STREAMS}/{name}.csv"
+    return read_recorded(session.streams[name], label, robot.joint_count, request.gains_nm_a)
+
+
+def _conditioned(robot: Robot, recorded: Recorded, request: Request) -> Conditioned:
+    return condition(recorded, request.cutoff_hz, robot.torque_nm)
+
+
+def _split(
+    robot: Robot, recorded: Sequence[Recorded], streams: Sequence[Conditioned], request: Request
+) -> _Split | None:
+    """Leaves the end of the fastest motion out; None where the rest tells too little.
+
+    Sweeps move one joint after the other: no part of them stands for the others.
+    """
+    fastest = int(np.argmax([_speed(it) for it in streams]))
+    filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
+    begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)
+    end = recorded[fastest].part(1.0 - HELD_OUT, 1.0)
+    rest = list(streams)
+    try:
+        rest[fastest] = _conditioned(robot, begin, filtered)
+        split = _Split(tuple(rest), _conditioned(robot, end, filtered))
+        identify(robot, split.rest, _quick(request.options, request.rotors is not False))
+    except (DataError, DegenerateError):
+        return None
+    return split
+
+
+def _with_rotors(robot: Robot, split: _Split | None, request: Request) -> Options:
+    """The options with rotors, where these are asked for, or predict by far better."""
+    options, rotors = request.options, request.rotors
+    if rotors is None and split is not None:
+        errors = []
+        for there in (False, True):
+            found = identify(robot, split.rest, _quick(options, there))
+            unseen = predict(found.identified, split.unseen)
+            errors.append(unseen.rms_nm(unseen.predicted_nm))
+        rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < _ROTORS)
+    return replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
+
+
+def _quick(options: Options, rotors: bool) -> Options:
+    """The same for base parameters alone."""
+    terms = replace(options.terms, motor_inertia=rotors)
+    return Options(terms, stribeck=False, consistent=False, checked=False)
+
+
+def _speed(stream: Conditioned) -> FloatArray:
+    """How fast the slowest joint is [rad/s]."""
+    speeds = np.concatenate([it.measured.motion.dq for it in stream.pieces])
+    return np.asarray(np.sqrt(np.mean(speeds**2, axis=0)).min())
+
+
+def _predicted(identification: Identification, stream: Conditioned, which: str = "") -> Prediction:
+    friction = friction_of_known(identification)
+    found = predict(identification.identified, stream, friction)
+    return replace(found, label=f"{which}{stream.label}")

@@ -1,0 +1,238 @@
+"""What breaking loose takes: Stribeck's hump of dry friction at low speeds, and how wide it is.
+
+Dry friction is `(Fc + (Fs - Fc) exp(-(dq / vs)^2)) sign(dq)`. Where friction sets in gradually, as
+torque sensors behind a gear have it, the hump is a dip: Fs is less than Fc. All but the speeds vs
+are linear, and eliminated (Golub and Pereyra 1973, variable projection, in Kaufman's form of 1975).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from visioncal.chance import chi2_limit
+from visioncal.dynamics.conditioning import Conditioned
+from visioncal.dynamics.friction import sign
+from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.regression import Block, Regression, regress
+from visioncal.estimator.descend import Linearised, descend
+from visioncal.estimator.linalg import covariance, damped_step, gram
+from visioncal.types import FloatArray, IntArray
+
+# Where the search begins, and what it stays within [rad/s].
+_STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5
+_SETTLED, _SETTLED_NOISE, _ROUNDS = 1e-6, 1e-2, 8
+# A hump is one where chance would gain as much in less than so many cases.
+_CHANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Stribeck:
+    """The humps of some joints.
+
+    Attributes:
+        joints: (a,) which joints, from 0.
+        hump_nm: (a,) Fs - Fc [N m].
+        speed_rad_s: (a,) vs [rad/s].
+        slow_rad_s: See `friction.sign`.
+    """
+
+    joints: IntArray
+    hump_nm: FloatArray
+    speed_rad_s: FloatArray
+    slow_rad_s: float
+
+    @classmethod
+    def none(cls) -> Self:
+        """No joint has one."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), 0.0)
+
+    def shapes(self, motion: Motion) -> FloatArray:
+        """(m, a) torques of a hump of 1 N m."""
+        dq = motion.dq[:, self.joints]
+        return np.asarray(sign(dq, self.slow_rad_s) * np.exp(-((dq / self.speed_rad_s) ** 2)))
+
+    def torques(self, motion: Motion) -> FloatArray:
+        """(m, n) what the humps add to the joints' friction [N m]."""
+        torques = np.zeros_like(motion.dq)
+        torques[:, self.joints] = self.hump_nm * self.shapes(motion)
+        return torques
+
+    def slopes(self, motion: Motion) -> FloatArray:
+        """(m, 2 a) derivatives by the hump, and by the logarithm of its speed."""
+        shapes = self.shapes(motion)
+        squares = (motion.dq[:, self.joints] / self.speed_rad_s) ** 2
+        return np.concatenate([shapes, 2.0 * self.hump_nm * squares * shapes], axis=1)
+
+
+def fit_stribeck(
+    streams: Sequence[Conditioned], blocks: Sequence[Block], plain: Regression, slow_rad_s: float
+) -> tuple[Stribeck, Regression]:
+    """Finds the humps that torques show.
+
+    Args:
+        streams: The samples.
+        blocks: The same, as they were fitted without humps, to which humps may look like outliers.
+        plain: That fit.
+        slow_rad_s: See `friction.sign`.
+
+    Returns:
+        The humps, and the fit with them: its parameters are those of `plain`, humps [N m], and
+        logarithms of speeds, whose values are what is left to go and mean nothing.
+    """
+    joints = np.arange(blocks[0].y.shape[1])
+    whole = _Weighted.of(streams, blocks, plain.sigmas)
+    while len(joints):
+        ones = np.ones(len(joints))
+        starts = [Stribeck(joints, ones, it * ones, slow_rad_s) for it in _STARTS]
+        tried = [_descended(whole, it) for it in starts]
+        found, fit = _polished(streams, blocks, min(tried, key=lambda it: it.cost).humps)
+        shown = _shown(found, fit)
+        if shown.all():
+            return found, fit
+        joints = joints[shown]
+    return Stribeck.none(), plain
+
+
+def _polished(
+    streams: Sequence[Conditioned], blocks: Sequence[Block], found: Stribeck
+) -> tuple[Stribeck, Regression]:
+    """Descends again under the noise that is left with humps, until that stays the same."""
+    fit = regress(_with_humps(streams, blocks, found))
+    for _ in range(_ROUNDS):
+        found = _descended(_Weighted.of(streams, blocks, fit.sigmas), found).humps
+        before, fit = fit, regress(_with_humps(streams, blocks, found))
+        pairs = zip(before.sigmas, fit.sigmas, strict=True)
+        if all(np.allclose(old, new, rtol=_SETTLED_NOISE) for old, new in pairs):
+            break
+    return found, fit
+
+
+def _shown(found: Stribeck, fit: Regression) -> FloatArray:
+    """(a,) whether a hump is above chance and within the range of speeds."""
+    count = len(found.joints)
+    sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
+    limit = float(np.sqrt(chi2_limit(_CHANCE, 2.0)))
+    inside = (found.speed_rad_s > 1.01 * _SLOWEST) & (found.speed_rad_s < 0.99 * _FASTEST)
+    return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside)
+
+
+def _descended(whole: "_Weighted", start: Stribeck) -> "_Look":
+    """The humps that a descent from some speeds finds."""
+
+    def linearise(logs: FloatArray) -> Linearised[FloatArray]:
+        look = whole.look(replace(start, speed_rad_s=np.exp(logs)))
+
+        def step(damping: float) -> FloatArray:
+            by = np.clip(damped_step(look.information, look.gradient, damping), -1.0, 1.0)
+            return np.clip(logs + by, np.log(_SLOWEST), np.log(_FASTEST))
+
+        return Linearised(logs, look.cost, step)
+
+    logs, _ = descend(np.log(start.speed_rad_s), linearise, _SETTLED)
+    return whole.look(replace(start, speed_rad_s=np.exp(logs)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Humps of given speeds at their best.
+
+    Attributes:
+        humps: They.
+        cost: What is left with them, in units of the noise.
+        information: (a, a) by the logarithms of the speeds, all else being at its best.
+        gradient: (a,) of half the cost, likewise.
+    """
+
+    humps: Stribeck
+    cost: float
+    information: FloatArray
+    gradient: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighted:
+    """The problem without humps, under given noise.
+
+    Attributes:
+        streams: The samples.
+        blocks: The same in units of the noise.
+        weights: What these were multiplied by, (k, n) a block [1/(N m)].
+        information: (p, p) by the parameters without humps.
+        right: (p,) right side of their normal equations.
+        total: Sum of the squared torques.
+    """
+
+    streams: Sequence[Conditioned]
+    blocks: tuple[Block, ...]
+    weights: tuple[FloatArray, ...]
+    information: FloatArray
+    right: FloatArray
+    total: float
+
+    @classmethod
+    def of(
+        cls, streams: Sequence[Conditioned], blocks: Sequence[Block], sigmas: Sequence[FloatArray]
+    ) -> Self:
+        """Weighs blocks by the noise of their joints."""
+        weights = tuple(it.used / sigma for it, sigma in zip(blocks, sigmas, strict=True))
+        weighted = tuple(
+            replace(it, x=it.x * weight[:, :, None], y=it.y * weight)
+            for it, weight in zip(blocks, weights, strict=True)
+        )
+        return cls(
+            streams,
+            weighted,
+            weights,
+            np.asarray(sum(gram(it.x, it.x) for it in weighted)),
+            np.asarray(sum(gram(it.x, it.y) for it in weighted)),
+            float(sum(np.sum(it.y**2) for it in weighted)),
+        )
+
+    def look(self, at: Stribeck) -> _Look:
+        """Solves for all that is linear at given speeds."""
+        count, size = len(at.joints), len(self.right)
+        a, b = self._normal(replace(at, hump_nm=np.ones(count)))
+        linear, speeds = slice(size + count), slice(size + count, None)
+        spread = covariance(a[linear, linear])
+        best = spread @ b[linear]
+        humps = best[size:]
+        cross = humps[:, None] * a[speeds, linear]
+        return _Look(
+            replace(at, hump_nm=humps),
+            self.total - float(best @ b[linear]),
+            np.outer(humps, humps) * a[speeds, speeds] - cross @ spread @ cross.T,
+            cross @ best - humps * b[speeds],
+        )
+
+    def _normal(self, humps: Stribeck) -> tuple[FloatArray, FloatArray]:
+        """Normal equations with humps and speeds behind the other parameters."""
+        count, size = len(humps.joints), len(self.right)
+        a, b = np.zeros((size + 2 * count, size + 2 * count)), np.zeros(size + 2 * count)
+        a[:size, :size], b[:size] = self.information, self.right
+        for stream, block, weight in zip(self.streams, self.blocks, self.weights, strict=True):
+            slopes = stream.filtered(humps.slopes)
+            for at, joint in enumerate(humps.joints):
+                own = [size + at, size + count + at]
+                columns = slopes[:, [at, count + at]] * weight[:, joint, None]
+                a[:size, own] += block.x[:, joint].T @ columns
+                a[np.ix_(own, own)] += columns.T @ columns
+                b[own] += columns.T @ block.y[:, joint]
+        a[size:, :size] = a[:size, size:].T
+        return a, b
+
+
+def _with_humps(
+    streams: Sequence[Conditioned], blocks: Sequence[Block], humps: Stribeck
+) -> list[Block]:
+    """Blocks with the columns of humps and of their speeds added."""
+    count = len(humps.joints)
+    added = []
+    for stream, block in zip(streams, blocks, strict=True):
+        slopes = stream.filtered(humps.slopes)
+        more = np.zeros((*block.y.shape, 2 * count))
+        for at, joint in enumerate(humps.joints):
+            more[:, joint, [at, count + at]] = slopes[:, [at, count + at]]
+        added.append(replace(block, x=np.concatenate([block.x, more], axis=2)))
+    return added

@@ -1,0 +1,128 @@
+"""How well torques are predicted that no parameter was fitted to."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from visioncal.dynamics.conditioning import Conditioned
+from visioncal.dynamics.identified import Identified, Validation
+from visioncal.dynamics.identify import Identification
+from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.regression import Block, regress, rms_of, spread_of
+from visioncal.errors import DegenerateError
+from visioncal.robot import joint_torques
+from visioncal.types import FloatArray, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Filtered torques of a stream, measured and predicted.
+
+    Attributes:
+        label: The stream's place.
+        times_s: (k,) when [s].
+        measured_nm: (k, n) [N m].
+        predicted_nm: (k, n) by the base parameters [N m].
+        consistent_nm: (k, n) by the standard parameters of bodies; None without these.
+        known_nm: (k, n) by the robot's own inertias, with the friction that goes best with them;
+            None where it has none.
+        used: (k, n) which of the torques count.
+        q: (k, n) joint angles, filtered likewise [rad].
+        dq: (k, n) their speeds [rad/s].
+    """
+
+    label: str
+    times_s: FloatArray
+    measured_nm: FloatArray
+    predicted_nm: FloatArray
+    consistent_nm: FloatArray | None
+    known_nm: FloatArray | None
+    used: Mask
+    q: FloatArray
+    dq: FloatArray
+
+    def rms_nm(self, predicted_nm: FloatArray) -> FloatArray:
+        """(n,) root mean square error of a prediction [N m]."""
+        return rms_of(predicted_nm - self.measured_nm, self.used)
+
+    @property
+    def torque_nm(self) -> FloatArray:
+        """(n,) how far the torques range, as a standard deviation [N m]."""
+        return spread_of(self.measured_nm, self.used)
+
+
+def predict(
+    identified: Identified, stream: Conditioned, own_friction: FloatArray | None = None
+) -> Prediction:
+    """Predicts a stream's torques, filtered as they are.
+
+    Args:
+        identified: The arm's dynamics.
+        stream: The samples.
+        own_friction: (f,) parameters that go best with the robot's own inertias; see
+            `friction_of_known`.
+    """
+    with_bodies = identified.consistent is not None
+    known = None
+    if own_friction is not None:
+        known = stream.filtered(partial(_known_torques, identified, own_friction))
+    return Prediction(
+        stream.label,
+        stream.times_s,
+        stream.torques_nm,
+        stream.filtered(identified.torques),
+        stream.filtered(identified.consistent_torques) if with_bodies else None,
+        known,
+        stream.used,
+        stream.filtered(lambda motion: motion.q),
+        stream.filtered(lambda motion: motion.dq),
+    )
+
+
+def validate(identified: Identified, prediction: Prediction) -> Validation:
+    """Compares predicted with measured torques."""
+    consistent, known = prediction.consistent_nm, prediction.known_nm
+    return Validation(
+        prediction.label,
+        prediction.rms_nm(prediction.predicted_nm),
+        prediction.torque_nm,
+        identified.streams[0].noise_nm,
+        None if consistent is None else prediction.rms_nm(consistent),
+        None if known is None else prediction.rms_nm(known),
+    )
+
+
+def friction_of_known(identification: Identification) -> FloatArray | None:
+    """The parameters of friction that go best with the robot's own inertias.
+
+    Returns:
+        (f,) as the model has them behind the links'; None where the robot has no inertias, or the
+        model no friction.
+    """
+    identified = identification.identified
+    robot, model = identified.robot, identified.base.model
+    if robot.inertias is None or not model.terms.symbols:
+        return None
+    blocks = []
+    for stream, block in zip(identification.streams, identification.fit.blocks, strict=True):
+        links = stream.filtered(partial(_link_torques, model))
+        x = stream.filtered(model.terms.columns)
+        blocks.append(Block(x, block.y - links, block.used, block.correlation))
+    try:
+        return regress(blocks).values
+    except np.linalg.LinAlgError as error:
+        raise DegenerateError("dynamics: the motion does not tell friction.") from error
+
+
+def _link_torques(model: DynamicModel, motion: Motion) -> FloatArray:
+    robot = model.robot
+    if robot.inertias is None:
+        return np.zeros_like(motion.q)
+    return joint_torques(robot, robot.inertias, motion.q, motion.dq, motion.ddq)
+
+
+def _known_torques(identified: Identified, friction: FloatArray, motion: Motion) -> FloatArray:
+    model = identified.base.model
+    return np.asarray(_link_torques(model, motion) + model.terms.columns(motion) @ friction)

@@ -1,0 +1,156 @@
+"""How the links of an arm resist being moved: mass, first moments and second moments."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visioncal.files import Table
+from visioncal.robot.chain import number_list
+from visioncal.robot.loads import MASS_KEYS, Masses
+from visioncal.transforms import skew
+from visioncal.types import FloatArray
+
+# What a joint's table says of its link's inertia, beside its mass.
+INERTIA_KEY = "inertia_kg_m2"
+# The ten parameters of a body; {} is the number of its joint.
+PARAMETER_NAMES = (
+    "m{0}",
+    "m{0}*cx{0}",
+    "m{0}*cy{0}",
+    "m{0}*cz{0}",
+    "Ixx{0}",
+    "Ixy{0}",
+    "Iyy{0}",
+    "Ixz{0}",
+    "Iyz{0}",
+    "Izz{0}",
+)
+# Where xx, xy, yy, xz, yz, zz stand in a symmetric matrix.
+_ROWS, _COLUMNS = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
+
+
+@dataclass(frozen=True, eq=False)
+class Inertias:
+    """The inertial parameters of an arm's n links.
+
+    Attributes:
+        values: (n, 10) of what moves with each joint: mass [kg], first moments [kg m], and the
+            inertia xx, xy, yy, xz, yz, zz [kg m^2]; in the joint's frame after its motion and
+            about that frame's origin.
+    """
+
+    values: FloatArray
+
+    @classmethod
+    def of_bodies(cls, kg: FloatArray, centres_m: FloatArray, about: FloatArray) -> "Inertias":
+        """Of masses (n,) [kg], centres (n, 3) [m] and inertias about these (n, 3, 3) [kg m^2]."""
+        turned = np.array([skew(it) for it in centres_m])
+        about_origin = about - kg[:, None, None] * turned @ turned
+        moments = kg[:, None] * centres_m
+        return cls(np.column_stack([kg, moments, entries(about_origin)]))
+
+    @property
+    def masses(self) -> Masses:
+        """Masses and their centres; the centre of what weighs nothing is the frame's origin."""
+        kg = self.values[:, 0]
+        weighs = np.where(kg == 0.0, 1.0, kg)
+        return Masses(kg, np.where(kg[:, None] == 0.0, 0.0, self.values[:, 1:4] / weighs[:, None]))
+
+    @property
+    def about_centres(self) -> FloatArray:
+        """(n, 3, 3) inertias about the centres of mass, along the frames' axes [kg m^2]."""
+        masses = self.masses
+        turned = np.array([skew(it) for it in masses.centres_m])
+        found = matrices(self.values[:, 4:]) + masses.kg[:, None, None] * turned @ turned
+        return np.asarray(found)
+
+    @property
+    def consistent(self) -> bool:
+        """Whether each link can be a body: its pseudo-inertia is not negative (Wensing 2018)."""
+        eigenvalues = np.linalg.eigvalsh(pseudo_inertias(self.values))
+        return bool((eigenvalues[:, 0] >= -1e-12 * np.abs(eigenvalues[:, -1])).all())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The joints' entries in a description whose rows are the joints' frames."""
+        about = entries(self.about_centres).tolist()
+        rows = zip(self.masses.rows(), about, strict=True)
+        return [mass | {INERTIA_KEY: it} for mass, it in rows]
+
+
+def entries(full: FloatArray) -> FloatArray:
+    """The (..., 6) xx, xy, yy, xz, yz, zz of (..., 3, 3) symmetric matrices."""
+    return np.asarray(full[..., _ROWS, _COLUMNS])
+
+
+def matrices(six: FloatArray) -> FloatArray:
+    """(..., 3, 3) symmetric matrices of their (..., 6) xx, xy, yy, xz, yz, zz."""
+    full = np.empty((*six.shape[:-1], 3, 3))
+    full[..., _ROWS, _COLUMNS] = full[..., _COLUMNS, _ROWS] = six
+    return full
+
+
+def pseudo_inertias(values: FloatArray) -> FloatArray:
+    """Writes (..., 10) inertial parameters as pseudo-inertias.
+
+    A body moved by (4, 4) X has X P X^T; parameters are those of a body where it is positive
+    (Wensing, Kim and Slotine 2018, Linear matrix inequalities for physically consistent inertial
+    parameter identification).
+
+    Returns:
+        (..., 4, 4) second moments of the mass [kg m^2], bordered by its first moments and itself.
+    """
+    inertia = matrices(values[..., 4:])
+    half = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)
+    pseudo = np.empty((*values.shape[:-1], 4, 4))
+    pseudo[..., :3, :3] = half[..., None, None] * np.eye(3) - inertia
+    pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
+    pseudo[..., 3, 3] = values[..., 0]
+    return pseudo
+
+
+def parameters_of(pseudo: FloatArray) -> FloatArray:
+    """The (..., 10) inertial parameters of (..., 4, 4) pseudo-inertias."""
+    second = pseudo[..., :3, :3]
+    trace = np.trace(second, axis1=-2, axis2=-1)
+    inertia = trace[..., None, None] * np.eye(3) - second
+    mass, moments = pseudo[..., 3, 3][..., None], pseudo[..., :3, 3]
+    return np.concatenate([mass, moments, entries(inertia)], axis=-1)
+
+
+def moving(link_from_body: FloatArray) -> FloatArray:
+    """(10, 10) matrix that takes a body's parameters in its own frame to those in a link's.
+
+    Args:
+        link_from_body: (4, 4) the body's frame in the link's [m].
+    """
+    units = pseudo_inertias(np.eye(10))
+    return np.asarray(parameters_of(link_from_body @ units @ link_from_body.T).T)
+
+
+def inertias_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Inertias | None:
+    """Reads `mass_kg`, `com_m` and `inertia_kg_m2` of a table of joints.
+
+    Args:
+        rows: The joints' tables. An inertia is xx, xy, yy, xz, yz, zz about the centre of mass,
+            along the axes of the frame in which the row ends [kg m^2].
+        joint_from_row: (n, 4, 4) these frames in the joints' frames after their motion.
+
+    Returns:
+        The inertias; None where no joint tells one, or none its mass.
+
+    Raises:
+        DataError: Some joints tell their inertia and others do not, or it is no list of numbers.
+    """
+    if not all(any(key in row.content for row in rows) for key in (INERTIA_KEY, MASS_KEYS[0])):
+        return None
+    kg = np.array([row.number(MASS_KEYS[0]) for row in rows])
+    centres = np.array([number_list(row, MASS_KEYS[1], 3) for row in rows])
+    about = matrices(np.array([number_list(row, INERTIA_KEY, 6) for row in rows]))
+    rotation, place = joint_from_row[:, :3, :3], joint_from_row[:, :3, 3]
+    return Inertias.of_bodies(
+        kg,
+        (rotation @ centres[:, :, None])[:, :, 0] + place,
+        rotation @ about @ np.swapaxes(rotation, 1, 2),
+    )

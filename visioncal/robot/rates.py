@@ -1,0 +1,51 @@
+"""How fast and how strong the joints of an arm are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visioncal.files import Table
+from visioncal.types import FloatArray
+
+# What a joint's table says of its drive.
+RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """The limits of an arm's drives; inf where nothing is said.
+
+    Of a prismatic joint they are m/s, m/s^2 and N.
+
+    Attributes:
+        velocity: (n,) greatest speeds [rad/s].
+        acceleration: (n,) greatest accelerations [rad/s^2].
+        torque: (n,) greatest torques [N m].
+    """
+
+    velocity: FloatArray
+    acceleration: FloatArray
+    torque: FloatArray
+
+    @classmethod
+    def of_rows(cls, rows: Sequence[Table]) -> "Rates":
+        """Reads the limits from a table of joints.
+
+        Raises:
+            DataError: One is not above zero.
+        """
+        found = [
+            [row.number(key, positive=True) if key in row.content else np.inf for key in RATE_KEYS]
+            for row in rows
+        ]
+        return cls(*np.array(found).T)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The joints' entries in a description."""
+        columns = np.stack([self.velocity, self.acceleration, self.torque], axis=1)
+        return [
+            {key: float(it) for key, it in zip(RATE_KEYS, row, strict=True) if np.isfinite(it)}
+            for row in columns
+        ]

@@ -1,0 +1,122 @@
+"""Motions of a simulated arm, and what its controller records of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.session import Session, Stream
+from visioncal.simulation.dynamics import DynamicArm, drive_torques
+from visioncal.types import FloatArray
+
+_HARMONICS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Exercise:
+    """A motion: (m,) times [s], and (m, n) angles [rad], speeds and accelerations."""
+
+    times_s: FloatArray
+    q: FloatArray
+    dq: FloatArray
+    ddq: FloatArray
+
+
+@dataclass(frozen=True)
+class Senses:
+    """How well a controller records.
+
+    Attributes:
+        q_rad: Noise of the angles, as a standard deviation [rad].
+        dq_rad_s: That of the speeds; None where none are recorded [rad/s].
+        torque_share: That of the torques, as a share of their root mean square by joint.
+        torque_nm: What is added to it, whatever the torques are [N m].
+        gains_nm_a: (n,) torque for a current; currents are recorded in the place of torques where
+            it is told [N m/A].
+    """
+
+    q_rad: float = 1e-5
+    dq_rad_s: float | None = 1e-3
+    torque_share: float = 0.03
+    torque_nm: float = 0.0
+    gains_nm_a: tuple[float, ...] = ()
+
+
+def multi_sine(
+    count: int,
+    rng: np.random.Generator,
+    *,
+    seconds: float = 20.0,
+    rate_hz: float = 500.0,
+    speed_rad_s: float = 2.0,
+) -> Exercise:
+    """A periodic motion of all of `count` joints, of five harmonics each, at random.
+
+    Args:
+        count: The number of joints.
+        rng: Source of randomness.
+        seconds: Its length, which is one period.
+        rate_hz: Samples a second.
+        speed_rad_s: The highest speed of each joint.
+    """
+    times_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    omega = 2.0 * np.pi / seconds * np.arange(1, _HARMONICS + 1)
+    turns = omega[:, None] * times_s
+    size = rng.standard_normal((2, count, _HARMONICS)) / omega
+    sines, cosines = np.sin(turns), np.cos(turns)
+    dq = (size[0] * omega) @ cosines - (size[1] * omega) @ sines
+    size *= (speed_rad_s / np.abs(dq).max(axis=1))[:, None]
+    middle = rng.uniform(-1.0, 1.0, (count, 1))
+    return Exercise(
+        times_s,
+        (middle + size[0] @ sines + size[1] @ cosines).T,
+        ((size[0] * omega) @ cosines - (size[1] * omega) @ sines).T,
+        (-(size[0] * omega**2) @ sines - (size[1] * omega**2) @ cosines).T,
+    )
+
+
+def slow_sweep(
+    count: int,
+    rng: np.random.Generator,
+    *,
+    seconds: float = 60.0,
+    rate_hz: float = 500.0,
+    speed_rad_s: float = 0.15,
+) -> Exercise:
+    """Every joint to and fro at up to a low speed, which it passes from rest again and again."""
+    times_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    omega = 2.0 * np.pi * rng.uniform(0.1, 0.15, count)
+    turns = omega * times_s[:, None] + rng.uniform(0.0, 2.0 * np.pi, count)
+    middle, size = rng.uniform(-1.0, 1.0, count), speed_rad_s / omega
+    return Exercise(
+        times_s,
+        middle + size * np.sin(turns),
+        size * omega * np.cos(turns),
+        -size * omega**2 * np.sin(turns),
+    )
+
+
+def record(
+    built: DynamicArm, done: Exercise, rng: np.random.Generator, senses: Senses | None = None
+) -> Stream:
+    """What the controller records of a motion, with noise."""
+    senses = Senses() if senses is None else senses
+    torques = drive_torques(built, done.q, done.dq, done.ddq)
+    sigma = senses.torque_share * np.sqrt(np.mean(torques**2, axis=0)) + senses.torque_nm
+    torques = torques + sigma * rng.standard_normal(torques.shape)
+    groups = {"q{}_rad": done.q + senses.q_rad * rng.standard_normal(done.q.shape)}
+    if senses.dq_rad_s is not None:
+        groups["dq{}_rad_s"] = done.dq + senses.dq_rad_s * rng.standard_normal(done.dq.shape)
+    if senses.gains_nm_a:
+        groups["current{}_a"] = torques / np.array(senses.gains_nm_a)
+    else:
+        groups["tau{}_nm"] = torques
+    numbers = range(1, done.q.shape[1] + 1)
+    columns = ("stamp_s", *(name.format(it) for name in groups for it in numbers))
+    return Stream(columns, np.column_stack([done.times_s, *groups.values()]))
+
+
+def exercise_session(robot: str, streams: Mapping[str, Stream], name: str = "exercise") -> Session:
+    """A session of motions alone, without views."""
+    document = {"schema": 1, "name": name, "robot": {"model": robot}}
+    return Session.of_streams(document, streams)
