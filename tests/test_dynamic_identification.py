@@ -6,21 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moved_arms import recorded, robot_with_bodies, true_base
+from moved_arms import changed, recorded, robot_with_bodies, true_base
 
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
+from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.reading import Recorded
+from visioncal.dynamics.reading import Recorded, read_recorded
+from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.untold import untold
 from visioncal.dynamics.validate import friction_of_known, predict, validate
 from visioncal.errors import DegenerateError
 from visioncal.robot import load_robot
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
-from visioncal.simulation.exercise import Senses, multi_sine, slow_sweep
+from visioncal.simulation.exercise import Exercise, Senses, multi_sine, record, slow_sweep
 
 PANDA = Path(__file__).parents[2] / "shared" / "data" / "dyn_franka_panda"
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=SLOW_RAD_S)
@@ -107,6 +109,29 @@ def test_breaking_loose_is_found():
     assert np.sqrt(np.diag(spread)[6:]).max() < 0.05
 
 
+def test_planned_sweeps_tell_friction():
+    """Joints move one at a time, and those at rest are held by what nothing foretells."""
+    rng = np.random.default_rng(3)
+    built = real_dynamics("ur5e", rng, stribeck=True)
+    plan = plan_sweeps(allowed_motion(load_robot("ur5e"), Share()), SweepRequest(speeds=4))
+    swept = plan.sampled(500.0)
+    sweeps = record(built, Exercise(swept.times_s, swept.q, swept.dq, swept.ddq), rng)
+    resting = {f"tau{it}_nm": np.abs(swept.dq[:, it - 1]) < 1e-9 for it in range(1, 7)}
+
+    def hold(columns):
+        for joint, (name, rests) in enumerate(resting.items()):
+            columns[name][rests] += 0.8 * built.gears.coulomb[joint]
+
+    held = condition(read_recorded(changed(sweeps, hold), "streams/sweeps.csv", 6))
+    streams = [recorded(built, multi_sine(6, rng), rng), held]
+    result = identify(known_arm(), streams, replace(PLAIN, stribeck=True)).identified
+    names = [result.base.model.names[it] for it in result.base.independent]
+    friction = result.values[[names.index(f"Fv{it}") for it in range(1, 7)]]
+    # Four speeds there and back, each held for a second or so, at 3 % of noise.
+    assert friction == pytest.approx(built.gears.viscous, rel=0.03)
+    assert (result.streams[1].rms_nm < 0.02 * result.streams[1].torque_nm).all()
+
+
 def test_an_arm_without_humps_gets_none(worlds):
     built, _, _, _ = worlds[0]
     rng = np.random.default_rng(7)
@@ -124,6 +149,37 @@ def test_joints_that_stand_still_are_named():
     with pytest.raises(DegenerateError, match=r"joint 4 \(wrist_1_joint\) stands still") as told:
         identify(known_arm(), [recorded(built, done, rng)])
     assert "visioncal dynamics plan" in told.value.next_step
+
+
+def test_torques_of_joints_at_rest_count_for_nothing():
+    """Three seconds at rest, where friction holds the joints by torques that nothing foretells."""
+    rng = np.random.default_rng(10)
+    built, moved = real_dynamics("ur5e", rng), multi_sine(6, rng)
+    rise = np.clip((moved.times_s - 3.0) / 2.0, 0.0, 1.0)[:, None]
+    # A blend of fifth order, and its derivatives.
+    blend = rise**3 * (10.0 - 15.0 * rise + 6.0 * rise**2)
+    slope = 15.0 * rise**2 * (1.0 - rise) ** 2
+    curve = 15.0 * rise * (1.0 - rise) * (1.0 - 2.0 * rise)
+    away = moved.q - moved.q.mean(axis=0)
+    done = replace(
+        moved,
+        q=moved.q.mean(axis=0) + blend * away,
+        dq=slope * away + blend * moved.dq,
+        ddq=curve * away + 2.0 * slope * moved.dq + blend * moved.ddq,
+    )
+    stream = record(built, done, rng)
+    held = built.gears.coulomb * rng.uniform(-0.9, 0.9, 6)
+
+    def hold(columns):
+        for joint in range(6):
+            columns[f"tau{joint + 1}_nm"][moved.times_s < 3.0] += held[joint]
+
+    sound = condition(read_recorded(changed(stream, hold), "streams/robot.csv", 6))
+    assert not sound.used[sound.times_s < 2.5].any()
+    result = identify(known_arm(), [sound], PLAIN).identified
+    off = result.values - true_base(result.base, built)
+    # As for motions that never rest.
+    assert off @ np.linalg.solve(result.covariance, off) / len(off) < 1.9
 
 
 def test_motion_about_one_line_is_named():

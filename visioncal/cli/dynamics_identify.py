@@ -165,7 +165,7 @@ def _joint_table(identified: Identified) -> Table:
     values = dict(zip(names, identified.values.tolist(), strict=True))
     humps = {row["joint"]: row for row in stribeck_rows(identified)}
     joints = range(1, identified.robot.joint_count + 1)
-    columns: dict[str, list[float | None]] = {"fitted": [*identified.streams[0].rms_nm]}
+    columns: dict[str, list[float | None]] = {"fitted": [*identified.fitted_rms_nm]}
     validation = identified.validation
     if validation is not None:
         columns["predicted"] = [*validation.rms_nm]
@@ -186,7 +186,7 @@ def _joint_table(identified: Identified) -> Table:
 
 def _tell_prediction(identified: Identified, prediction: Prediction) -> None:
     found = validate(identified, prediction)
-    fitted = identified.streams[0].rms_nm
+    fitted = identified.fitted_rms_nm
     table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
     for joint, name in enumerate(identified.robot.joint_names):
         table.add_row(

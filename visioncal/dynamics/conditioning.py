@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
 
 from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.motion import Measured, Motion
@@ -17,14 +17,17 @@ from visioncal.files import some_of
 from visioncal.types import FloatArray, Mask
 
 # Torques of a rigid arm have all but their friction's corners within so many times the band of its
-# motion; below so many a second there is little to tell noise by [Hz].
-_TORQUE_BAND, _LEAST_HZ = 10.0, 4.0
+# motion; below so many a second there is little to tell noise by, and beyond the other gears and
+# links swing by themselves [Hz]. Motions are smoothed no less than so many times wider.
+_TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
 # Samples farther apart than so many times the usual, and than so much [s], have others missing
 # between them; steps that differ by more than this share of the usual are resampled.
 _GAP, _GAP_S, _JITTER = 2.5, 0.02, 0.02
 # Torques at rest on an extreme for so many samples on end, within this share of it, are cut off.
 _FLAT_SAMPLES, _FLAT = 5, 1e-6
 _MOST_AT_LIMIT = 0.2
+# A joint that is slower than this in the mean of so long, for so long, stands still [rad/s], [s].
+_REST_RAD_S, _REST_S = 1e-3, 0.1
 # Torques that stand out from their neighbours by so many times what is usual, and by this share of
 # their range, are slips of the line.
 _SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
@@ -40,7 +43,7 @@ class Piece:
 
     Attributes:
         measured: The samples.
-        bad: (m, n) torques that are none.
+        bad: (m, n) torques that tell nothing: cut off, or of a joint that stands still.
         lowpass: For torques and regressor alike.
     """
 
@@ -148,7 +151,8 @@ def condition(
 
     Args:
         recorded: The stream's samples.
-        cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's band where None.
+        cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's band, 4 to 10 Hz,
+            where None.
         limits_nm: (n,) torques beyond which the drives give none [N m], where known.
 
     Raises:
@@ -161,10 +165,11 @@ def condition(
     longest = max(parts, key=lambda it: len(it[0]))[0]
     rate_hz = (len(longest) - 1) / float(longest.times_s[-1] - longest.times_s[0])
     band_hz = band_of(longest.q, rate_hz)
-    cutoff = max(_TORQUE_BAND * band_hz, _LEAST_HZ) if cutoff_hz is None else cutoff_hz
-    cutoff = min(cutoff, 0.25 * rate_hz)
+    usual = min(max(_TORQUE_BAND * band_hz, _LEAST_HZ), _MOST_HZ)
+    cutoff = min(usual if cutoff_hz is None else cutoff_hz, 0.25 * rate_hz)
     lowpass = LowPass.of(cutoff, rate_hz)
-    window = window_of(max(WIDER * band_hz, cutoff), rate_hz, len(longest))
+    smoothing = min(max(WIDER * band_hz, cutoff), _WIDEST * cutoff)
+    window = window_of(smoothing, rate_hz, len(longest))
     pieces, good = [], True
     for part, wrong in parts:
         if len(part) < len(lowpass.taps) + 2 * window:
@@ -173,7 +178,8 @@ def condition(
         good &= agree
         inner = slice(window // 2, -(window // 2))
         measured = Measured(motion.chosen(inner), part.torques_nm[inner])
-        pieces.append(Piece(measured, wrong[inner], lowpass))
+        resting = _resting(measured.motion, rate_hz)
+        pieces.append(Piece(measured, wrong[inner] | resting, lowpass))
     if not pieces:
         span_s = (len(lowpass.taps) + 2 * window) / rate_hz
         raise DataError(
@@ -188,6 +194,13 @@ def condition(
             "were left out. Are they in rad/s, measured, and not delayed?"
         )
     return Conditioned(recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes))
+
+
+def _resting(motion: Motion, rate_hz: float) -> Mask:
+    """(m, n) where a joint stands: there friction holds it by any torque up to its bound."""
+    samples = max(round(_REST_S * rate_hz), 1)
+    slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < _REST_RAD_S
+    return np.asarray(binary_opening(slow, np.ones((samples, 1), dtype=bool)))
 
 
 def _even_parts(recorded: Recorded, bad: Mask, notes: list[str]) -> Iterator[tuple[Recorded, Mask]]:

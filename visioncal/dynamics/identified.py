@@ -144,6 +144,11 @@ class Identified:
         return np.asarray(np.sqrt(np.diag(self.covariance)[: self.base.rank]))
 
     @property
+    def fitted_rms_nm(self) -> FloatArray:
+        """(n,) residuals of what was fitted, of the worst stream, as a root mean square [N m]."""
+        return np.asarray(np.max([it.rms_nm for it in self.streams], axis=0))
+
+    @property
     def determined(self) -> tuple[str, ...]:
         """How well each base parameter is told: to `2 %` of itself, `10 %`, worse, or not."""
         shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)

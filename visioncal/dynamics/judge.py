@@ -65,7 +65,7 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[Status, str]]:
         f"The torques of {validation.label} are predicted to {_percents(shares)} of their range "
         f"(joints 1 to {len(shares)}).",
     )
-    fitted = np.sqrt(np.mean([it.rms_nm**2 for it in identified.streams], axis=0))
+    fitted = identified.fitted_rms_nm
     surprised = validation.rms_nm > _WORSE * np.maximum(fitted, validation.noise_nm)
     if surprised.any():
         yield (

@@ -20,8 +20,8 @@ from visioncal.errors import DataError
 from visioncal.robot import Inertias, Robot, joint_torques
 from visioncal.types import FloatArray, IntArray
 
-# So many samples are enough to tell.
-_SAMPLES = 250
+# So many samples are enough to tell, and fewer than these, as of sweeps of single joints, are not.
+_SAMPLES, _LEAST = 250, 100
 # A mistake is named where undoing it divides the unexplained power of the torques by this much, and
 # leaves of the joints concerned no more than this share.
 _BETTER, _LEFT = 10.0, 0.5
@@ -65,7 +65,10 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     """
     robot = base.model.robot
     for stream in streams:
-        as_it_is = _as_it_is(robot, _some(stream))
+        measured = _some(stream)
+        if len(measured) < _LEAST:
+            continue
+        as_it_is = _as_it_is(robot, measured)
         found = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
         if found is not None:
             raise DataError(
@@ -77,7 +80,7 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
 
 
 def _some(stream: Conditioned) -> Measured:
-    """Samples from all over a stream, as they were before the filter."""
+    """Samples from all over a stream at which all joints move, as they were before the filter."""
     piece = max(stream.pieces, key=lambda it: len(it.measured))
     good = np.flatnonzero(~piece.bad.any(axis=1))
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])

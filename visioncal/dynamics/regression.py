@@ -175,8 +175,9 @@ def _decomposed(block: Block) -> list[_Joint]:
         for begin in range(0, len(x), _CHUNK):
             some = slice(begin, begin + _CHUNK)
             chunk = np.column_stack([x[some][:, columns], block.y[some, joint]])[rows[some]]
-            (triangle,) = qr(np.concatenate([triangle, chunk]), mode="r", overwrite_a=True)
-            triangle = triangle[: len(columns) + 1]
+            if len(chunk):
+                (triangle,) = qr(np.concatenate([triangle, chunk]), mode="r", overwrite_a=True)
+                triangle = triangle[: len(columns) + 1]
         found.append(_Joint(columns, triangle, int(rows.sum())))
     return found
 
