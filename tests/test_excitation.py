@@ -286,7 +286,7 @@ def test_limits_that_leave_nothing_are_named():
         excite(flooded, QUICK)
     assert "floor" in told.value.culprits
     weak = allowed_motion(small_arm(torque_nm=0.5), Share())
-    with pytest.raises(DegenerateError, match="torque of joint_2"):
+    with pytest.raises(DegenerateError, match="torque of joint_"):
         excite(weak, replace(QUICK, harmonics=3))
 
 

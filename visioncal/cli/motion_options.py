@@ -59,7 +59,7 @@ Seconds: TypeAlias = Annotated[
     float,
     typer.Option(
         "--seconds",
-        help="How long to search, in s of one core; the first descent is always ended.",
+        help="How long to search, in s of one core; longer until a motion is found.",
         rich_help_panel=_MOTION,
     ),
 ]

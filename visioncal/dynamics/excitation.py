@@ -32,10 +32,14 @@ from visioncal.types import FloatArray, Progress
 SHORTEST_S, LONGEST_S = 10.0, 30.0
 FEWEST, MOST = 3, 10
 # Sharpness of the condition and price of breaches, round by round.
-_ROUNDS = ((1.0, 10.0), (4.0, 40.0), (12.0, 160.0), (30.0, 640.0))
-_MEMORY = 20
+_ROUNDS = ((1.0, 10.0), (4.0, 80.0), (15.0, 640.0))
 # Random motions use this share of the limits, and start from one of so many random postures.
 _MODEST, _POSTURES = 0.5, 2000
+# They are halved so many times, at most, until they are clear of everything: a descent that begins
+# within a body may never come out of it.
+_HALVINGS, _CLEAR_HZ = 8, 10.0
+# Where no motion was found that keeps all limits, so many starts are made although the time is up.
+_LEAST_STARTS = 4
 # A motion that breaks a limit is made smaller by this, so many times, before it is given up.
 _SMALLER, _TRIES = 0.97, 5
 # Figures do not change with more samples than these.
@@ -54,8 +58,8 @@ class ExcitationRequest:
         period_s: How long it lasts [s].
         harmonics: How many harmonics of that period it has.
         terms: The friction that is to be told besides the inertias.
-        seconds: How long it is searched for [s of one core's time]; the first descent is ended
-            even if it takes longer.
+        seconds: How long it is searched for [s of one core's time]; descents are ended even if
+            they take longer, until a motion is found.
         seed: Of the random motions that the search starts from.
         starts: The most of them.
         steps: The most of each round of a descent.
@@ -157,8 +161,8 @@ class _Search:
 
     def run(self) -> Excitation:
         request, starts = self._request, 0
-        while starts < request.starts and (starts == 0 or self._left_s > 0.0):
-            self._keep(self._descend(self._start(), hurry=starts > 0))
+        while starts < request.starts and (self._left_s > 0.0 or self._is_needed(starts)):
+            self._keep(self._descend(self._start(), hurry=not self._is_needed(starts)))
             starts += 1
         if self._best is None:
             raise DegenerateError(
@@ -173,6 +177,10 @@ class _Search:
         return Excitation(
             request, self._base, self._weights, *found, time.process_time() - self._begin
         )
+
+    def _is_needed(self, starts: int) -> bool:
+        """Whether another start is made although the time is up."""
+        return self._best is None and starts < _LEAST_STARTS
 
     @property
     def _left_s(self) -> float:
@@ -196,9 +204,9 @@ class _Search:
                 free,
                 args=(sharpness, price),
                 jac=True,
-                method="L-BFGS-B",
+                method="BFGS",
                 callback=look,
-                options={"maxiter": self._request.steps, "maxcor": _MEMORY},
+                options={"maxiter": self._request.steps},
             )
             free = found.x
         return free
@@ -221,7 +229,14 @@ class _Search:
         return condition_of(self._base, series.sampled(_FIGURES_HZ), self._weights)
 
     def _start(self) -> FloatArray:
-        return self._modest(self._posture())
+        """A random motion (k,) that is clear of everything, or nearly at rest."""
+        motion = self._modest(self._posture())
+        for _ in range(_HALVINGS):
+            way = motion.sampled(_CLEAR_HZ).q
+            if (self._allowed.collisions.first_contact(way) < 0).all():
+                break
+            motion = motion.shrunk(0.5)
+        return motion.free.ravel()
 
     def _posture(self) -> FloatArray:
         """A random posture that is clear of everything (n,) [rad]."""
@@ -242,8 +257,8 @@ class _Search:
             next_step="Look at --floor, --box and --clearance-mm, and at the base's frame.",
         )
 
-    def _modest(self, posture: FloatArray) -> FloatArray:
-        """A random motion (k,) from a posture, well within the limits of joints and drives."""
+    def _modest(self, posture: FloatArray) -> Series:
+        """A random motion from a posture, well within the limits of joints and drives."""
         allowed, resting = self._allowed, self._harmonics.resting
         orders = np.arange(1.0, self._harmonics.count + 1.0)
         sizes = 1.0 / np.concatenate([[np.inf], orders, orders])
@@ -260,11 +275,11 @@ class _Search:
             )
         ]
         scaled = _MODEST * np.min(shares, axis=0)[:, None] * free
-        return np.asarray(scaled + np.outer(posture, resting[0])).ravel()
+        return Series(self._harmonics, scaled + np.outer(posture, resting[0]))
 
     def _random(self) -> Condition:
         """The median condition of random motions, which nobody optimised."""
-        drawn = [self._figures(self._objective.series(self._start())) for _ in range(_COMPARED)]
+        drawn = [self._figures(self._modest(self._posture())) for _ in range(_COMPARED)]
         figures = np.median([(it.weighted, it.scaled, it.raw) for it in drawn], axis=0)
         return Condition(*figures.tolist())
 

@@ -14,7 +14,7 @@ from visioncal.types import FloatArray
 
 # Samples for each of the highest harmonic's periods: torques hold products of few of them. Limits
 # and distances are looked at more often.
-_SAMPLES, _LOOKS = 14, 2
+_SAMPLES, _LOOKS = 10, 3
 # Dry friction is spread over this share of the greatest speed: else its sense jumps at a sample.
 _SPREAD = 0.03
 # Steps of the derivatives [rad and its rates]: far above rounding, and the regressor bends little.
