@@ -5,12 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cells import calibrated, session_of
 from commands import visioncal
 
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.errors import DataError, DegenerateError
 from visioncal.session import Session
+from visioncal.simulation import CellOptions, charuco_target, simulate
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
@@ -23,6 +25,7 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
+from visioncal.simulation.records import pose_row
 from visioncal.transforms import exp, invert, log
 from visioncal.types import Target
 
@@ -309,6 +312,28 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
     cell = replace(cell, sights=tuple(kept))
     with pytest.raises(DegenerateError, match="cam_right may be in two places: target_floor looks"):
         aligned(cell)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_one_camera_on_one_robot_gives_what_calibrate_gives(mount):
+    # A board whose size is known: one of the two would hold it, and the other weigh it.
+    target = replace(charuco_target(), square_sigma_m=1e-8)
+    cell = simulate(CellOptions(mount=mount, views=15, target=target))
+    session = session_of(cell)
+    views = [
+        replace(view, numbers={**view.numbers, **pose_row(pose)})
+        for view, pose in zip(session.views, cell.base_from_flange, strict=True)
+    ]
+    found = align(replace(session, views=tuple(views)), corners=dict(enumerate(cell.corners)))
+    edges = calibrated(cell, joints_rad=None, robot=None).solved.edges
+    names = {
+        "eye-in-hand": ("flange_from_cam", "cell_from_target"),
+        "eye-to-hand": ("cell_from_cam", "flange_from_target"),
+    }[mount]
+    for name, matrix in zip(names, (edges.x, edges.z), strict=True):
+        away = log(invert(matrix) @ found.edges[name].matrix)
+        # The same but for how levels of noise are estimated: a fraction of a sigma.
+        assert np.all(np.abs(away) < 0.3 * np.sqrt(np.diag(found.edges[name].covariance)))
 
 
 def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path):
