@@ -284,6 +284,15 @@ def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
     assert "put a board on flange_b and let cam_left, cam_right see it" in caught.value.next_step
 
 
+def test_few_stops_are_said_to_be_few():
+    cell = simulate_network(NetworkOptions(stops=6))
+    found = aligned(cell)
+    assert found.verdict.status == "check"
+    assert "6 stops leave little to check the result with" in found.verdict.reasons[0]
+    with pytest.raises(DegenerateError, match=r"too few, too much alike, or wrong .* 2 have any"):
+        aligned(simulate_network(NetworkOptions(stops=2)))
+
+
 def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     wall = BoardAt("wall", place_m=(3.0, 0.0, 0.05))
     apart = CameraAt("apart", place_m=(3.0, -1.0, 1.1), looks_at_m=(3.0, 0.0, 0.05))
