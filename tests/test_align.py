@@ -156,6 +156,16 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert np.linalg.norm(away[3:]) < 2.5e-4
 
 
+def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
+    cell = simulate_network(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
+    found = aligned(cell)
+    (words,) = [it for it in found.verdict.reasons if "pushed" in it]
+    assert "by way of flange_b from stop 10 on" in words
+    assert "as if base_b had been pushed by 5" in words
+    assert not found.moved
+    assert off(cell, found, "base_a", "base_b")[1] < 22.0
+
+
 def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
     boards = (
         replace(FLOOR, target=ALIKE),
