@@ -156,6 +156,16 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert np.linalg.norm(away[3:]) < 2.5e-4
 
 
+def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
+    cell = simulate_network(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
+    found = aligned(cell)
+    (words,) = [it for it in found.verdict.reasons if "pushed" in it]
+    assert "by way of flange_b from stop 10 on" in words
+    assert "as if base_b had been pushed by 5" in words
+    assert not found.moved
+    assert off(cell, found, "base_a", "base_b")[1] < 22.0
+
+
 def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
     boards = (
         replace(FLOOR, target=ALIKE),
@@ -282,6 +292,15 @@ def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
     with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
         aligned(cell)
     assert "put a board on flange_b and let cam_left, cam_right see it" in caught.value.next_step
+
+
+def test_few_stops_are_said_to_be_few():
+    cell = simulate_network(NetworkOptions(stops=6))
+    found = aligned(cell)
+    assert found.verdict.status == "check"
+    assert "6 stops leave little to check the result with" in found.verdict.reasons[0]
+    with pytest.raises(DegenerateError, match=r"too few, too much alike, or wrong .* 2 have any"):
+        aligned(simulate_network(NetworkOptions(stops=2)))
 
 
 def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():

@@ -9,15 +9,18 @@ import numpy as np
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
 from visioncal.chance import chi2_limit
+from visioncal.estimator.closure import deviations
 from visioncal.estimator.network import Network
 from visioncal.estimator.networkfit import by_noise_alone
 from visioncal.figures import figure
-from visioncal.transforms import pose_difference
+from visioncal.transforms import mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
 
 # An image fits another stop where it is as near to what is predicted there as noise may put it,
 # which it is by chance at one stop in so many.
 _CHANCE = 1e-3
+# A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
+_FEWEST_STOPS, _ALIKE = 3, 0.5
 # Poses of one robot are exchanged where so many observations of the stops say so.
 _FEWEST = 2
 
@@ -110,6 +113,41 @@ def moved_words(moved: Moved) -> str:
         f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}; the result has it "
         f"where it stood last, and as {moved.before} where it stood before."
     )
+
+
+def pushed_bases(solved: Solved) -> list[str]:
+    """Words robots whose observations all disagree from some stop on, as one other place explains.
+
+    Such observations are left out, and the base is where it stood before: a base is no frame that
+    may be two, because all that its robot carries hangs on it.
+    """
+    network, used = solved.agreed.network, solved.agreed.used
+    stops, found = network.sightings.stops, []
+    for flange, branch in network.tree.branches.items():
+        if not branch.robot:
+            continue
+        asked = network.change_of(branch.parent, solved.agreed.fit.state)
+        mine = np.isfinite(asked[:, 0, 0])
+        first = int(stops[mine & used].max(initial=-1)) + 1
+        after = mine & ~used & (stops >= first)
+        if len(np.unique(stops[after])) < _FEWEST_STOPS:
+            continue
+        middle = mean_transform(asked[after])
+        shift_mm, turn_deg = pose_difference(np.eye(4), middle)
+        scatter_mm = 1e3 * float(np.median(deviations(asked[after])[0]))
+        alike = scatter_mm < _ALIKE * shift_mm
+        found.append(
+            f"All {int(after.sum())} views by way of {flange} from stop "
+            f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before"
+            + (
+                f", as if {branch.parent} had been pushed by {figure(shift_mm)} mm and "
+                f"{figure(turn_deg)} deg"
+                if alike
+                else ""
+            )
+            + f": {branch.parent} is where it stood before. Align the stops from there on alone."
+        )
+    return found
 
 
 def reasons(solved: Solved) -> dict[int, str]:

@@ -29,6 +29,7 @@ class Limits:
         pixel_px: Noise of a corner's coordinate [px].
         robot_mm: Error of a flange from stop to stop [mm].
         level: How much more a camera's poses scatter than its corners say.
+        stops: Stops in the fit; fewer leave too little to check the result with.
         left_out: Share of observations that disagree.
     """
 
@@ -37,6 +38,7 @@ class Limits:
     pixel_px: tuple[float, float] = (0.7, 3.0)
     robot_mm: float = 0.2
     level: float = 2.0
+    stops: tuple[int, int] = (10, 5)
     left_out: tuple[float, float] = (0.25, 0.6)
 
 
@@ -162,6 +164,10 @@ def judge(
     doubts += [("check", f"{it.frame} is tied to nothing. {it.remedy}") for it in untied]
     doubts += _weak(solved.cell, edges, limits)
     doubts += _noisy(noise, limits)
+    stops = len(np.unique(solved.agreed.network.sightings.stops[solved.agreed.used]))
+    if stops < limits.stops[0]:
+        words = f"{stops} stops leave little to check the result with: record {limits.stops[0]}."
+        doubts.append(("bad" if stops < limits.stops[1] else "check", words))
     out = int(np.sum(~solved.agreed.used))
     if out:
         status = _beyond(out / len(solved.agreed.used), limits.left_out) or "good"

@@ -9,7 +9,14 @@ import numpy as np
 
 from visioncal.alignment.arms import ARMS_ASKED, ArmsAsked, erring_arms
 from visioncal.alignment.cell import Cell, read_cell
-from visioncal.alignment.faults import Version, movements, reasons, residuals, versions
+from visioncal.alignment.faults import (
+    Version,
+    movements,
+    pushed_bases,
+    reasons,
+    residuals,
+    versions,
+)
 from visioncal.alignment.judging import check_determined, judge, size_warnings, weakest_link
 from visioncal.alignment.looking import Looked, look_around
 from visioncal.alignment.solving import Solved, sensors_of, solve
@@ -114,6 +121,7 @@ def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
     return [
         *missing,
         *_erring(solved),
+        *pushed_bases(solved),
         *solved.cell.session.warnings,
         *looked.warnings,
         *size_warnings(solved, spread),

@@ -153,7 +153,7 @@ def _started(
     targets = _targets(cell)
     tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets))
     if tied.untied:
-        untied_robots(cell, tied.untied)
+        untied_robots(cell, tied.untied, seen=True)
         kept = _without_frames(cell, tied.untied)
         rows = {it.view for it in kept.rows}
         cell, views = kept, [it for it in views if it.view in rows]

@@ -7,8 +7,13 @@ from visioncal.errors import DegenerateError
 from visioncal.files import some_of
 
 
-def untied_robots(cell: Cell, lost: Collection[str]) -> None:
+def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
     """Refuses a cell in which a robot is tied to nothing.
+
+    Args:
+        cell: The cell.
+        lost: The frames that are tied to nothing.
+        seen: Whether there are observations that would tie them, were they enough.
 
     Raises:
         DegenerateError: A robot's base is among the frames that are lost.
@@ -19,9 +24,16 @@ def untied_robots(cell: Cell, lost: Collection[str]) -> None:
         return
     bases = [branches[it].parent for it in flanges]
     words = [untied_words(cell, it) for it in bases]
+    robots = "this robot" if len(bases) == 1 else "these robots"
+    why = f"no observation links {robots} to the rest of the cell"
+    if seen:
+        stops = len({it.station for it in cell.rows})
+        why = (
+            f"the observations that link {robots} to the rest of the cell are too few, too much "
+            f"alike, or wrong (it takes 3 stops or more, turned about two axes; {stops} have any)"
+        )
     raise DegenerateError(
-        f"align: nothing ties {some_of(bases)} to {cell.reference}: no observation links "
-        f"{'this robot' if len(bases) == 1 else 'these robots'} to the rest of the cell.",
+        f"align: nothing ties {some_of(bases)} to {cell.reference}: {why}.",
         culprits=bases,
         next_step=" ".join(words),
     )

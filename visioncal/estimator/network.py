@@ -232,7 +232,7 @@ class Network:
         """The change of a frame's edge that each observation asks for, were all else right.
 
         Args:
-            frame: An unknown frame.
+            frame: A frame that hangs by no robot.
             state: The unknowns.
 
         Returns:

@@ -138,6 +138,10 @@ def _parted(
         open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
         if len(rows) < FEWEST or len(open_ones) not in (2, 3):
             continue
+        # What no robot parts cannot be told apart.
+        inner = [factors[begin + 1 : end] for begin, end in pairwise(open_ones)]
+        if not all(any(not it.frame for it in part) for part in inner):
+            continue
         parts = [
             _product(factors[begin + 1 : end], placed)
             for begin, end in pairwise([-1, *open_ones, len(factors)])

@@ -73,7 +73,7 @@ def hand_eye(
         (4, 4) x and z, and what each is known to, rotations on a lever [m]; None where the motion
         leaves a direction open, or no half of the views agrees.
     """
-    half = len(robot) // 2 + 1
+    half = max(len(robot) // 2 + 1, FEWEST)
     found = []
     for rows, picks in _starts(candidates, turns):
         away = distances_to(robot, candidates, *_park(robot[rows], candidates.poses[rows, picks]))

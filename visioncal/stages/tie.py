@@ -7,7 +7,7 @@ found the best transforms are taken first (Prim 1957), until every frame hangs o
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,13 +44,11 @@ def tie(tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted) -> Tied:
         poses: (s, 4, 4) `base_from_flange` by robot and stop.
         sighted: What was seen.
     """
-    pairs = _pairs(tree, sighted)
-    relations = [*_known(tree)]
-    growth = Growth(tree, poses, sighted, pairs, relations)
+    growth = Growth(tree, poses, sighted, _pairs(tree, sighted), ())
+    relations = [*_known(tree), *mounted_points(growth)]
     for pair in growth.oriented:
         relations += _solved(tree, poses, sighted, pair)
-    relations += mounted_points(growth)
-    placed, ambiguous = grow(growth)
+    placed, ambiguous = grow(replace(growth, relations=relations))
     edges = {
         name: invert(placed[tree.branches[name].parent]) @ placed[name]
         for name in tree.unknown
