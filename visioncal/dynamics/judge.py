@@ -17,6 +17,8 @@ Status: TypeAlias = Literal["good", "check", "bad"]
 # Other torques may be predicted so many times worse than those that were fitted, and bodies so many
 # times worse than base parameters.
 _WORSE, _BODIES_WORSE = 1.5, 1.3
+# An error under this share of a torque's range is no reason for doubt, whatever the noise was.
+_SLIGHT = 0.02
 # Beyond this share of a torque's range a prediction is of little use, beyond the other of none.
 _POOR, _USELESS = 0.2, 0.6
 # Known inertias that leave more of the range than this are another robot's.
@@ -67,6 +69,7 @@ def _of_prediction(identified: Identified) -> Iterator[tuple[Status, str]]:
     )
     fitted = identified.fitted_rms_nm
     surprised = validation.rms_nm > _WORSE * np.maximum(fitted, validation.noise_nm)
+    surprised &= shares > _SLIGHT
     if surprised.any():
         yield (
             "check",
