@@ -15,6 +15,7 @@ from visioncal.errors import DataError, DegenerateError
 from visioncal.files import did_you_mean
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
+from visioncal.session.single import check_one_of_each
 from visioncal.types import FloatArray
 
 # The share of a motion's end that is predicted where no other motion is named.
@@ -182,8 +183,9 @@ def robot_of(session: Session) -> Robot:
     """The session's robot.
 
     Raises:
-        DataError: It names none that is known.
+        DataError: It names none that is known, or several.
     """
+    check_one_of_each(session)
     if session.robot_document is None:
         raise DataError(
             f"session {session.name!r} names no known robot.",
