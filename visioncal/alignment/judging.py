@@ -10,7 +10,12 @@ from visioncal.alignment.faults import moved_words
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Edge, Moved, Untied, Verdict, VerdictStatus
 from visioncal.errors import DegenerateError
-from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, axis_words
+from visioncal.estimator.observability import (
+    SIGMA_LIMIT_M,
+    SIGMA_LIMIT_RAD,
+    Direction,
+    axis_words,
+)
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.types import FloatArray
@@ -62,23 +67,7 @@ def check_determined(cell: Cell, edges: Mapping[str, Edge]) -> None:
             )
 
 
-@dataclass(frozen=True)
-class Worst:
-    """The direction of a transform that is known worst for its limit [m or rad]."""
-
-    words: str
-    sigma: float
-    limit: float
-    is_rotation: bool
-
-    @property
-    def figure(self) -> str:
-        """The sigma and its limit with their unit."""
-        unit, scale = ("deg", np.rad2deg(1.0)) if self.is_rotation else ("mm", 1e3)
-        return f"{figure(self.sigma * scale)} {unit} (limit {figure(self.limit * scale)})"
-
-
-def worst_direction(edge: Edge) -> Worst:
+def worst_direction(edge: Edge) -> Direction:
     """Finds it, in the axes of the frame that the transform hangs on."""
     found = []
     for is_rotation in (False, True):
@@ -87,7 +76,7 @@ def worst_direction(edge: Edge) -> Worst:
         axis = axis_words(edge.matrix[:3, :3] @ vectors[:, -1])
         words = f"its rotation about {axis}" if is_rotation else f"its offset along {axis}"
         limit = float(SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M)
-        found.append(Worst(words, float(np.sqrt(max(values[-1], 0.0))), limit, is_rotation))
+        found.append(Direction(words, float(np.sqrt(max(values[-1], 0.0))), limit, is_rotation))
     return max(found, key=lambda it: it.sigma / it.limit)
 
 
