@@ -16,9 +16,9 @@ from visioncal.figures import figure
 from visioncal.transforms import mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
 
-# An image fits another stop where it is as near to what is predicted there as noise may put it,
-# which it is by chance at one stop in so many.
-_CHANCE = 1e-3
+# An image fits another stop where it is as near to what is predicted there as noise may put it, and
+# twice as far: what is predicted has errors, too, and other stops are farther by far.
+_CHANCE, _NEAR = 1e-3, 4.0
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
 # Poses of one robot are exchanged where so many observations of the stops say so.
@@ -197,38 +197,59 @@ def residuals(solved: Solved) -> FloatArray:
 
 def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
     """The other stations that observations fit, which do not fit their own, best first."""
-    network, fit = solved.agreed.network, solved.agreed.fit
-    stations = len(solved.cell.stops)
-    starts = {it.twin: (it.frame, it.stop) for it in solved.agreed.moves}
+    # Between the last stop before a move and the first one after it, either may be true.
+    late = {it.twin: it.stop for it in solved.agreed.moves}
+    early = {it.twin: _last_used(solved, it.frame) + 1 for it in solved.agreed.moves}
     found = {}
     for at in out.tolist():
-        row = solved.cell.rows[at]
-        here = replace(
-            network.sightings.subset(np.arange(len(network)) == at),
-            seers=(row.seer,) * stations,
-            seen=(row.seen,) * stations,
-            stops=np.arange(stations),
-            sensors=np.repeat(network.sightings.sensors[at], stations),
-            measured=np.repeat(network.sightings.measured[[at]], stations, axis=0),
-            covariance=np.repeat(network.sightings.covariance[[at]], stations, axis=0),
-            turned=np.repeat(network.sightings.turned[[at]], stations),
-            by_shared=np.repeat(network.sightings.by_shared[[at]], stations, axis=0),
-        )
-        for twin, (frame, stop) in starts.items():
-            here = here.renamed(frame, twin, np.arange(stations) >= stop)
-        there = replace(network, sightings=here)
-        known = _known(there)
-        if not known.any():
-            continue
-        part = there.subset(known)
-        squares = by_noise_alone(part, fit)
-        at_station = np.flatnonzero(known)
-        near = (squares < chi2_limit(_CHANCE, 6)) & (at_station != row.station)
-        order = np.argsort(squares[near])
-        moving = any(it.robot for group in part.groups for it in group.way)
-        if near.any() and moving:
-            found[at] = at_station[near][order].tolist()
+        ways = [_squares_by_station(solved, at, it) for it in (late, early)]
+        squares = np.minimum(*ways)
+        squares[solved.cell.rows[at].station] = np.inf
+        near = np.flatnonzero(squares < _NEAR * chi2_limit(_CHANCE, 6))
+        if len(near):
+            found[at] = near[np.argsort(squares[near])].tolist()
     return found
+
+
+def _last_used(solved: Solved, key: str) -> int:
+    """The last station at which a frame, as the network knows it, is in what is used."""
+    network = solved.agreed.network
+    rows = network.sightings.involves(key) & solved.agreed.used
+    return int(network.sightings.stops[rows].max(initial=-1))
+
+
+def _squares_by_station(solved: Solved, at: int, starts: Mapping[str, int]) -> FloatArray:
+    """Squared distances (s,) of an observation from what is predicted at every station.
+
+    Args:
+        solved: The fit.
+        at: The observation.
+        starts: The first station of each frame that stands elsewhere from then on.
+
+    Returns:
+        Infinite where a robot's pose is not known, or where no robot has a part in it.
+    """
+    network, row = solved.agreed.network, solved.cell.rows[at]
+    stations = np.arange(len(solved.cell.stops))
+    one = network.sightings.subset(np.arange(len(network)) == at)
+    here = replace(
+        one,
+        seers=(row.seer,) * len(stations),
+        seen=(row.seen,) * len(stations),
+        stops=stations,
+        sensors=np.repeat(one.sensors, len(stations)),
+        measured=np.repeat(one.measured, len(stations), axis=0),
+        covariance=np.repeat(one.covariance, len(stations), axis=0),
+        turned=np.repeat(one.turned, len(stations)),
+        by_shared=np.repeat(one.by_shared, len(stations), axis=0),
+    )
+    for move in solved.agreed.moves:
+        here = here.renamed(move.frame, move.twin, stations >= starts[move.twin])
+    there = replace(network, sightings=here)
+    known, squares = _known(there), np.full(len(stations), np.inf)
+    if known.any() and any(it.robot for group in there.groups for it in group.way):
+        squares[known] = by_noise_alone(there.subset(known), solved.agreed.fit)
+    return squares
 
 
 def _known(network: Network) -> Mask:
