@@ -138,16 +138,21 @@ def _mm(cell: Network, found: Alignment) -> float:
 
 
 def four_cameras_s() -> float:
-    """Seconds that four cameras at 40 stops take to align, their corners being found."""
+    """Seconds that four cameras at 40 stops take to align, their corners being found: the best of
+    three, as the first still imports.
+    """
     names = ("one", "two", "three", "four")
     places = ((0.0, -1.0, 1.1), (0.15, 0.95, 1.25), (0.9, -0.6, 1.2), (-0.8, 0.7, 1.2))
     cameras = tuple(
         CameraAt(name, place_m=place) for name, place in zip(names, places, strict=True)
     )
     cell = simulate_network(NetworkOptions(cameras=cameras, stops=40))
-    begin = time.process_time()
-    aligned(cell)
-    return time.process_time() - begin
+    taken = []
+    for _ in range(3):
+        begin = time.process_time()
+        aligned(cell)
+        taken.append(time.process_time() - begin)
+    return min(taken)
 
 
 def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> str:

@@ -20,6 +20,8 @@ _LEVELS_SETTLED = 1e-2
 _START_SIGMA = 5e-4
 # Where they are sought again, it is from so much above where they were.
 _ABOVE = 1.5
+# ... and never from nothing, which no residuals would lift them from.
+_ABOVE_NOTHING = 2e-5
 # A sensor may be this much better or worse than is said of it, at the most.
 _SENSOR_RANGE = (1e-3, 1e4)
 # Levels below this are none [rad and m].
@@ -161,7 +163,7 @@ def _robots(network: Network, state: State, noise: Noise, *, from_above: bool) -
             parts[2 * robot, rows, at, at] = parts[2 * robot + 1, rows, at + 3, at + 3] = 1.0
     seen = np.array([(members == it).any() for it in range(count)])
     places = tuple((2 * it, 2 * it + 1) for it in np.flatnonzero(seen).tolist())
-    start = _ABOVE * noise.robots.ravel()
+    start = np.maximum(_ABOVE * noise.robots.ravel(), _ABOVE_NOTHING)
     if from_above:
         squares = np.mean(reduced.flanges.reshape(-1, 2, 3) ** 2, axis=(0, 2))
         start = np.tile(np.maximum(np.sqrt(squares), _START_SIGMA), count)

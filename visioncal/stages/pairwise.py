@@ -14,7 +14,7 @@ from visioncal.transforms import invert, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mount
 
 # Triples of views to start a hand-eye calibration from, and how many are followed up.
-_TRIPLES, _REFINED, _ROUNDS = 30, 4, 6
+_TRIPLES, _REFINED, _ROUNDS = 30, 3, 4
 FEWEST = 3
 # Below this scaled eigenvalue ratio the motion leaves a direction open; an edge that is known worse
 # than this [m, with rotations on a lever] is no start.
