@@ -138,10 +138,7 @@ def _mm(cell: Network, found: Alignment) -> float:
 
 
 def four_cameras_s() -> float:
-    """Seconds that four cameras at 40 stops take to align, their corners being found.
-
-    The best of three, as the first still imports.
-    """
+    """Seconds that four cameras at 40 stops take to align, corners being found; best of three."""
     names = ("one", "two", "three", "four")
     places = ((0.0, -1.0, 1.1), (0.15, 0.95, 1.25), (0.9, -0.6, 1.2), (-0.8, 0.7, 1.2))
     cameras = tuple(
