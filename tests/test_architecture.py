@@ -121,12 +121,22 @@ def test_heavy_libraries_enter_in_one_place():
             assert layer_name(path) in HOMES.get(top, {layer_name(path)}), (path, top)
 
 
-def test_calibrating_imports_no_device_library_and_no_torch():
-    code = (
-        "import sys, visioncal.cli, visioncal.pipeline;"
-        "print(sorted({'depthai', 'rtde_control', 'rtde_receive', 'torch', 'kornia'}"
-        " & set(sys.modules)))"
-    )
+@pytest.mark.parametrize(
+    ("imported", "unwanted"),
+    [
+        (
+            "visioncal.cli, visioncal.pipeline",
+            {"depthai", "rtde_control", "rtde_receive", "torch", "kornia"},
+        ),
+        # Every command waits for what is loaded here, `--help` too.
+        (
+            "visioncal.cli.app",
+            {"rerun", "pinocchio", "coal", "matplotlib", "scipy.signal", "scipy.stats"},
+        ),
+    ],
+)
+def test_heavy_libraries_are_loaded_where_they_are_needed(imported, unwanted):
+    code = f"import sys, {imported}; print(sorted({unwanted} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

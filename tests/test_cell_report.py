@@ -7,8 +7,8 @@ import numpy as np
 from aligned_cells import made_up_cell
 
 from visioncal.calibration import Moved, Sight, Untied
+from visioncal.figures import significant
 from visioncal.recording.cellmap import pairs, weakest_frame
-from visioncal.recording.numbers import significant
 from visioncal.report.cells import pair_table, render_cell, write_cell_report
 
 CELL = made_up_cell(5)

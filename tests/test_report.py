@@ -15,10 +15,10 @@ from samples import CAMERA, REJECTED, Sample, made_up
 
 from visioncal.calibration import Calibration, CameraResult, Rms, Verdict, VerdictStatus
 from visioncal.errors import DataError
+from visioncal.figures import matched, significant
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import Run, run
 from visioncal.recording import write_recording
-from visioncal.recording.numbers import matched, significant
 from visioncal.report import write_report
 from visioncal.report.advice import listed, next_steps, suspects
 from visioncal.report.page import render

@@ -181,7 +181,7 @@ def write_motions(
     Raises:
         DataError: The folder cannot be written.
     """
-    from visioncal.planning.motions import motion_preview
+    from visioncal.planning.motion_preview import motion_preview
     from visioncal.recording.motions import write_motion_preview
     from visioncal.viewer.motions import motion_blueprint
 

@@ -15,7 +15,7 @@ from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics import BaseModel, DynamicModel, FrictionTerms, Gains, drive_gains
 from visioncal.dynamics.run import current_streams, robot_of
 from visioncal.errors import DataError
-from visioncal.recording.numbers import matched, significant
+from visioncal.figures import matched, significant
 from visioncal.robot import Inertias, matrices
 from visioncal.session import Session
 from visioncal.types import FloatArray

@@ -17,7 +17,7 @@ from visioncal.cli.dynamics_options import (
 from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics import Payload, estimate_payload
 from visioncal.dynamics.run import Request, conditioned_streams
-from visioncal.recording.numbers import matched, significant
+from visioncal.figures import matched, significant
 from visioncal.session import Session
 from visioncal.types import FloatArray
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.signal.windows import kaiser
 
 from visioncal.types import FloatArray, Mask
 
@@ -34,7 +33,7 @@ class LowPass:
         step = max(int(rate_hz / (2.0 * band_hz)), 1)
         half = step * int(np.ceil(_SPAN * rate_hz / band_hz / step))
         at = np.arange(-half, half + 1)
-        taps = np.sinc(2.0 * band_hz / rate_hz * at) * kaiser(len(at), _BETA)
+        taps = np.sinc(2.0 * band_hz / rate_hz * at) * np.kaiser(len(at), _BETA)
         return cls(taps / taps.sum(), step)
 
     @classmethod

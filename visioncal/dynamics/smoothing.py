@@ -1,7 +1,6 @@
 """From noisy angles to speeds and accelerations, in the band in which an arm moved."""
 
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from visioncal.dynamics.motion import Motion
 from visioncal.types import FloatArray, IntArray
@@ -72,6 +71,9 @@ def smoothed_motion(
         The motion at all m times, which is good from half a window on from either end, and whether
         the reported speeds belong to the angles.
     """
+    # With it comes scipy.stats, which no other command shall have to wait for.
+    from scipy.signal import savgol_filter
+
     step = float(times_s[-1] - times_s[0]) / (len(times_s) - 1)
 
     def fitted(values: FloatArray, order: int) -> FloatArray:
@@ -94,5 +96,7 @@ def smoothed_motion(
 
 def _noise(residual: FloatArray, window: int, order: int, step: float) -> float:
     """How noisy a derivative of that order is, by what smoothing left [rad/s^2]."""
+    from scipy.signal import savgol_coeffs
+
     taps = savgol_coeffs(window, _ORDER, order, step)
     return float(np.sqrt(np.mean(residual**2)) * np.linalg.norm(taps))

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import rerun as rr
 
 from visioncal.calibration import Calibration
+from visioncal.figures import decimals_for, fixed, signed, significant
 from visioncal.recording import paths
 from visioncal.recording.elastic import Elastic
 from visioncal.recording.kinematics import Kinematics, Level, Parameter, joint_words
 from visioncal.recording.notes import plain
-from visioncal.recording.numbers import decimals_for, fixed, signed, significant
 
 _MOST_WORTH = 5
 # Without a sigma: about a hundredth of what an arm repeats to.

@@ -15,13 +15,13 @@ import rerun as rr
 
 from visioncal.calibration import Alignment, Sight
 from visioncal.errors import DataError
+from visioncal.figures import significant
 from visioncal.files import sha256
 from visioncal.recording import board, colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.cellmap import pairs, places, spans
 from visioncal.recording.celltext import sight_markdown, verdict_markdown
 from visioncal.recording.frames import Frame, scan
-from visioncal.recording.numbers import significant
 from visioncal.recording.reader import chunks
 from visioncal.recording.recorder import Recorder
 from visioncal.recording.scene import image_plane

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from visioncal.calibration import Alignment, Sight
+from visioncal.figures import significant
 from visioncal.recording.notes import HEADLINES, edge_line, plain
-from visioncal.recording.numbers import significant
 from visioncal.session import View
 
 

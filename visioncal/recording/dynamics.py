@@ -9,9 +9,9 @@ import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.dynamics import Identified, Prediction, Run
+from visioncal.figures import matched, significant
 from visioncal.recording import colours, paths
 from visioncal.recording.arm import log_arm
-from visioncal.recording.numbers import matched, significant
 from visioncal.recording.recorder import Recorder, beside
 from visioncal.recording.writer import RecordingWriter
 from visioncal.types import FloatArray

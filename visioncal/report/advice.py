@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration import Calibration, ViewResult
-from visioncal.recording.numbers import significant
+from visioncal.figures import significant
 from visioncal.stages.judge import JudgeOptions
 
 # Views whose residual is this many times the median are named, as by the verdict.

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from visioncal.estimator.arm import SIGNIFICANT
+from visioncal.figures import significant
 from visioncal.recording.armtext import ParameterRow, parameter_row
 from visioncal.recording.kinematics import NOMINAL, Kinematics, Level, joint_words
-from visioncal.recording.numbers import significant
 from visioncal.report.content import Fact
 
 _COLUMNS = 2

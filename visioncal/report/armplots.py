@@ -7,8 +7,8 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from visioncal.figures import significant
 from visioncal.recording.kinematics import Kinematics, Unseen, WorkspaceMap
-from visioncal.recording.numbers import significant
 from visioncal.report import svg
 from visioncal.types import FloatArray
 

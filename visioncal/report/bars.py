@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from visioncal.recording.numbers import significant
+from visioncal.figures import significant
 from visioncal.report import svg
 
 _ROOM = 1.25

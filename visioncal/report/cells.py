@@ -9,9 +9,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from visioncal.calibration import Alignment, CameraResult, Sight
+from visioncal.figures import significant
 from visioncal.files import write_atomically
 from visioncal.recording import cellmap
-from visioncal.recording.numbers import significant
 from visioncal.report import bars, content, network, svg
 from visioncal.report.bars import Bar
 from visioncal.report.content import Fact

@@ -11,9 +11,9 @@ import numpy as np
 from visioncal.calibration import Calibration, Edge, Rms, SolverResult, Verdict, ViewResult
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
+from visioncal.figures import decimals_for, fixed, matched, significant
 from visioncal.recording.findings import read_stage
 from visioncal.recording.kinematics import Kinematics
-from visioncal.recording.numbers import decimals_for, fixed, matched, significant
 from visioncal.report.advice import Suspects, contradicts, outlying_views
 from visioncal.transforms import pose_difference
 from visioncal.types import FloatArray

@@ -9,8 +9,8 @@ import numpy as np
 from markupsafe import Markup
 
 from visioncal.dynamics import Identified, Prediction, Run, judge, stribeck_rows
+from visioncal.figures import matched, significant
 from visioncal.files import write_atomically
-from visioncal.recording.numbers import matched, significant
 from visioncal.report import content, torqueplots
 from visioncal.report.content import Fact
 from visioncal.report.templating import template

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from visioncal.calibration import Alignment
+from visioncal.figures import significant
 from visioncal.recording.cellmap import Pair, pairs, places, spans, weakest_frame
-from visioncal.recording.numbers import significant
 from visioncal.report import svg
 
 # Sizes of a frame's box, in the units of the drawing.

@@ -5,8 +5,8 @@ from markupsafe import Markup
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from matplotlib.tri import Triangulation, UniformTriRefiner
 
+from visioncal.figures import significant
 from visioncal.recording.findings import SOURCES, Board, Uncertainty
-from visioncal.recording.numbers import significant
 from visioncal.report import svg
 from visioncal.types import Target
 

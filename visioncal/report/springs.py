@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
+from visioncal.figures import significant
 from visioncal.recording.elastic import Elastic, Spring
 from visioncal.recording.kinematics import joint_words
-from visioncal.recording.numbers import significant
 from visioncal.report import svg
 from visioncal.report.content import Fact
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from visioncal.recording.numbers import significant
+from visioncal.figures import significant
 from visioncal.recording.thermal import Drift
 from visioncal.report import svg
 

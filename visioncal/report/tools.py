@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from visioncal.calibration import Calibration, Frame, Observation
+from visioncal.figures import significant
 from visioncal.recording.details import details
-from visioncal.recording.numbers import significant
 from visioncal.report import bars, svg
 from visioncal.report.bars import Bar
 from visioncal.report.content import EdgeCard, Fact, edge_card, headline, readable_time

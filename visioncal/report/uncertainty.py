@@ -1,8 +1,8 @@
 """Where the uncertainty comes from, in words: sources, noise, board and arm."""
 
 from visioncal.calibration import Calibration
+from visioncal.figures import decimals_for, matched, significant
 from visioncal.recording.findings import Arm, Board, Uncertainty
-from visioncal.recording.numbers import decimals_for, matched, significant
 from visioncal.report.content import PLUS_MINUS, Fact, answering_solver, frame_words
 from visioncal.types import Target
 
