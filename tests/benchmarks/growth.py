@@ -1,0 +1,146 @@
+"""How the time and memory of a calibration grow with its views and its cameras.
+
+Corners are drawn (no images are rendered), and every size runs in a process of its own on one core.
+An exponent is the slope of the time over the size, both as logarithms, fitted to the upper half of
+the sizes: below it what does not grow with them counts, too.
+
+    PYTHONPATH=tests python tests/benchmarks/growth.py [--quick]
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from multiprocessing import get_context
+
+import numpy as np
+from cells import known_of
+from results import write_section
+
+from visioncal.alignment import align
+from visioncal.pipeline.steps import STAGES
+from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
+from visioncal.simulation.network import simulate_network
+from visioncal.simulation.network_records import network_session
+
+VIEWS = (20, 60, 125, 250, 500, 1000)
+CAMERAS = (2, 4, 6, 8, 10)
+STOPS = 200
+PLAIN = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+WRONG_ARM = replace(PLAIN, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)
+# Stages whose time is named by itself.
+NAMED = ("agree", "refine", "hand-eye", "kinematics", "diagnose")
+
+
+def seconds_of(options: CellOptions, *, joints: bool) -> dict[str, float]:
+    """Processor time by stage of one simulated cell [s]."""
+    known, taken = known_of(simulate(options), joints=joints), {}
+    for stage in STAGES:
+        if stage.name not in ("robot", "detect"):
+            begin = time.process_time()
+            known = stage.run(known)
+            taken[stage.name] = time.process_time() - begin
+    return taken
+
+
+def of_views(task: tuple[CellOptions, bool]) -> dict[str, float]:
+    options, joints = task
+    taken = seconds_of(options, joints=joints)
+    return {"all": sum(taken.values()), **{it: taken[it] for it in NAMED if it in taken}}
+
+
+def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
+    """Processor time [s] and what memory grew by [MB] of a whole cell."""
+    cameras, stops, faulty = task
+    turns = 2 * np.pi * np.arange(cameras) / cameras
+    around = tuple(
+        CameraAt(f"c{at}", place_m=(1.1 * np.cos(it), 1.1 * np.sin(it), 1.1))
+        for at, it in enumerate(turns.tolist())
+    )
+    faults = {
+        "moved": (Moved("target_floor", stops // 2), Moved("cam_c1", stops // 3)),
+        "swapped_rows": 1,
+        "stray_images": 6,
+    }
+    options = NetworkOptions(cameras=around, stops=stops, seed=1, **(faults if faulty else {}))
+    cell = simulate_network(options)
+    session = network_session(cell, "network", seen="names")
+    corners = {it.view: it for it in cell.corners}
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begin = time.process_time()
+    found = align(session, corners=corners)
+    taken = time.process_time() - begin
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    return {
+        "all": taken,
+        "memory": grown / 1024,
+        "moved": float(len(found.moved)),
+        "rows": float(len(found.sights)),
+    }
+
+
+def exponent(sizes: Sequence[float], taken: Sequence[float]) -> float:
+    """Slope of the logarithms over the upper half of the sizes."""
+    half = len(sizes) // 2
+    return float(np.polyfit(np.log(sizes[half:]), np.log(taken[half:]), 1)[0])
+
+
+def run_each(run: Callable, tasks: list) -> list[dict[str, float]]:
+    """Runs every task in a fresh process, one after the other."""
+    with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        return pool.map(run, tasks, chunksize=1)
+
+
+def views_table(views: Sequence[int]) -> str:
+    lines = [
+        f"| cell | {' | '.join(f'{it} views [s]' for it in views)} | exponent |",
+        f"| --- | {' | '.join('---:' for _ in views)} | ---: |",
+    ]
+    for words, options, joints in (
+        ("lens given, in hand", PLAIN, False),
+        ("lens estimated, to hand", replace(PLAIN, state_intrinsics=False, mount="eye-to-hand"),
+         False),
+        ("with an arm", WRONG_ARM, True),
+    ):  # fmt: skip
+        found = run_each(of_views, [(replace(options, views=it), joints) for it in views])
+        for name in ("all", *NAMED):
+            taken = [it.get(name, 0.0) for it in found]
+            if min(taken) > 0.0:
+                figures = " | ".join(f"{it:.3f}" for it in taken)
+                label = words if name == "all" else f"of it: {name}"
+                lines.append(f"| {label} | {figures} | {exponent(views, taken):.2f} |")
+    return "\n".join(lines)
+
+
+def cameras_table(cameras: Sequence[int], stops: int) -> str:
+    tasks = [(it, stops, faulty) for faulty in (False, True) for it in cameras]
+    found = run_each(of_cameras, [*tasks, (4, 40, False)])
+    lines = [
+        "| cameras x stops | rows | s | MB | moves named |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for (count, stops_of, faulty), it in zip([*tasks, (4, 40, False)], found, strict=True):
+        words = f"{count} x {stops_of}{', faults' if faulty else ''}"
+        lines.append(f"| {words} | {it['rows']:.0f} | {it['all']:.2f} | {it['memory']:.0f} "
+                     f"| {it['moved']:.0f} |")  # fmt: skip
+    slope = exponent(cameras, [it["all"] for it in found[: len(cameras)]])
+    return "\n".join([*lines, "", f"Exponent over the number of cameras: {slope:.2f}."])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    quick = parser.parse_args().quick
+    views, cameras, stops = (20, 40, 60), (2, 3, 4), 12
+    if not quick:
+        views, cameras, stops = VIEWS, CAMERAS, STOPS
+    text = f"{views_table(views)}\n\n{cameras_table(cameras, stops)}"
+    print(text)
+    if not quick:
+        write_section("Growth", "PYTHONPATH=tests python tests/benchmarks/growth.py", text)
+
+
+if __name__ == "__main__":
+    main()
