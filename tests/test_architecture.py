@@ -29,6 +29,7 @@ LAYERS = (
     ("finders",),
     ("solvers",),
     ("estimator",),
+    ("estimation",),
     ("session",),
     ("evidence",),
     ("thermal",),

@@ -4,19 +4,16 @@ What the first joint's place could take up is the base's, and what the last one'
 flange's: both are frames of the cell already.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from visioncal.alignment.cell import Cell, robot_key
+from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.solve import normal_equations, score_gain
 from visioncal.estimator.joint import chance_limit
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.network import Network
-from visioncal.estimator.networkfit import normal_equations
-from visioncal.estimator.sightings import Common, Noise, State
+from visioncal.estimator.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
@@ -33,54 +30,35 @@ class ArmsErrors:
     """Unknowns of the arms.
 
     Attributes:
-        by_flange: (s, 6, k) by robot, how its flange moves at every station with all of them.
-        prior_sigma: (k,) what they are known to beforehand.
-        places: Which of them are a robot's.
+        effects: One a robot, by how its flange moves at every station.
+        robots: The robots, in that order.
         unasked: Robots whose errors cannot be asked for, because joints or models are missing.
     """
 
-    by_flange: Mapping[str, FloatArray] = field(default_factory=dict)
-    prior_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
-    places: Mapping[str, slice] = field(default_factory=dict)
+    effects: tuple[Effect, ...] = ()
+    robots: tuple[str, ...] = ()
     unasked: tuple[str, ...] = ()
 
-    def __len__(self) -> int:
-        return len(self.prior_sigma)
+    @property
+    def values(self) -> FloatArray:
+        """(k,) all of them, of arms as they are stated."""
+        return np.concatenate([np.zeros(0), *(it.values for it in self.effects)])
 
-    def added(self, network: Network) -> Network:
-        """The network with these unknowns behind those that it shares; once, not twice."""
-        if not len(self):
-            return network
-        first, seen = len(network.common.pull), network.sightings
-        wider = np.concatenate([seen.by_shared, np.zeros((len(seen), 6, len(self)))], axis=2)
-        moves = {
-            robot: np.concatenate([np.zeros((len(it), 6, first)), it], axis=2)
-            for robot, it in self.by_flange.items()
-        }
-        known = network.common
-        return replace(
-            network,
-            sightings=replace(seen, by_shared=wider),
-            common=Common(
-                block_diag(known.information, np.diag(self.prior_sigma**-2.0)),
-                np.concatenate([known.pull, np.zeros(len(self))]),
-            ),
-            by_flange=moves,
-        )
-
-    def document(self, values: FloatArray, spread: FloatArray) -> dict[str, Any]:
+    def document(self, problem: Problem, state: State, spread: FloatArray) -> dict[str, Any]:
         """What was found of each arm, as it stands on disk.
 
         Args:
-            values: (k,) the unknowns.
-            spread: (k, k) their covariance.
+            problem: The problem that has these effects.
+            state: The unknowns.
+            spread: (p, p) their covariance.
         """
+        sigmas = np.sqrt(np.diag(spread))
         return {
             robot: {
-                "values": values[at].tolist(),
-                "sigmas": np.sqrt(np.diag(spread)[at]).tolist(),
+                "values": problem.values_of(it.name, state).tolist(),
+                "sigmas": sigmas[problem.effect_columns[it.name]].tolist(),
             }
-            for robot, at in self.places.items()
+            for robot, it in zip(self.robots, self.effects, strict=True)
         }
 
 
@@ -93,13 +71,9 @@ def arms_errors(cell: Cell, asked: ArmsAsked) -> ArmsErrors:
             order; `kinematics` for the place of each link in the one before, too, in six numbers
             each (rotation, translation).
     """
-    if asked == "reported":
-        return ArmsErrors()
-    parts: dict[str, FloatArray] = {}
-    sigmas: list[FloatArray] = []
-    places: dict[str, slice] = {}
+    effects: dict[str, Effect] = {}
     unasked = []
-    for name in cell.session.robots:
+    for name in cell.session.robots if asked != "reported" else ():
         key, document = robot_key(name), cell.session.robot_documents.get(name)
         if key not in cell.poses:
             continue
@@ -108,25 +82,23 @@ def arms_errors(cell: Cell, asked: ArmsAsked) -> ArmsErrors:
             unasked.append(name or "the robot")
             continue
         robot = Robot.from_document(document)
-        parts[key] = _moves(robot, joints, cell.poses[key], asked)
-        begin = sum(map(len, sigmas))
-        sigmas.append(_sigmas(robot, asked))
-        places[key] = slice(begin, begin + len(sigmas[-1]))
-    count = sum(map(len, sigmas))
-    by_flange = {}
-    for key, moves in parts.items():
-        by_flange[key] = np.zeros((len(moves), 6, count))
-        by_flange[key][:, :, places[key]] = moves
-    every = np.concatenate(sigmas) if sigmas else np.zeros(0)
-    return ArmsErrors(by_flange, every, places, tuple(unasked))
+        sigmas = _sigmas(robot, asked)
+        effects[key] = Effect(
+            f"arm {key}",
+            np.zeros(len(sigmas)),
+            Knowledge(np.diag(sigmas**-2.0), np.zeros(len(sigmas))),
+            np.zeros(len(sigmas), dtype=bool),
+            by_flange={key: _moves(robot, joints, cell.poses[key], asked)},
+        )
+    return ArmsErrors(tuple(effects.values()), tuple(effects), tuple(unasked))
 
 
-def erring_arms(cell: Cell, network: Network, state: State, noise: Noise) -> dict[str, ArmsAsked]:
+def erring_arms(cell: Cell, problem: Problem, state: State, noise: Noise) -> dict[str, ArmsAsked]:
     """Robots whose errors follow their posture, by Rao's score test, and what explains them.
 
     Args:
         cell: The cell.
-        network: The observations that agree, robots being as they report themselves.
+        problem: The observations that agree, robots being as they report themselves.
         state: The fit.
         noise: Its noise.
 
@@ -134,7 +106,7 @@ def erring_arms(cell: Cell, network: Network, state: State, noise: Noise) -> dic
         By robot, `offsets` where these explain its errors as well as chance asks, else
         `kinematics`.
     """
-    offsets, links = (_gains(cell, network, state, noise, it) for it in ARMS_ASKED[1:])
+    offsets, links = (_gains(cell, problem, state, noise, it) for it in ARMS_ASKED[1:])
     found: dict[str, ArmsAsked] = {}
     for robot, (gain, count) in links.items():
         of_offsets, fewer = offsets[robot]
@@ -146,23 +118,21 @@ def erring_arms(cell: Cell, network: Network, state: State, noise: Noise) -> dic
 
 
 def _gains(
-    cell: Cell, network: Network, state: State, noise: Noise, asked: ArmsAsked
+    cell: Cell, problem: Problem, state: State, noise: Noise, asked: ArmsAsked
 ) -> dict[str, tuple[float, int]]:
     """By how much each robot's errors would lower the squared error, and how many they are."""
     arms = arms_errors(cell, asked)
-    if not len(arms):
-        return {}
-    wider = State(state.edges, np.concatenate([state.shared, np.zeros(len(arms))]))
-    information, gradient = normal_equations(arms.added(network), wider, noise)
-    first = len(gradient) - len(arms)
-    between = information[first:, :first]
-    taken = between @ covariance(information[:first, :first])
-    left = information[first:, first:] - taken @ between.T
-    pull = gradient[first:] - taken @ gradient[:first]
-    return {
-        robot: (float(pull[at] @ covariance(left[at, at]) @ pull[at]), at.stop - at.start)
-        for robot, at in arms.places.items()
-    }
+    wider = problem.with_effects([*problem.effects, *arms.effects])
+    there = State(state.edges, np.concatenate([state.values, arms.values]))
+    information, gradient = normal_equations(wider, there, noise)
+    now = np.zeros(wider.size, dtype=bool)
+    now[: problem.size] = problem.moving
+    found = {}
+    for robot, it in zip(arms.robots, arms.effects, strict=True):
+        more = now.copy()
+        more[wider.effect_columns[it.name]] = True
+        found[robot] = score_gain(information, gradient, more, now), len(it)
+    return found
 
 
 def _joints(cell: Cell, name: str) -> FloatArray | None:

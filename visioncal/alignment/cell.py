@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from visioncal.errors import DataError
-from visioncal.estimator.networktree import Branch, Tree
+from visioncal.estimation.tree import Branch, Tree
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
 from visioncal.types import FloatArray
@@ -65,7 +65,7 @@ class Cell:
         ]
         for seer, seen in {(it.seer, it.seen) for it in self.rows}:
             ends = [seer, seen]
-            for step in self.tree.way(seer, seen):
+            for step in self.tree.path(seer, seen):
                 if step.robot:
                     ends += [step.frame, self.tree.branches[step.frame].parent]
             pairs += [(place[seer], place[it]) for it in ends]

@@ -9,9 +9,9 @@ import numpy as np
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
 from visioncal.chance import chi2_limit
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import by_noise_alone
 from visioncal.estimator.closure import deviations
-from visioncal.estimator.network import Network
-from visioncal.estimator.networkfit import by_noise_alone
 from visioncal.figures import figure
 from visioncal.transforms import mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
@@ -30,7 +30,7 @@ class Version:
     """A frame over a part of the time.
 
     Attributes:
-        key: Its name in the network.
+        key: Its name in the problem.
         frame: The frame that it is.
         name: Its name in the result: the frame's own for the last.
         start: The first station of it; -1 for the first version.
@@ -43,10 +43,10 @@ class Version:
 
 
 def versions(solved: Solved) -> dict[str, Version]:
-    """All unknown frames over time, by their names in the network."""
+    """All unknown frames over time, by their names in the problem."""
     moves = {it.twin: it for it in solved.agreed.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
-    for key in solved.agreed.network.unknown:
+    for key in solved.agreed.problem.unknown:
         start = moves[key].stop if key in moves else -1
         parts[key.partition("@")[0]].append((start, key))
     found = {}
@@ -68,18 +68,18 @@ def _last_seen(solved: Solved, twin: str) -> int:
 
 
 def _stops_of(solved: Solved, key: str) -> list[int]:
-    """The stops at which a frame, as the network knows it, is in what is used; in order of time."""
-    network = solved.agreed.network
-    rows = network.sightings.involves(key)
+    """The stops at which a frame, as the problem knows it, is in what is used; in order of time."""
+    problem = solved.agreed.problem
+    rows = problem.observations.involves(key)
     some = rows & solved.agreed.used
-    stations = network.sightings.stops[some if some.any() else rows]
+    stations = problem.observations.stops[some if some.any() else rows]
     return [solved.cell.stops[it] for it in np.unique(stations).tolist()]
 
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
     """What moved, in the order of time."""
     found, names = [], versions(solved)
-    edges = dict(zip(solved.agreed.network.unknown, solved.agreed.fit.state.edges, strict=True))
+    edges = dict(zip(solved.agreed.problem.unknown, solved.agreed.fit.state.edges, strict=True))
     for move in sorted(solved.agreed.moves, key=lambda it: it.stop):
         after = names[move.twin]
         earlier = [
@@ -121,12 +121,12 @@ def pushed_bases(solved: Solved) -> list[str]:
     Such observations are left out, and the base is where it stood before: a base is no frame that
     may be two, because all that its robot carries hangs on it.
     """
-    network, used = solved.agreed.network, solved.agreed.used
-    stops, found = network.sightings.stops, []
-    for flange, branch in network.tree.branches.items():
+    problem, used = solved.agreed.problem, solved.agreed.used
+    stops, found = problem.observations.stops, []
+    for flange, branch in problem.tree.branches.items():
         if not branch.robot:
             continue
-        asked = network.change_of(branch.parent, solved.agreed.fit.state)
+        asked = problem.change_of(branch.parent, solved.agreed.fit.state)
         mine = np.isfinite(asked[:, 0, 0])
         first = int(stops[mine & used].max(initial=-1)) + 1
         after = mine & ~used & (stops >= first)
@@ -163,7 +163,7 @@ def reasons(solved: Solved) -> dict[int, str]:
     found = {}
     for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
         words = f"disagrees with the rest of the cell by {figure(mm)} mm"
-        if solved.agreed.network.sightings.turned[at]:
+        if solved.agreed.problem.observations.has_rotation[at]:
             words += f" and {figure(deg)} deg"
         if at in robots:
             words += f": {robots[at]}"
@@ -190,8 +190,8 @@ def _stop(solved: Solved, row: int) -> int:
 
 def residuals(solved: Solved) -> FloatArray:
     """Distance (n, 2) of each observation from what is predicted [mm], [deg]."""
-    network, state = solved.agreed.network, solved.agreed.fit.state
-    pairs = zip(network.predicted(state), network.measured(state), strict=True)
+    problem, state = solved.agreed.problem, solved.agreed.fit.state
+    pairs = zip(problem.predicted(state), problem.measured(state), strict=True)
     return np.array([pose_difference(a, b) for a, b in pairs]).reshape(-1, 2)
 
 
@@ -212,10 +212,10 @@ def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
 
 
 def _last_used(solved: Solved, key: str) -> int:
-    """The last station at which a frame, as the network knows it, is in what is used."""
-    network = solved.agreed.network
-    rows = network.sightings.involves(key) & solved.agreed.used
-    return int(network.sightings.stops[rows].max(initial=-1))
+    """The last station at which a frame, as the problem knows it, is in what is used."""
+    problem = solved.agreed.problem
+    rows = problem.observations.involves(key) & solved.agreed.used
+    return int(problem.observations.stops[rows].max(initial=-1))
 
 
 def _squares_by_station(solved: Solved, at: int, starts: Mapping[str, int]) -> FloatArray:
@@ -229,36 +229,32 @@ def _squares_by_station(solved: Solved, at: int, starts: Mapping[str, int]) -> F
     Returns:
         Infinite where a robot's pose is not known, or where no robot has a part in it.
     """
-    network, row = solved.agreed.network, solved.cell.rows[at]
+    problem, row = solved.agreed.problem, solved.cell.rows[at]
     stations = np.arange(len(solved.cell.stops))
-    one = network.sightings.subset(np.arange(len(network)) == at)
+    repeated = np.full(len(stations), at)
     here = replace(
-        one,
-        seers=(row.seer,) * len(stations),
-        seen=(row.seen,) * len(stations),
+        problem.observations.take(repeated),
+        observers=(row.seer,) * len(stations),
+        observed=(row.seen,) * len(stations),
         stops=stations,
-        sensors=np.repeat(one.sensors, len(stations)),
-        measured=np.repeat(one.measured, len(stations), axis=0),
-        covariance=np.repeat(one.covariance, len(stations), axis=0),
-        turned=np.repeat(one.turned, len(stations)),
-        by_shared=np.repeat(one.by_shared, len(stations), axis=0),
     )
     for move in solved.agreed.moves:
         here = here.renamed(move.frame, move.twin, stations >= starts[move.twin])
-    there = replace(network, sightings=here)
+    effects = tuple(it.take(repeated) for it in problem.effects)
+    there = replace(problem, observations=here, effects=effects)
     known, squares = _known(there), np.full(len(stations), np.inf)
-    if known.any() and any(it.robot for group in there.groups for it in group.way):
+    if known.any() and any(it.robot for group in there.groups for it in group.path):
         squares[known] = by_noise_alone(there.subset(known), solved.agreed.fit)
     return squares
 
 
-def _known(network: Network) -> Mask:
+def _known(problem: Problem) -> Mask:
     """(n,) whether every robot in an observation's way has a known pose."""
-    known = np.ones(len(network), dtype=bool)
-    for group in network.groups:
-        for step in group.way:
+    known = np.ones(len(problem), dtype=bool)
+    for group in problem.groups:
+        for step in group.path:
             if step.robot:
-                poses = network.poses[step.robot][network.sightings.stops[group.rows]]
+                poses = problem.poses[step.robot][problem.observations.stops[group.rows]]
                 known[group.rows] &= np.isfinite(poses[:, 0, 0])
     return known
 
@@ -277,11 +273,11 @@ def _mutual(solved: Solved, out: IntArray, fitting: Mapping[int, Sequence[int]])
 
 def _exchanged_robots(solved: Solved, mutual: Mapping[int, int]) -> dict[int, str]:
     """Observations that disagree because two poses of a robot are exchanged, in words."""
-    rows, network = solved.cell.rows, solved.agreed.network
-    ways = {(it.seer, it.seen): network.tree.way(it.seer, it.seen) for it in rows}
+    rows, problem = solved.cell.rows, solved.agreed.problem
+    ways = {(it.seer, it.seen): problem.tree.path(it.seer, it.seen) for it in rows}
     used = solved.agreed.used
     found: dict[int, str] = {}
-    for robot in network.robots:
+    for robot in problem.robots:
         mine = [
             at
             for at, it in enumerate(rows)

@@ -153,7 +153,7 @@ def judge(
     doubts += [("check", f"{it.frame} is tied to nothing. {it.remedy}") for it in untied]
     doubts += _weak(solved.cell, edges, limits)
     doubts += _noisy(noise, limits)
-    stops = len(np.unique(solved.agreed.network.sightings.stops[solved.agreed.used]))
+    stops = len(np.unique(solved.agreed.problem.observations.stops[solved.agreed.used]))
     if stops < limits.stops[0]:
         words = f"{stops} stops leave little to check the result with: record {limits.stops[0]}."
         doubts.append(("bad" if stops < limits.stops[1] else "check", words))
@@ -233,17 +233,13 @@ def _noisy(
 
 def size_warnings(solved: Solved, spread: FloatArray) -> list[str]:
     """Words boards whose size is another than was stated, by more than noise says."""
-    seen = solved.seen
-    if seen is None:
+    looks, names = solved.looks, list(solved.cell.session.boards)
+    if looks is None:
         return []
-    looks, names = seen.looks, list(solved.cell.session.boards)
-    first = len(spread) - len(seen.free) - len(solved.arms)
-    values = looks.values.copy()
-    values[seen.free] += solved.agreed.fit.state.shared[: solved.looks_count]
     found = []
     for board, place in enumerate(looks.scales.tolist()):
-        at = first + int(np.searchsorted(seen.free, place))
-        scale, prior = float(values[place]), float(looks.prior_sigma[place])
+        (at,) = solved.columns_of(np.array([place]))
+        scale, prior = float(looks.values[place]), float(looks.prior_sigma[place])
         sigma = float(np.hypot(np.sqrt(spread[at, at]), prior))
         if abs(scale) > _SIZE_SIGMAS * sigma:
             name = f"target_{names[board]}" if names[board] else "target"

@@ -1,22 +1,26 @@
 """Lenses and boards of a whole cell, fitted with its frames: what is free of them, and how far."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from visioncal.alignment.arms import ArmsErrors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook
-from visioncal.estimator.joint import Problem, Scene, chance_limit
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.network import Network
-from visioncal.estimator.networkagree import Agreed
-from visioncal.estimator.networkfit import fit_network, normal_equations
-from visioncal.estimator.networklooks import Looks, Seen
-from visioncal.estimator.sightings import State
+from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
+from visioncal.estimation.outliers import Agreed
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import (
+    fit_problem,
+    fitted_covariance,
+    normal_equations,
+    score_gain,
+)
+from visioncal.estimator.joint import Problem as CameraCorners
+from visioncal.estimator.joint import Scene, chance_limit
 from visioncal.stages.pnp import ViewPoses
-from visioncal.types import Corners, FloatArray, IntArray
+from visioncal.types import Corners, IntArray, Mask
 
 # Values that move by less than this share of their sigma have settled.
 _SETTLED, _ROUNDS = 0.02, 6
@@ -56,7 +60,7 @@ def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPo
         corners: dict[int, Corners] = {
             view.view: view.corners for view in mine if view.corners is not None
         }
-        problems[name] = Problem.of(scene, corners)
+        problems[name] = CameraCorners.of(scene, corners)
         poses[name] = np.array([view.cam_from_target[0] for view in mine])
     return Looks.of(problems, poses)
 
@@ -65,83 +69,66 @@ def _settled(
     cell: Cell, looks: Looks, free: IntArray, agreed: Agreed, arms: ArmsErrors
 ) -> tuple[Agreed, Seen]:
     """Linearises corners and fits the cell in turn, until lenses and boards stay."""
-    bent = np.zeros(len(arms))
+    bent = arms.values
     for _ in range(_ROUNDS):
         seen = looks.seen(free)
-        network = arms.added(with_seen(cell, agreed.network, seen))
-        state = State(agreed.fit.state.edges, np.concatenate([np.zeros(len(free)), bent]))
-        part = network.subset(agreed.used)
-        fit = fit_network(part, state, agreed.fit.noise)
-        change, bent = np.split(fit.state.shared, [len(free)])
-        sigma = np.sqrt(np.diag(covariance(normal_equations(part, fit.state, fit.noise)[0])))
-        sigma = sigma[6 * len(fit.state.edges) :][: len(free)]
-        agreed = replace(agreed, network=network, fit=fit)
-        if np.all(np.abs(change) <= _SETTLED * sigma):
+        problem = with_seen(cell, agreed.problem, seen, arms)
+        part = problem.subset(agreed.used)
+        values = seen.looks.values[free]
+        start = State(agreed.fit.state.edges, np.concatenate([values, bent]))
+        fit = fit_problem(part, start, agreed.fit.noise)
+        found, bent = np.split(fit.state.values, [len(free)])
+        agreed = replace(agreed, problem=problem, fit=fit)
+        spread = fitted_covariance(part, fit.state, fit.noise)
+        sigma = np.sqrt(np.diag(spread))[problem.effect_columns[LENSES]] if len(free) else values
+        if np.all(np.abs(found - values) <= _SETTLED * sigma):
             break
-        looks = seen.looks.moved(free, change)
+        looks = seen.looks.with_values(free, found)
     return agreed, seen
 
 
-def with_seen(cell: Cell, network: Network, seen: Seen) -> Network:
-    """The network with poses as its lenses and boards make them."""
+def with_seen(cell: Cell, problem: Problem, seen: Seen, arms: ArmsErrors) -> Problem:
+    """The problem with poses as its lenses and boards make them, and the arms' errors."""
     places = {view: at for at, view in enumerate(seen.views)}
     rows = np.array([places.get(it.view, -1) for it in cell.rows], dtype=np.int64)
-    mine = rows >= 0
-    measured, spread = network.sightings.measured.copy(), network.sightings.covariance.copy()
-    by_free = np.zeros((len(rows), 6, len(seen.free)))
-    measured[mine] = seen.looks.poses[rows[mine]]
-    spread[mine], by_free[mine] = seen.spread[rows[mine]], seen.by_free[rows[mine]]
-    sightings = replace(network.sightings, measured=measured, covariance=spread, by_shared=by_free)
-    return replace(network, sightings=sightings, common=seen.common, by_flange={})
+    mine, before = rows >= 0, problem.observations
+    measured, spread = before.measured.copy(), before.covariance.copy()
+    measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
+    wider = replace(problem, observations=replace(before, measured=measured, covariance=spread))
+    return wider.with_effects([seen.effect(rows), *arms.effects])
 
 
 def _wider(cell: Cell, seen: Seen, agreed: Agreed, arms: ArmsErrors) -> IntArray:
     """What more the corners ask to set free: boards' bends, and lenses that were stated."""
     looks = seen.looks
     groups: list[IntArray] = [looks.shape_of(it) for it in range(len(looks.scales))]
-    for name, problem in looks.problems.items():
+    for name, corners in looks.problems.items():
         lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
-        if problem.scene.mode == "auto" and not np.isin(lens, seen.free).all():
+        if corners.scene.mode == "auto" and not np.isin(lens, seen.free).all():
             groups.append(lens)
     if not all(it.has_spare_corners for it in looks.problems.values()):
         return seen.free
     every = np.unique(np.concatenate([seen.free, *groups]))
-    network = arms.added(with_seen(cell, agreed.network, looks.seen(every)))
-    scores = _Scores.of(network, agreed, every, arms)
+    problem = with_seen(cell, agreed.problem, looks.seen(every), arms)
+    bent = agreed.fit.state.values[len(seen.free) :]
+    state = State(agreed.fit.state.edges, np.concatenate([looks.values[every], bent]))
+    scores = normal_equations(problem.subset(agreed.used), state, agreed.fit.noise)
+
+    def among(free: IntArray) -> Mask:
+        columns = problem.moving.copy()
+        columns[problem.effect_columns[LENSES]] = np.isin(every, free)
+        return columns
+
+    def gain(group: IntArray) -> float:
+        """By how much more than chance the squared error falls with a group free (Rao)."""
+        more = np.setdiff1d(group, free)
+        wider, now = among(np.union1d(free, more)), among(free)
+        return score_gain(*scores, wider, now) - chance_limit(len(more))
+
     free = seen.free
     while groups:
-        gain, at = max((scores.gain(free, it), at) for at, it in enumerate(groups))
-        if gain <= 0.0:
+        most, at = max((gain(it), at) for at, it in enumerate(groups))
+        if most <= 0.0:
             break
         free = np.union1d(free, groups.pop(at))
     return free
-
-
-@dataclass(frozen=True, eq=False)
-class _Scores:
-    """Normal equations with (f,) values free beside the edges: those that stand at some places."""
-
-    information: FloatArray
-    gradient: FloatArray
-    free: IntArray
-    arms: int
-
-    @classmethod
-    def of(cls, network: Network, agreed: Agreed, free: IntArray, arms: ArmsErrors) -> "_Scores":
-        bent = agreed.fit.state.shared[len(agreed.fit.state.shared) - len(arms) :]
-        shared = np.concatenate([np.zeros(len(free)), bent])
-        state = State(agreed.fit.state.edges, shared)
-        part = network.subset(agreed.used)
-        return cls(*normal_equations(part, state, agreed.fit.noise), free, len(arms))
-
-    def gain(self, free: IntArray, group: IntArray) -> float:
-        """By how much more than chance the squared error falls with a group free (Rao)."""
-        more = np.setdiff1d(group, free)
-        return self._score(np.union1d(free, more)) - self._score(free) - chance_limit(len(more))
-
-    def _score(self, free: IntArray) -> float:
-        size = len(self.gradient)
-        edges, arms = size - len(self.free) - self.arms, np.arange(size - self.arms, size)
-        at = np.concatenate([np.arange(edges), edges + np.searchsorted(self.free, free), arms])
-        gradient = self.gradient[at]
-        return float(gradient @ covariance(self.information[np.ix_(at, at)]) @ gradient)

@@ -23,8 +23,8 @@ from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Untied
 from visioncal.errors import DataError
-from visioncal.estimator.linalg import covariance, one_blas_thread
-from visioncal.estimator.networkfit import network_information
+from visioncal.estimation.solve import covariance_of
+from visioncal.estimator.linalg import one_blas_thread
 from visioncal.session import Session
 from visioncal.types import Corners, FloatArray, Progress
 
@@ -76,15 +76,13 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
         DegenerateError: The observations leave a frame open.
     """
     agreed, session = solved.agreed, cell.session
-    network = agreed.network
-    spread = covariance(
-        network_information(network.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
-    )
+    problem = agreed.problem
+    spread = covariance_of(problem.subset(agreed.used), agreed.fit)
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
     check_determined(solved.cell, last)
-    parents = {name: network.tree.branches[it.key].parent for name, it in _by_name(named).items()}
+    parents = {name: problem.tree.branches[it.key].parent for name, it in _by_name(named).items()}
     kept = {
         name: it.parent
         for name, it in cell.tree.branches.items()
@@ -130,10 +128,10 @@ def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
 
 def _erring(solved: Solved) -> list[str]:
     """Words robots whose errors follow their posture, where these were not asked for."""
-    if len(solved.arms):
+    if solved.arms.effects:
         return []
     agreed = solved.agreed
-    part = agreed.network.subset(agreed.used)
+    part = agreed.problem.subset(agreed.used)
     found = erring_arms(solved.cell, part, agreed.fit.state, agreed.fit.noise)
     return [
         f"The errors of robot {robot} follow its posture, as those of its own "
@@ -145,11 +143,10 @@ def _erring(solved: Solved) -> list[str]:
 
 def _details(solved: Solved, spread: FloatArray) -> dict[str, Any]:
     """What was found of the arms, where it was asked for."""
-    count = len(solved.arms)
-    if not count:
+    if not solved.arms.effects:
         return {}
-    values = solved.agreed.fit.state.shared[-count:]
-    return {"arms": solved.arms.document(values, spread[-count:, -count:])}
+    agreed = solved.agreed
+    return {"arms": solved.arms.document(agreed.problem, agreed.fit.state, spread)}
 
 
 def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:
@@ -158,24 +155,22 @@ def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:
 
 def _edges(solved: Solved, named: Mapping[str, Version], spread: FloatArray) -> dict[str, Edge]:
     """The estimated transforms by the frames that they place."""
-    network, found = solved.agreed.network, {}
-    for key, at in network.unknown.items():
-        block = spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6].copy()
-        if key in network.points:
-            block[:3] = block[:, :3] = 0.0
+    problem, found = solved.agreed.problem, {}
+    for key, at in problem.unknown.items():
+        block = spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6]
         found[named[key].name] = Edge(solved.agreed.fit.state.edges[at], block)
     return found
 
 
 def _noise(solved: Solved) -> dict[str, dict[str, float]]:
     """Estimated standard deviations: of robots by name, of cameras and instruments by frame."""
-    fit, network = solved.agreed.fit, solved.agreed.network
+    fit, problem = solved.agreed.fit, solved.agreed.problem
     found = {
         robot: {
             "translation_mm": 1e3 * float(sigma_m),
             "rotation_deg": float(np.rad2deg(sigma_rad)),
         }
-        for robot, (sigma_rad, sigma_m) in zip(network.robots, fit.noise.robots, strict=True)
+        for robot, (sigma_rad, sigma_m) in zip(problem.robots, fit.noise.robots, strict=True)
     }
     if solved.seen is not None:
         pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
@@ -189,18 +184,16 @@ def _noise(solved: Solved) -> dict[str, dict[str, float]]:
 
 
 def _cameras(solved: Solved, looked: Looked, spread: FloatArray) -> dict[str, CameraResult]:
-    seen = solved.seen
-    if seen is None:
+    seen, looks = solved.seen, solved.looks
+    if seen is None or looks is None:
         return {}
-    change = solved.agreed.fit.state.shared[: solved.looks_count]
-    looks = seen.looks.moved(seen.free, change)
-    first, found = len(spread) - len(seen.free) - len(solved.arms), {}
+    found = {}
     for name, look in looked.cameras.items():
         lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
         if not np.isin(lens, seen.free).all():
             found[name] = CameraResult(looks.camera(name), look.estimated)
             continue
-        at = first + np.searchsorted(seen.free, lens)
+        at = solved.columns_of(lens)
         found[name] = CameraResult(looks.camera(name), look.estimated, spread[np.ix_(at, at)])
     return found
 
@@ -222,7 +215,7 @@ def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
         for row, used, turned, (mm, deg) in zip(
             solved.cell.rows,
             solved.agreed.used,
-            solved.agreed.network.sightings.turned,
+            solved.agreed.problem.observations.has_rotation,
             away,
             strict=True,
         )

@@ -11,17 +11,16 @@ from visioncal.alignment.lenses import with_looks
 from visioncal.alignment.looking import Looked
 from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
-from visioncal.estimator.network import Network
-from visioncal.estimator.networkagree import Agreed, agree, settle
-from visioncal.estimator.networkfit import fit_network
-from visioncal.estimator.networklooks import Seen
-from visioncal.estimator.sightings import Common, Sightings, State
+from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
+from visioncal.estimation.outliers import Agreed, agree, settle
+from visioncal.estimation.problem import Observations, Problem, State
+from visioncal.estimation.solve import fit_problem
 from visioncal.stages.choose import chosen, padded
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
 from visioncal.targets import first_corners, rotation_transforms
-from visioncal.types import Mask, Target
+from visioncal.types import IntArray, Mask, Target
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +33,7 @@ class Solved:
         seen: What all corners say of lenses and boards; None without images.
         poses: Each row's one pose.
         untied: Frames that nothing ties to the rest.
-        arms: The robots' own errors; the last of what is shared.
+        arms: The robots' own errors.
     """
 
     cell: Cell
@@ -45,9 +44,18 @@ class Solved:
     arms: ArmsErrors
 
     @property
-    def looks_count(self) -> int:
-        """How many values of lenses and boards are free: the first of what is shared."""
-        return 0 if self.seen is None else len(self.seen.free)
+    def looks(self) -> Looks | None:
+        """Lenses and boards as they were found; None without images."""
+        if self.seen is None:
+            return None
+        found = self.agreed.problem.values_of(LENSES, self.agreed.fit.state)
+        return self.seen.looks.with_values(self.seen.free, found)
+
+    def columns_of(self, places: IntArray) -> IntArray:
+        """The problem's columns of free values of lenses and boards, by their places."""
+        first = self.agreed.problem.effect_columns[LENSES].start
+        free = np.zeros(0) if self.seen is None else self.seen.free
+        return np.asarray(first + np.searchsorted(free, places))
 
 
 def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
@@ -69,15 +77,15 @@ def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
     cell = cell.without(missing)
     cell, lost = _tied_part(cell)
     views = [looked.poses[it.view] for it in cell.rows]
-    cell, views, network, state, unplaced = _started(cell, views)
-    agreed = agree(network, state, _movable(network))
+    cell, views, problem, state, unplaced = _started(cell, views)
+    agreed = agree(problem, state, _movable(problem))
     agreed = _levelled(cell, views, agreed)
     seen, arms = None, arms_errors(cell, asked)
     if looked.cameras:
         agreed, seen = with_looks(cell, looked.cameras, views, agreed, arms)
-    elif len(arms):
+    elif arms.effects:
         agreed = _with_arms(agreed, arms)
-    agreed = settle(agreed, _movable(agreed.network))
+    agreed = settle(agreed, _movable(agreed.problem))
     return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
 
 
@@ -90,17 +98,18 @@ def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
     sensors = sensors_of(cell, views)
     frames = tuple(dict.fromkeys((*sensors, *(it.seer for it in cell.rows))))
     places = {it: at for at, it in enumerate(frames)}
-    network = agreed.network
-    sightings = replace(
-        network.sightings, sensors=np.array([places[it.seer] for it in cell.rows], dtype=np.int64)
+    problem = agreed.problem
+    observations = replace(
+        problem.observations,
+        sensors=np.array([places[it.seer] for it in cell.rows], dtype=np.int64),
     )
     more = np.ones(len(frames) - len(sensors))
     noise = agreed.fit.noise
     return replace(
         agreed,
-        network=replace(
-            network,
-            sightings=sightings,
+        problem=replace(
+            problem,
+            observations=observations,
             least_levels=np.concatenate([np.zeros(len(sensors)), more]),
         ),
         fit=replace(
@@ -110,16 +119,16 @@ def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
 
 
 def _with_arms(agreed: Agreed, arms: ArmsErrors) -> Agreed:
-    network = arms.added(agreed.network)
-    state = State(agreed.fit.state.edges, np.zeros(len(arms)))
-    fit = fit_network(network.subset(agreed.used), state, agreed.fit.noise)
-    return replace(agreed, network=network, fit=fit)
+    problem = agreed.problem.with_effects(arms.effects)
+    state = State(agreed.fit.state.edges, arms.values)
+    fit = fit_problem(problem.subset(agreed.used), state, agreed.fit.noise)
+    return replace(agreed, problem=problem, fit=fit)
 
 
-def _movable(network: Network) -> tuple[str, ...]:
+def _movable(problem: Problem) -> tuple[str, ...]:
     """What may be bumped or slip: all that is unknown but bases."""
-    bases = {branch.parent for branch in network.tree.branches.values() if branch.robot}
-    return tuple(it for it in network.tree.unknown if it not in bases)
+    bases = {branch.parent for branch in problem.tree.branches.values() if branch.robot}
+    return tuple(it for it in problem.tree.unknown if it not in bases)
 
 
 def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
@@ -148,7 +157,7 @@ def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
 
 def _started(
     cell: Cell, views: Sequence[ViewPoses]
-) -> tuple[Cell, list[ViewPoses], Network, State, tuple[str, ...]]:
+) -> tuple[Cell, list[ViewPoses], Problem, State, tuple[str, ...]]:
     """Finds a start, and gives each view its one pose by it."""
     targets = _targets(cell)
     tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets))
@@ -161,14 +170,14 @@ def _started(
         raise ambiguous_error(cell, tied.ambiguous)
     edges = np.array([tied.edges[it] for it in cell.tree.unknown]).reshape(-1, 4, 4)
     state = State(edges, np.zeros(0))
-    rough = _network(cell, [chosen(it, 0, None) for it in views])
+    rough = _problem(cell, [chosen(it, 0, None) for it in views])
     picks = pick(rough.predicted(state), _sighted(cell, views, targets))
     firsts = dict(zip(targets, first_corners(tuple(targets.values())).tolist(), strict=True))
     views = [
         chosen(view, at, targets.get(row.seen), firsts.get(row.seen, 0))
         for view, at, row in zip(views, picks.tolist(), cell.rows, strict=True)
     ]
-    return cell, views, _network(cell, views), state, tied.untied
+    return cell, views, _problem(cell, views), state, tied.untied
 
 
 def _targets(cell: Cell) -> dict[str, Target]:
@@ -202,8 +211,8 @@ def _places(cell: Cell) -> Mask:
     return np.array([alone[it.view] for it in cell.rows], dtype=bool)
 
 
-def _network(cell: Cell, views: Sequence[ViewPoses]) -> Network:
-    """The network of views with one pose each, lenses and boards as they are taken to be."""
+def _problem(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
+    """The problem of views with one pose each, lenses and boards as they are taken to be."""
     given = np.array([not it.covariance.any() for it in views])
     levels = {it: at for at, it in enumerate(sensors_of(cell, views))}
     sensors = [
@@ -213,10 +222,10 @@ def _network(cell: Cell, views: Sequence[ViewPoses]) -> Network:
     spread, places = np.array([it.covariance[0] for it in views]), _places(cell)
     spread[given] = nominal_spread()
     turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
-    return Network(
+    return Problem(
         cell.tree,
         cell.poses,
-        Sightings(
+        Observations(
             tuple(it.seer for it in cell.rows),
             tuple(it.seen for it in cell.rows),
             np.array([it.station for it in cell.rows]),
@@ -224,10 +233,8 @@ def _network(cell: Cell, views: Sequence[ViewPoses]) -> Network:
             np.array([it.cam_from_target[0] for it in views]),
             spread,
             ~places,
-            np.zeros((len(views), 6, 0)),
         ),
-        Common.none(),
-        frozenset(it.seen for it in cell.rows) - turned,
+        points=frozenset(it.seen for it in cell.rows) - turned,
     )
 
 

@@ -14,7 +14,7 @@ from visioncal.calibration.edge import Edge, edge_document, read_array, read_edg
 from visioncal.calibration.frame import present
 from visioncal.calibration.parts import CameraResult, Verdict, VerdictStatus
 from visioncal.errors import DataError
-from visioncal.estimator.networktree import Branch, Step, Tree
+from visioncal.estimation.tree import Branch, Step, Tree
 from visioncal.files import did_you_mean, read_bytes, write_atomically
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
@@ -158,7 +158,7 @@ class Alignment:
                     culprits=[frame],
                     next_step=did_you_mean(frame, known),
                 )
-        way, places = tree.way(first, second), {it: at for at, it in enumerate(self.edges)}
+        way, places = tree.path(first, second), {it: at for at, it in enumerate(self.edges)}
         rest, slope = np.eye(4), np.zeros((6, 6 * len(places)))
         for step in reversed(way):
             edge = self._matrix(step, poses)

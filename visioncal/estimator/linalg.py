@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.linalg import eigh
 from threadpoolctl import ThreadpoolController
 
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import FloatArray, IntArray, Mask
 
 _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
@@ -72,6 +72,22 @@ def covariance(information: FloatArray) -> FloatArray:
     floor = np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
     inverse = (vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.asarray(inverse * outer)
+
+
+def covariance_among(information: FloatArray, among: Mask) -> FloatArray:
+    """Inverts (n, n) information on some unknowns, the others being where they are.
+
+    Args:
+        information: (n, n) on all unknowns.
+        among: (n,) those that are open.
+
+    Returns:
+        (n, n), zero where an unknown is not among them.
+    """
+    found = np.zeros_like(information)
+    places = np.ix_(among, among)
+    found[places] = covariance(information[places])
+    return found
 
 
 def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.networktree import Step, Tree
+from visioncal.estimation.tree import Step, Tree
 from visioncal.stages.choose import Candidates
 from visioncal.types import FloatArray, IntArray, Mask
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.networktree import Step, Tree
+from visioncal.estimation.tree import Step, Tree
 from visioncal.stages.grow import grow
 from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
 from visioncal.stages.placing import mounted_points
@@ -71,7 +71,7 @@ def _pairs(tree: Tree, sighted: Sighted) -> tuple[Pair, ...]:
     rows: dict[tuple[str, str], list[int]] = {}
     for at in np.argsort(sighted.stops, kind="stable").tolist():
         rows.setdefault((sighted.seers[at], sighted.seen[at]), []).append(at)
-    return tuple(Pair(*pair, np.array(at), tree.way(*pair)) for pair, at in rows.items())
+    return tuple(Pair(*pair, np.array(at), tree.path(*pair)) for pair, at in rows.items())
 
 
 def _known(tree: Tree) -> Iterator[Relation]:

@@ -1,7 +1,7 @@
-"""Lenses and boards of a whole cell: every camera has its lens, and all see the same boards.
+"""Effect of lenses and boards: every camera has its lens, and all see the same boards.
 
-Each camera's images are compressed as those of a single camera are; what they say of lens and
-boards comes together here, with what is known of them beforehand.
+Each camera's corners are compressed to poses with their covariance, to how these move with lens and
+boards, and to information on lens and boards; here the latter comes together, with the priors.
 """
 
 from collections.abc import Mapping
@@ -11,12 +11,16 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.estimation.problem import Effect
 from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Compressed, compress
 from visioncal.estimator.corners import floored_sigma_px
 from visioncal.estimator.joint import Problem
 from visioncal.estimator.linalg import covariance
-from visioncal.estimator.sightings import Common
+from visioncal.estimator.variance import Knowledge
 from visioncal.types import Camera, FloatArray, IntArray
+
+# The effect's name in a problem.
+LENSES = "lenses and boards"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +107,10 @@ class Looks:
         """A camera with its lens as it is taken to be."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
 
-    def moved(self, free: IntArray, change: FloatArray) -> "Looks":
-        """Returns them after a (f,) change of some values."""
+    def with_values(self, free: IntArray, found: FloatArray) -> "Looks":
+        """Returns them with (f,) values at some places."""
         values = self.values.copy()
-        values[free] += change
+        values[free] = found
         return replace(self, values=values)
 
     def seen(self, free: IntArray) -> "Seen":
@@ -138,7 +142,7 @@ class Looks:
             free,
             tuple(found),
             tuple(sigmas),
-            Common(information[np.ix_(free, free)], pull[free]),
+            Knowledge(information[np.ix_(free, free)], pull[free]),
         )
 
     def places(self, name: str) -> IntArray:
@@ -158,14 +162,14 @@ class Seen:
         free: (f,) places of the values that are free.
         compressed: What each camera's corners say.
         sigmas_px: Each camera's noise of a corner's coordinate [px].
-        common: What is known of the free values without any robot.
+        known: What is known of the free values without any robot.
     """
 
     looks: Looks
     free: IntArray
     compressed: tuple[Compressed, ...]
     sigmas_px: tuple[float, ...]
-    common: Common
+    known: Knowledge
 
     @property
     def spread(self) -> FloatArray:
@@ -186,6 +190,17 @@ class Seen:
             every[:, :, self.looks.places(name)] = it.by_shared
             parts.append(every[:, :, self.free])
         return np.concatenate(parts)
+
+    def effect(self, rows: IntArray) -> Effect:
+        """The free values as an effect on observations.
+
+        Args:
+            rows: (n,) which of the views each observation is; -1 for none of them.
+        """
+        by_sensor = np.zeros((len(rows), 6, len(self.free)))
+        by_sensor[rows >= 0] = self.by_free[rows[rows >= 0]]
+        held = np.zeros(len(self.free), dtype=bool)
+        return Effect(LENSES, self.looks.values[self.free], self.known, held, by_sensor)
 
     @property
     def views(self) -> tuple[int, ...]:

@@ -98,7 +98,7 @@ class Tree:
         """The frame that a frame's body is named by: the root, or a flange."""
         return next(it for it in self.above(frame) if it == self.root or self.branches[it].robot)
 
-    def way(self, start: str, end: str) -> tuple[Step, ...]:
+    def path(self, start: str, end: str) -> tuple[Step, ...]:
         """The edges whose product is `start_from_end`, first to last."""
         up, down = list(self.above(start)), list(self.above(end))
         while up and down and up[-1] == down[-1]:

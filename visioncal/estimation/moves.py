@@ -11,15 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
-from visioncal.estimator.linalg import covariance, spectrum
-from visioncal.estimator.network import Network
-from visioncal.estimator.networkfit import (
-    NetworkFit,
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import (
+    Solution,
     by_noise_alone,
     equations_by_stop,
-    normal_equations,
+    fitted_covariance,
 )
-from visioncal.estimator.sightings import State
+from visioncal.estimator.linalg import covariance, spectrum
 from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -46,7 +45,7 @@ class Move:
     """A frame that stands elsewhere from some stop on.
 
     Attributes:
-        frame: The frame, as the network knows it until then.
+        frame: The frame, as the problem knows it until then.
         twin: Its name from then on.
         stop: The first stop at which it stands elsewhere.
         change: (4, 4) where it then is, in its own frame before: as first estimated.
@@ -60,42 +59,42 @@ class Move:
     rivals: tuple[str, ...] = ()
 
 
-def moved(network: Network, fit: NetworkFit, move: Move) -> tuple[Network, NetworkFit]:
-    """The network in which what moved is two frames, and its state."""
-    rows = network.sightings.stops >= move.stop
+def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solution]:
+    """The problem in which what moved is two frames, and its state."""
+    rows = problem.observations.stops >= move.stop
     wider = replace(
-        network,
-        tree=network.tree.with_twin(move.frame, move.twin),
-        sightings=network.sightings.renamed(move.frame, move.twin, rows),
+        problem,
+        tree=problem.tree.with_twin(move.frame, move.twin),
+        observations=problem.observations.renamed(move.frame, move.twin, rows),
     )
-    there = dict(zip(network.unknown, fit.state.edges, strict=True))
+    there = dict(zip(problem.unknown, fit.state.edges, strict=True))
     there[move.twin] = there[move.frame] @ move.change
     edges = np.array([there[name] for name in wider.unknown])
-    return wider, replace(fit, state=State(edges, fit.state.shared))
+    return wider, replace(fit, state=State(edges, fit.state.values))
 
 
-def explained_by_noise(network: Network, fit: NetworkFit, among: int) -> Mask:
+def explained_by_noise(problem: Problem, fit: Solution, among: int) -> Mask:
     """(n,) whether noise explains observations as the unknowns are, out of so many in all."""
     limit = _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / among, 6))
-    return np.asarray(by_noise_alone(network, fit) < limit)
+    return np.asarray(by_noise_alone(problem, fit) < limit)
 
 
-def better_stop(network: Network, fit: NetworkFit, move: Move) -> int:
+def better_stop(problem: Problem, fit: Solution, move: Move) -> int:
     """The stop from which on a move explains most, now that both places are known better.
 
     Args:
-        network: All n observations.
+        problem: All n observations.
         fit: The unknowns and the noise.
         move: What moved.
     """
-    mine = network.sightings.involves(move.frame) | network.sightings.involves(move.twin)
-    part = network.subset(mine)
+    mine = problem.observations.involves(move.frame) | problem.observations.involves(move.twin)
+    part = problem.subset(mine)
     every = np.ones(len(part), dtype=bool)
     explained = []
     for old, new in ((move.twin, move.frame), (move.frame, move.twin)):
-        there = replace(part, sightings=part.sightings.renamed(old, new, every))
-        explained.append(explained_by_noise(there, fit, len(network)))
-    stops = part.sightings.stops
+        there = replace(part, observations=part.observations.renamed(old, new, every))
+        explained.append(explained_by_noise(there, fit, len(problem)))
+    stops = part.observations.stops
     choices = np.unique(stops)
     counts = [np.sum(np.where(stops < it, *explained)) for it in choices]
     best = max(counts)
@@ -105,32 +104,32 @@ def better_stop(network: Network, fit: NetworkFit, move: Move) -> int:
 
 
 def moved_earlier_or_later(
-    network: Network, moves: Sequence[Move], move: Move, stop: int
-) -> tuple[Network, list[Move]]:
-    """The network with a move at another stop."""
-    mine = network.sightings
+    problem: Problem, moves: Sequence[Move], move: Move, stop: int
+) -> tuple[Problem, list[Move]]:
+    """The problem with a move at another stop."""
+    mine = problem.observations
     after = mine.stops >= stop
     sightings = mine.renamed(move.frame, move.twin, after).renamed(move.twin, move.frame, ~after)
     return (
-        replace(network, sightings=sightings),
+        replace(problem, observations=sightings),
         [replace(it, stop=stop) if it is move else it for it in moves],
     )
 
 
-def needless_move(network: Network, fit: NetworkFit, moves: Sequence[Move]) -> Move | None:
+def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Move | None:
     """The least significant move whose two places are one, up to noise; None where none is.
 
     Args:
-        network: The observations that agree.
+        problem: The observations that agree.
         fit: The unknowns and the noise.
         moves: What is thought to have moved.
     """
     if not moves:
         return None
-    known = covariance(normal_equations(network, fit.state, fit.noise)[0])
+    known = fitted_covariance(problem, fit.state, fit.noise)
     found = []
     for move in moves:
-        first, second = (network.unknown[it] for it in (move.frame, move.twin))
+        first, second = (problem.unknown[it] for it in (move.frame, move.twin))
         between = invert(fit.state.edges[first]) @ fit.state.edges[second]
         slope = np.zeros((6, len(known)))
         slope[:, 6 * first : 6 * first + 6] = -adjoint(invert(between))
@@ -138,22 +137,22 @@ def needless_move(network: Network, fit: NetworkFit, moves: Sequence[Move]) -> M
         away = log(between)
         found.append((float(away @ np.linalg.solve(slope @ known @ slope.T, away)), move))
     squared, move = min(found, key=lambda it: it[0])
-    stops = len(np.unique(network.sightings.stops))
-    return move if squared < _move_limit(network, len(network.unknown) * stops) else None
+    stops = len(np.unique(problem.observations.stops))
+    return move if squared < _move_limit(problem, len(problem.unknown) * stops) else None
 
 
 def unmoved(
-    network: Network, fit: NetworkFit, moves: Sequence[Move], move: Move
-) -> tuple[Network, NetworkFit, list[Move]]:
-    """The network without a move, its two places being one; what moved later stays."""
-    at = network.unknown[move.twin]
-    everywhere = np.ones(len(network), dtype=bool)
+    problem: Problem, fit: Solution, moves: Sequence[Move], move: Move
+) -> tuple[Problem, Solution, list[Move]]:
+    """The problem without a move, its two places being one; what moved later stays."""
+    at = problem.unknown[move.twin]
+    everywhere = np.ones(len(problem), dtype=bool)
     joined = replace(
-        network,
-        tree=network.tree.without([move.twin]),
-        sightings=network.sightings.renamed(move.twin, move.frame, everywhere),
+        problem,
+        tree=problem.tree.without([move.twin]),
+        observations=problem.observations.renamed(move.twin, move.frame, everywhere),
     )
-    state = State(np.delete(fit.state.edges, at, axis=0), fit.state.shared)
+    state = State(np.delete(fit.state.edges, at, axis=0), fit.state.values)
     rest = [
         replace(it, frame=move.frame if it.frame == move.twin else it.frame)
         for it in moves
@@ -162,17 +161,17 @@ def unmoved(
     return joined, replace(fit, state=state), rest
 
 
-def twin_name(network: Network, frame: str) -> str:
+def twin_name(problem: Problem, frame: str) -> str:
     """A name for a frame from when on it moved."""
     first, _, number = frame.partition("@")
     count = int(number or 1) + 1
-    while f"{first}@{count}" in network.tree.branches:
+    while f"{first}@{count}" in problem.tree.branches:
         count += 1
     return f"{first}@{count}"
 
 
 def gross_move(
-    network: Network, fit: NetworkFit, agrees: Mask, movable: Sequence[str]
+    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
 ) -> Move | None:
     """The move that explains most of what is not explained yet; None where none explains enough.
 
@@ -180,19 +179,19 @@ def gross_move(
     about as much, the one counts that leaves most to the next.
 
     Args:
-        network: All n observations.
+        problem: All n observations.
         fit: The unknowns and the noise, by those that agree.
         agrees: (n,) what is explained.
         movable: Frames that may have moved.
     """
-    steps = _steps(network, fit, agrees, movable)
+    steps = _steps(problem, fit, agrees, movable)
     if not steps:
         return None
     rivals = [it for it in steps if it.gain >= _WORTH_TRYING * steps[0].gain][:_MOST_TRIED]
-    moves = [_move(network, it) for it in rivals]
+    moves = [_move(problem, it) for it in rivals]
     if len(rivals) == 1:
         return moves[0]
-    followed = [_followed(network, fit, agrees, movable, it) for it in moves]
+    followed = [_followed(problem, fit, agrees, movable, it) for it in moves]
     totals = [it.gain + gain for it, (gain, _) in zip(rivals, followed, strict=True)]
     best = int(np.argmax(totals))
     # What goes next is no rival: it moved as well.
@@ -215,46 +214,46 @@ class _Step:
     change: FloatArray
 
 
-def _steps(network: Network, fit: NetworkFit, agrees: Mask, movable: Sequence[str]) -> list[_Step]:
+def _steps(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]) -> list[_Step]:
     """The steps that explain enough, those that explain most first."""
     found: list[_Step] = []
     for frame in movable:
-        rows = np.flatnonzero(network.sightings.involves(frame))
+        rows = np.flatnonzero(problem.observations.involves(frame))
         if np.sum(~agrees[rows]) >= _FEWEST:
-            found += _best_steps(network, fit, agrees, frame, rows)
+            found += _best_steps(problem, fit, agrees, frame, rows)
     return sorted(found, key=lambda it: -it.gain)
 
 
 def _followed(
-    network: Network, fit: NetworkFit, agrees: Mask, movable: Sequence[str], move: Move
+    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str], move: Move
 ) -> tuple[int, str]:
     """How many more observations the best next move explains, and the frame that it is of."""
-    wider, there = moved(network, fit, move)
-    mine = wider.sightings.involves(move.twin)
-    agrees = np.where(mine, explained_by_noise(wider, there, len(network)), agrees)
+    wider, there = moved(problem, fit, move)
+    mine = wider.observations.involves(move.twin)
+    agrees = np.where(mine, explained_by_noise(wider, there, len(problem)), agrees)
     steps = _steps(wider, there, agrees, (*movable, move.twin))
     return (steps[0].gain, steps[0].frame) if steps else (0, "")
 
 
-def _move(network: Network, step: _Step) -> Move:
-    return Move(step.frame, twin_name(network, step.frame), step.stop, step.change)
+def _move(problem: Problem, step: _Step) -> Move:
+    return Move(step.frame, twin_name(problem, step.frame), step.stop, step.change)
 
 
 def _best_steps(
-    network: Network, fit: NetworkFit, agrees: Mask, frame: str, rows: IntArray
+    problem: Problem, fit: Solution, agrees: Mask, frame: str, rows: IntArray
 ) -> list[_Step]:
     """The step of a frame that explains most, and the best that is another one."""
-    part = network.subset(np.isin(np.arange(len(network)), rows))
-    order = np.argsort(part.sightings.stops, kind="stable")
+    part = problem.subset(np.isin(np.arange(len(problem)), rows))
+    order = np.argsort(part.observations.stops, kind="stable")
     asked = part.change_of(frame, fit.state)[order]
     spread = _asked_spread(part, fit, frame)[order]
-    stops, explained = part.sightings.stops[order], agrees[rows][order]
+    stops, explained = part.observations.stops[order], agrees[rows][order]
     open_rows = np.flatnonzero(~explained)
     some = open_rows[np.linspace(0, len(open_rows) - 1, min(_ASKED, len(open_rows))).astype(int)]
     apart = log(invert(asked[some])[:, None] @ asked[None])
     both = spread[some][:, None] + spread[None]
     squares = np.einsum("abi,abi->ab", apart, np.linalg.solve(both, apart[..., None])[..., 0])
-    alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(network), 6)
+    alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(problem), 6)
     gains = np.cumsum((alike.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
     # Of stops that explain as much the last: between them nothing speaks for either.
     first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)[::-1]
@@ -287,31 +286,31 @@ def _is_enough(after: Mask, explained: Mask, stops: IntArray, begin: int) -> boo
     )
 
 
-def _asked_spread(network: Network, fit: NetworkFit, frame: str) -> FloatArray:
+def _asked_spread(problem: Problem, fit: Solution, frame: str) -> FloatArray:
     """Covariances (n, 6, 6) of the changes that observations ask for."""
-    linear = network.linear(fit.state, ideal=True)
-    spread = network.total(linear, fit.noise)
-    at = 6 * network.unknown[frame]
+    linear = problem.linear(fit.state, ideal=True)
+    spread = problem.total_covariance(linear, fit.noise)
+    at = 6 * problem.unknown[frame]
     back = np.linalg.inv(linear.jacobian[:, :, at : at + 6])
     return np.asarray(back @ spread @ np.swapaxes(back, 1, 2))
 
 
-def slight_move(network: Network, fit: NetworkFit, movable: Sequence[str]) -> Move | None:
+def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move | None:
     """The most significant step of a frame at any stop; None where noise explains all of them.
 
     Args:
-        network: The observations that agree.
+        problem: The observations that agree.
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    information, pull = equations_by_stop(network, fit)
-    known = covariance(normal_equations(network, fit.state, fit.noise)[0])
+    information, pull = equations_by_stop(problem, fit)
+    known = fitted_covariance(problem, fit.state, fit.noise)
     # Sums over each stop and all after it.
     information, pull = (np.cumsum(it[::-1], axis=0)[::-1] for it in (information, pull))
-    best, limit = None, _move_limit(network, len(movable) * len(pull))
+    best, limit = None, _move_limit(problem, len(movable) * len(pull))
     for frame in movable:
-        at = slice(6 * network.unknown[frame], 6 * network.unknown[frame] + 6)
-        stops = np.unique(network.sightings.stops[network.sightings.involves(frame)])
+        at = slice(6 * problem.unknown[frame], 6 * problem.unknown[frame] + 6)
+        stops = np.unique(problem.observations.stops[problem.observations.involves(frame)])
         for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
             across = information[stop][at]
             own = across[:, at] - across @ known @ across.T
@@ -324,9 +323,9 @@ def slight_move(network: Network, fit: NetworkFit, movable: Sequence[str]) -> Mo
     if best is None:
         return None
     frame, stop, step = best
-    return _move(network, _Step(0, frame, stop, exp(step)))
+    return _move(problem, _Step(0, frame, stop, exp(step)))
 
 
-def _move_limit(network: Network, tried: int) -> float:
-    freedom = max(0.5 * (6.0 * len(network) - network.size), 6.0)
+def _move_limit(problem: Problem, tried: int) -> float:
+    freedom = max(0.5 * (6.0 * len(problem) - problem.size), 6.0)
     return 6.0 * float(f_limit(_FALSE_MOVE / tried, 6, freedom))

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimator.network import Network
-from visioncal.estimator.networktree import Branch, Tree
-from visioncal.estimator.sightings import Common, Sightings, State
+from visioncal.estimation.problem import Observations, Problem, State
+from visioncal.estimation.tree import Branch, Tree
 
 # Of a camera's poses [rad and m]: across the view, and towards it.
 CAMERA_SIGMAS = np.array([3e-4, 3e-4, 1e-4, 3e-5, 3e-5, 1.2e-4])
@@ -132,7 +131,7 @@ def observed(world, rng, changed=None, noise=1.0):
         true = np.linalg.inv(world.place(cam, stop, changed)) @ world.place(target, stop, changed)
         rows.append(moved(true, rng.normal(size=6) * CAMERA_SIGMAS * noise))
     count = len(rows)
-    sightings = Sightings(
+    observations = Observations(
         tuple(it[0] for it in world.pairs),
         tuple(it[1] for it in world.pairs),
         np.array([it[2] for it in world.pairs]),
@@ -140,27 +139,26 @@ def observed(world, rng, changed=None, noise=1.0):
         np.array(rows),
         np.tile(np.diag(CAMERA_SIGMAS**2), (count, 1, 1)),
         np.ones(count, dtype=bool),
-        np.zeros((count, 6, 0)),
     )
-    return Network(world.tree(), reported, sightings, Common.none())
+    return Problem(world.tree(), reported, observations)
 
 
 def true_state(world, tree):
     return State(np.array([world.truth[it] for it in tree.unknown]), np.zeros(0))
 
 
-def away(world, network, state):
+def away(world, problem, state):
     """(6 e,) twists of the estimated edges from the true ones, on their right."""
     found = []
-    for name, edge in zip(network.tree.unknown, state.edges, strict=True):
+    for name, edge in zip(problem.tree.unknown, state.edges, strict=True):
         between = np.linalg.inv(world.truth[name]) @ edge
         turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
         found.append(np.concatenate([turn, between[:3, 3]]))
     return np.concatenate(found)
 
 
-def swapped(network, robot, first, second):
-    """The network with a robot's poses of two stops exchanged."""
-    poses = network.poses[robot].copy()
+def swapped(problem, robot, first, second):
+    """The problem with a robot's poses of two stops exchanged."""
+    poses = problem.poses[robot].copy()
     poses[[first, second]] = poses[[second, first]]
-    return replace(network, poses={**network.poses, robot: poses})
+    return replace(problem, poses={**problem.poses, robot: poses})

@@ -1,0 +1,1 @@
+"""Effects: vectors of unknowns that move many observations together, one file each."""

@@ -1,0 +1,536 @@
+"""The estimation problem of a cell: a tree of frames, observations, and blocks of unknowns.
+
+An observation is that one frame (a camera's, an instrument's) measured where another is (a
+board's, a point's). Its residual is `log(predicted^-1 * measured)`, in the observed frame. Noise is
+that of the observation itself, whose covariance is known up to its sensor's level, and one small
+error of each robot's flange at each of its stops, which all observations by way of that flange
+share (Strobl and Hirzinger 2006; Ulrich and Hillemann 2021, for one robot).
+
+Unknown are pose edges of the tree, six numbers each, and the values of effects: vectors that move
+many observations together, as lenses, boards' shapes, arms' errors and clocks do. A value may be
+free, or held: it then stays where it is, has no column in the solver, and counts in the covariance.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from visioncal.estimation.tree import Step, Tree
+from visioncal.estimator.variance import Knowledge
+from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
+from visioncal.types import FloatArray, IntArray, Mask
+
+# A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
+_NOT_MEASURED = 1.0
+# Variance of a flange's error where nothing was observed of it [rad^2 and m^2]: nothing is known.
+ANYTHING = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What n observations measured.
+
+    Attributes:
+        observers: (n,) the frame that measured.
+        observed: (n,) the frame whose place was measured.
+        stops: (n,) the stop, numbered from 0.
+        sensors: (n,) whose noise level it is, numbered from 0; -1 where the covariance is known.
+        measured: (n, 4, 4) `observer_from_observed`.
+        covariance: (n, 6, 6) of its right perturbation, at a sensor's level of one.
+        has_rotation: (n,) whether its rotation was measured; else its place alone.
+    """
+
+    observers: tuple[str, ...]
+    observed: tuple[str, ...]
+    stops: IntArray
+    sensors: IntArray
+    measured: FloatArray
+    covariance: FloatArray
+    has_rotation: Mask
+
+    def __len__(self) -> int:
+        return len(self.stops)
+
+    def take(self, rows: IntArray) -> "Observations":
+        """Returns those of (m,) rows."""
+        return Observations(
+            tuple(self.observers[it] for it in rows.tolist()),
+            tuple(self.observed[it] for it in rows.tolist()),
+            self.stops[rows],
+            self.sensors[rows],
+            self.measured[rows],
+            self.covariance[rows],
+            self.has_rotation[rows],
+        )
+
+    def renamed(self, frame: str, other: str, rows: Mask) -> "Observations":
+        """Returns them with a frame that has another name in the rows of an (n,) mask."""
+
+        def names(old: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(
+                other if name == frame and row else name
+                for name, row in zip(old, rows.tolist(), strict=True)
+            )
+
+        return replace(self, observers=names(self.observers), observed=names(self.observed))
+
+    def involves(self, frame: str) -> Mask:
+        """(n,) which of them a frame observed or was observed in."""
+        pairs = zip(self.observers, self.observed, strict=True)
+        return np.array([frame in pair for pair in pairs], dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A vector of k unknowns that moves many observations together.
+
+    Attributes:
+        name: What it is of, as `lens and board` or `arm a`.
+        values: (k,) where the observations were linearised.
+        known: What is known of them beside the observations, as information (k, k) and half its
+            gradient (k,) at these values.
+        held: (k,) which of them stay there, and count in the covariance.
+        by_sensor: (n, 6, k) how the measured poses move with them, on their right; None for not.
+        by_flange: By robot, (s, 6, k) how its flange moves at each stop, on its right.
+        concerned: (n,) the observations at which flanges move so; None for all.
+    """
+
+    name: str
+    values: FloatArray
+    known: Knowledge
+    held: Mask
+    by_sensor: FloatArray | None = None
+    by_flange: Mapping[str, FloatArray] = field(default_factory=dict)
+    concerned: Mask | None = None
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def take(self, rows: IntArray) -> "Effect":
+        """Returns it for (m,) rows of the observations."""
+        return replace(
+            self,
+            by_sensor=None if self.by_sensor is None else self.by_sensor[rows],
+            concerned=None if self.concerned is None else self.concerned[rows],
+        )
+
+    def flange_slopes(self, robot: str, stops: IntArray) -> FloatArray:
+        """(n, 6, k) how a robot's flange moves at observations of (n,) stops."""
+        if robot not in self.by_flange:
+            return np.zeros((len(stops), 6, len(self)))
+        found = self.by_flange[robot][stops]
+        return found if self.concerned is None else found * self.concerned[:, None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePrior:
+    """Components of an unknown edge's origin that were measured by hand, in its parent's frame.
+
+    An edge moves on its right: a step v of its translation moves the origin by `R v`.
+
+    Attributes:
+        frame: The frame at the edge's end.
+        axes: (c,) which components were measured, 0 for x.
+        values_m: (c,) what was measured [m].
+        sigma_m: The standard deviation of each [m].
+    """
+
+    frame: str
+    axes: tuple[int, ...]
+    values_m: tuple[float, ...]
+    sigma_m: float
+
+    def whitened(self, edge: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (c,) in units of sigma at a (4, 4) edge, and slopes (c, 3) by its step."""
+        rows = list(self.axes)
+        away = edge[rows, 3] - np.array(self.values_m)
+        return away / self.sigma_m, edge[rows, :3] / self.sigma_m
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of the unknowns: (e, 4, 4) `parent_from_frame` of each unknown frame, and (k,)."""
+
+    edges: FloatArray
+    values: FloatArray
+
+    def moved(self, step: FloatArray) -> "State":
+        """Returns the unknowns after a (6 e + k,) step, on the right of the edges."""
+        size = 6 * len(self.edges)
+        by = exp(step[:size].reshape(-1, 6))
+        return State(self.edges @ by, self.values + step[size:])
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations.
+
+    Attributes:
+        robots: (r, 2) of each robot's flange, of rotation [rad] and translation [m], per axis.
+        sensors: (s,) by which each sensor's covariances are to be taken larger, as sigmas.
+    """
+
+    robots: FloatArray
+    sensors: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """The observations of one pair of frames, and the path between them."""
+
+    rows: IntArray
+    path: tuple[Step, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Residuals (n, 6), their Jacobian (n, 6, p), and that by the flanges' errors (n, 6, 6 w).
+
+    The latter in the places of the robots that the observation's unit has; see `Problem.units`.
+    """
+
+    residuals: FloatArray
+    jacobian: FloatArray
+    by_errors: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The frames, the robots' poses, the observations and the unknowns.
+
+    Attributes:
+        tree: The frames.
+        poses: (s, 4, 4) `base_from_flange` by robot and stop; not a number where unknown.
+        observations: What was measured.
+        effects: The vectors of unknowns, in the order of their columns behind the edges.
+        priors: What was measured of edges by hand.
+        points: Frames of which only the place is asked for: their rotation is a matter of choice,
+            and fixed.
+        least_levels: (s,) below which no sensor's level is; where there are none, any.
+    """
+
+    tree: Tree
+    poses: Mapping[str, FloatArray]
+    observations: Observations
+    effects: tuple[Effect, ...] = ()
+    priors: tuple[EdgePrior, ...] = ()
+    points: frozenset[str] = frozenset()
+    least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    def subset(self, chosen: Mask) -> "Problem":
+        """Returns the problem with the observations of an (n,) mask."""
+        rows = np.flatnonzero(chosen)
+        return replace(
+            self,
+            observations=self.observations.take(rows),
+            effects=tuple(it.take(rows) for it in self.effects),
+        )
+
+    def with_effects(self, effects: Sequence[Effect]) -> "Problem":
+        """Returns the problem with other effects."""
+        return replace(self, effects=tuple(it for it in effects if len(it)))
+
+    @cached_property
+    def unknown(self) -> Mapping[str, int]:
+        """Places of the unknown frames among the edges."""
+        return {name: at for at, name in enumerate(self.tree.unknown)}
+
+    def edge_columns(self, frame: str) -> slice:
+        """The columns of an unknown frame's edge."""
+        at = 6 * self.unknown[frame]
+        return slice(at, at + 6)
+
+    @cached_property
+    def effect_columns(self) -> Mapping[str, slice]:
+        """The columns of each effect, by its name."""
+        found, at = {}, 6 * len(self.unknown)
+        for it in self.effects:
+            found[it.name] = slice(at, at + len(it))
+            at += len(it)
+        return found
+
+    def values_of(self, name: str, state: State) -> FloatArray:
+        """The (k,) values of an effect; of one that is not there, none."""
+        columns, first = self.effect_columns.get(name, slice(0, 0)), 6 * len(self.unknown)
+        return state.values[max(columns.start - first, 0) : max(columns.stop - first, 0)]
+
+    @property
+    def size(self) -> int:
+        """How many columns p there are."""
+        return 6 * len(self.unknown) + sum(map(len, self.effects))
+
+    @cached_property
+    def start_values(self) -> FloatArray:
+        """(k,) the effects' values where the observations were linearised."""
+        return np.concatenate([np.zeros(0), *(it.values for it in self.effects)])
+
+    @cached_property
+    def counted(self) -> Mask:
+        """(p,) which columns count in the covariance: all but what is fixed."""
+        found = np.ones(self.size, dtype=bool)
+        for name, at in self.unknown.items():
+            if name in self.points:
+                found[6 * at : 6 * at + 3] = False
+        return found
+
+    @cached_property
+    def moving(self) -> Mask:
+        """(p,) which columns a fit moves: all but what is fixed or held."""
+        found = self.counted.copy()
+        found[6 * len(self.unknown) :] &= ~np.concatenate(
+            [np.zeros(0, dtype=bool), *(it.held for it in self.effects)]
+        )
+        return found
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots, in the order of the noise's levels."""
+        return tuple(self.poses)
+
+    @cached_property
+    def groups(self) -> tuple[_Group, ...]:
+        """The observations by pairs of frames."""
+        rows: dict[tuple[str, str], list[int]] = {}
+        pairs = zip(self.observations.observers, self.observations.observed, strict=True)
+        for at, pair in enumerate(pairs):
+            rows.setdefault(pair, []).append(at)
+        return tuple(_Group(np.array(at), self.tree.path(*pair)) for pair, at in rows.items())
+
+    @cached_property
+    def units(self) -> tuple[IntArray, IntArray]:
+        """Observations whose robots' errors belong together.
+
+        Returns:
+            (n,) the unit of each observation, -1 where no robot has a part in it, and (u, w) the
+            robots of each unit by their places, -1 where it has fewer.
+        """
+        count, joined = len(self.robots), []
+        first = np.full(len(self), -1, dtype=np.int64)
+        for group in self.groups:
+            mine = [self.robots.index(it.robot) for it in group.path if it.robot]
+            keys = self.observations.stops[group.rows] * count
+            if mine:
+                first[group.rows] = keys + mine[0]
+                joined += [np.stack([keys + mine[0], keys + it], axis=1) for it in mine]
+        if not joined:
+            return first, np.zeros((0, 0), dtype=np.int64)
+        used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
+        pairs = pairs.reshape(-1, 2)
+        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
+        units, of_key = connected_components(links, directed=False)
+        members = [np.unique(used[of_key == it] % count) for it in range(units)]
+        robots = np.full((units, max(map(len, members))), -1, dtype=np.int64)
+        for row, robot in zip(robots, members, strict=True):
+            row[: len(robot)] = robot
+        of = np.where(first < 0, -1, of_key[np.searchsorted(used, np.maximum(first, used[0]))])
+        return of, robots
+
+    @cached_property
+    def by_sensor(self) -> FloatArray:
+        """(n, 6, k) how the measured poses move with all effects."""
+        parts = [
+            np.zeros((len(self), 6, len(it))) if it.by_sensor is None else it.by_sensor
+            for it in self.effects
+        ]
+        return np.concatenate([np.zeros((len(self), 6, 0)), *parts], axis=2)
+
+    @cached_property
+    def by_flange(self) -> Mapping[str, FloatArray]:
+        """By robot, (n, 6, k) how its flange moves with all effects; of unmoved robots, nothing."""
+        robots = dict.fromkeys(robot for it in self.effects for robot in it.by_flange)
+        stops = self.observations.stops
+        return {
+            robot: np.concatenate([it.flange_slopes(robot, stops) for it in self.effects], axis=2)
+            for robot in robots
+        }
+
+    def knowledge(self, state: State) -> Knowledge:
+        """What is known of all p unknowns beside the observations, and half its gradient there."""
+        information = block_diag(
+            np.zeros((6 * len(self.unknown),) * 2), *(it.known.information for it in self.effects)
+        )
+        gradient = np.zeros(self.size)
+        for it in self.effects:
+            columns = self.effect_columns[it.name]
+            change = self.values_of(it.name, state) - it.values
+            gradient[columns] = it.known.pull + it.known.information @ change
+        for prior in self.priors:
+            at = self.unknown[prior.frame]
+            away, slopes = prior.whitened(state.edges[at])
+            places = slice(6 * at + 3, 6 * at + 6)
+            information[places, places] += slopes.T @ slopes
+            gradient[places] += slopes.T @ away
+        return Knowledge(np.asarray(information), gradient)
+
+    def cost_of_knowledge(self, state: State) -> float:
+        """The squared error of what is known, in units of its sigmas, up to a constant."""
+        cost = 0.0
+        for it in self.effects:
+            change = self.values_of(it.name, state) - it.values
+            cost += float(change @ (2.0 * it.known.pull + it.known.information @ change))
+        for prior in self.priors:
+            away, _ = prior.whitened(state.edges[self.unknown[prior.frame]])
+            cost += float(away @ away)
+        return cost
+
+    def _edge(self, step: Step, state: State, rows: IntArray) -> FloatArray:
+        """(4, 4) or (m, 4, 4) `parent_from_frame` of a step at some observations."""
+        if step.robot:
+            poses = self.poses[step.robot][self.observations.stops[rows]]
+            moves = self.by_flange.get(step.robot)
+            if moves is None:
+                return poses
+            return np.asarray(poses @ exp(moves[rows] @ (state.values - self.start_values)))
+        known = self.tree.branches[step.frame].known
+        return state.edges[self.unknown[step.frame]] if known is None else known
+
+    def _product(self, path: tuple[Step, ...], state: State, rows: IntArray) -> FloatArray:
+        product = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
+        for step in path:
+            edge = self._edge(step, state, rows)
+            product = product @ (invert(edge) if step.is_up else edge)
+        return product
+
+    def predicted(self, state: State) -> FloatArray:
+        """The (n, 4, 4) `observer_from_observed` that the unknowns and the robots predict."""
+        found = np.zeros((len(self), 4, 4))
+        for group in self.groups:
+            found[group.rows] = self._product(group.path, state, group.rows)
+        return found
+
+    def measured(self, state: State) -> FloatArray:
+        """The (n, 4, 4) measured poses as they are under the effects' values."""
+        poses, change = self.observations.measured, state.values - self.start_values
+        if not change.any():
+            return poses
+        return np.asarray(poses @ exp(self.by_sensor @ change))
+
+    def linear(self, state: State, *, ideal: bool = False) -> Linear:
+        """Linearises all residuals.
+
+        Args:
+            state: Where.
+            ideal: As if all that was measured were what is predicted: noise then does not pass for
+                information about directions that are not determined.
+        """
+        rotation, predicted = self.observations.has_rotation, self.predicted(state)
+        error = np.broadcast_to(np.eye(4), predicted.shape)
+        if not ideal:
+            error = invert(predicted) @ self.measured(state)
+        residuals = np.where(rotation[:, None], log(error), _places(error))
+        by_measured = np.where(
+            rotation[:, None, None], inverse_right_jacobian(residuals), _place_slope(error)
+        )
+        by_predicted = -np.where(
+            rotation[:, None, None],
+            by_measured @ adjoint(invert(error)),
+            _place_slope(np.broadcast_to(np.eye(4), error.shape)),
+        )
+        edges, errors, effects = self._slopes(state)
+        values = by_measured @ self.by_sensor + by_predicted @ effects
+        return Linear(
+            residuals, np.concatenate([by_predicted @ edges, values], axis=2), by_predicted @ errors
+        )
+
+    def _slopes(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How the predicted poses move, on their right.
+
+        Returns:
+            (n, 6, 6 e) with the edges, (n, 6, 6 w) with the flanges' errors, and (n, 6, k) with
+            the effects on flanges.
+        """
+        of, members = self.units
+        edges = np.zeros((len(self), 6, 6 * len(self.unknown)))
+        errors = np.zeros((len(self), 6, 6 * members.shape[1]))
+        effects = np.zeros((len(self), 6, len(state.values)))
+        for group in self.groups:
+            rest = np.broadcast_to(np.eye(4), (len(group.rows), 4, 4))
+            for step in reversed(group.path):
+                edge = self._edge(step, state, group.rows)
+                # An edge moves on its right: at its end, or at its start where it is gone up.
+                before = invert(edge) @ rest if step.is_up else edge @ rest
+                moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+                if step.frame in self.unknown:
+                    edges[group.rows, :, self.edge_columns(step.frame)] += moved
+                if step.robot:
+                    mine = members[of[group.rows]] == self.robots.index(step.robot)
+                    for slot in range(members.shape[1]):
+                        rows = group.rows[mine[:, slot]]
+                        errors[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
+                if step.robot in self.by_flange:
+                    effects[group.rows] += moved @ self.by_flange[step.robot][group.rows]
+                rest = before
+        return edges, errors, effects
+
+    def change_of(self, frame: str, state: State) -> FloatArray:
+        """The change of a frame's edge that each observation asks for, were all else right.
+
+        Args:
+            frame: A frame that hangs by no robot.
+            state: The unknowns.
+
+        Returns:
+            (n, 4, 4) on the right of the edge; not a number where it is not on the path.
+        """
+        asked = np.full((len(self), 4, 4), np.nan)
+        error = invert(self.predicted(state)) @ self.measured(state)
+        for group in self.groups:
+            frames = [step.frame for step in group.path]
+            if frame not in frames:
+                continue
+            at = frames.index(frame)
+            step, rest = group.path[at], self._product(group.path[at + 1 :], state, group.rows)
+            if step.is_up:
+                carry = invert(self._edge(step, state, group.rows)) @ rest
+                asked[group.rows] = carry @ invert(error[group.rows]) @ invert(carry)
+            else:
+                asked[group.rows] = rest @ error[group.rows] @ invert(rest)
+        return asked
+
+    def covariance(self, noise: Noise) -> FloatArray:
+        """Covariances (n, 6, 6) of the observations' own noise."""
+        seen = self.observations
+        # Behind the sensors' levels, that of covariances which are known.
+        level = np.append(noise.sensors, 1.0)[seen.sensors]
+        found = level[:, None, None] ** 2 * seen.covariance
+        places = np.flatnonzero(~seen.has_rotation)
+        found[places, :3, :] = found[places, :, :3] = 0.0
+        found[places, :3, :3] = _NOT_MEASURED * np.eye(3)
+        return found
+
+    def total_covariance(self, linear: Linear, noise: Noise) -> FloatArray:
+        """Covariances (n, 6, 6) of single residuals, the flanges' errors among their noise."""
+        found, (of, _) = self.covariance(noise), self.units
+        rows = of >= 0
+        if rows.any():
+            # Slots of robots that are not on an observation's path move nothing of it.
+            slopes, variances = linear.by_errors[rows], self.error_variances(noise)[of[rows]]
+            found[rows] += (slopes * variances[:, None, :]) @ np.swapaxes(slopes, 1, 2)
+        return found
+
+    def error_variances(self, noise: Noise) -> FloatArray:
+        """Variances (u, 6 w) of the flanges' errors of each unit."""
+        _, members = self.units
+        levels = np.repeat(noise.robots, 3, axis=1) ** 2
+        found = np.where(members[:, :, None] >= 0, levels[members], ANYTHING)
+        return found.reshape(len(members), -1) if len(members) else np.zeros((0, 0))
+
+
+def _places(error: FloatArray) -> FloatArray:
+    """Residuals (n, 6) of places alone."""
+    return np.concatenate([np.zeros_like(error[:, :3, 3]), error[:, :3, 3]], axis=1)
+
+
+def _place_slope(error: FloatArray) -> FloatArray:
+    """How a place (n, 6, 6) moves with a motion of its frame."""
+    slope = np.zeros((len(error), 6, 6))
+    slope[:, 3:, 3:] = error[:, :3, :3]
+    return slope

@@ -1,0 +1,370 @@
+"""Solving a problem: Levenberg-Marquardt on all unknowns, and the noise's levels by REML."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
+from visioncal.estimator.closure import RATIO_PRIOR
+from visioncal.estimator.descend import Linearised, descend
+from visioncal.estimator.linalg import covariance_among, damped_step, gram, squared_lengths
+from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
+from visioncal.types import FloatArray, Mask
+
+_ROUNDS, _SETTLED = 20, 1e-8
+# Noise levels that change by less have settled, far below what is known of them.
+_LEVELS_SETTLED = 1e-2
+# Robots' noise levels are started from above: at least here [rad and m].
+_START_SIGMA = 5e-4
+# Where they are sought again, it is from so much above where they were.
+_ABOVE = 1.5
+# ... and never from nothing, which no residuals would lift them from.
+_ABOVE_NOTHING = 2e-5
+# A sensor may be this much better or worse than is said of it, at the most.
+_SENSOR_RANGE = (1e-3, 1e4)
+# Levels below this are none [rad and m].
+_FLOOR = 1e-9
+# Eigenvalues of the information on a flange below this share of the largest are none.
+_NULL = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The unknowns, the noise, and whether the fit converged."""
+
+    state: State
+    noise: Noise
+    settled: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """The observations once the flanges' errors have been eliminated, unit by unit.
+
+    Attributes:
+        information: (p, p) on the unknowns, whatever the robots do.
+        gradient: (p,) half the gradient of the squared error.
+        cost: The squared error.
+        errors: (u, 6 w) what each unit says of its flanges' errors.
+        slopes: (u, 6 w, p) how that moves with the unknowns.
+        covariance: (u, 6 w, 6 w) of it, by the observations alone.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    cost: float
+    errors: FloatArray
+    slopes: FloatArray
+    covariance: FloatArray
+
+
+def starting_noise(problem: Problem) -> Noise:
+    """Noise to start from: robots from above, sensors as they are said to be."""
+    sensors = int(problem.observations.sensors.max(initial=-1)) + 1
+    return Noise(np.full((len(problem.robots), 2), _START_SIGMA), np.ones(sensors))
+
+
+def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> Solution:
+    """Minimises the whitened residuals, estimating the noise's levels too.
+
+    Args:
+        problem: The observations that agree.
+        state: Where to start.
+        noise: Its levels to start from; those from above where None.
+    """
+    settled = False
+    if noise is None:
+        noise = estimate_noise(problem, state, starting_noise(problem), from_above=True)
+    for _ in range(_ROUNDS):
+        state, settled = solve_problem(problem, state, noise)
+        before, noise = noise, estimate_noise(problem, state, noise)
+        if _alike(before.robots, noise.robots) and _alike(before.sensors, noise.sensors):
+            break
+    return Solution(state, noise, settled)
+
+
+def _alike(before: FloatArray, after: FloatArray) -> bool:
+    return bool(np.allclose(before, after, rtol=_LEVELS_SETTLED, atol=_FLOOR))
+
+
+def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, bool]:
+    """Minimises the residuals whitened by a known noise.
+
+    Returns:
+        The unknowns, and whether they converged.
+    """
+    weights = _weights(problem, noise)
+    variances, moving = problem.error_variances(noise), problem.moving
+
+    def linearise(at: State) -> Linearised[State]:
+        reduced = reduce(problem, at, problem.linear(at), weights)
+        information, gradient, cost = _whole(reduced, variances)
+        free, slope = information[np.ix_(moving, moving)], gradient[moving]
+
+        def step(damping: float) -> State:
+            whole = np.zeros(len(moving))
+            whole[moving] = damped_step(free, slope, damping)
+            return at.moved(whole)
+
+        return Linearised(at, cost, step)
+
+    return descend(state, linearise, _SETTLED)
+
+
+def reduce(problem: Problem, state: State, linear: Linear, weights: FloatArray) -> Reduced:
+    """Eliminates the flanges' errors (Schur complement by unit).
+
+    Args:
+        problem: The problem.
+        state: Where it was linearised.
+        linear: The residuals there.
+        weights: (n, 6, 6) inverse covariances of the observations' own noise.
+    """
+    of, members = problem.units
+    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    weighted = weights @ every
+    total = gram(every, weighted)
+    width, size = linear.by_errors.shape[2], len(total) - 1
+    own, cross = np.zeros((len(members), width, width)), np.zeros((len(members), width, size + 1))
+    rows = of >= 0
+    slopes = np.swapaxes(linear.by_errors[rows], 1, 2)
+    np.add.at(own, of[rows], slopes @ weights[rows] @ linear.by_errors[rows])
+    np.add.at(cross, of[rows], slopes @ weighted[rows])
+    inverse, blind = _pseudo_inverse(own)
+    answer = inverse @ cross
+    total = total - gram(cross, answer)
+    known = problem.knowledge(state)
+    # A residual is what the flange's error made of it: the error itself has the other sign.
+    return Reduced(
+        total[:-1, :-1] + known.information,
+        total[:-1, -1] + known.pull,
+        float(total[-1, -1]) + problem.cost_of_knowledge(state),
+        answer[:, :, -1],
+        answer[:, :, :-1],
+        inverse + blind,
+    )
+
+
+def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses (u, w, w) where there is information, and what is open where there is none."""
+    values, vectors = np.linalg.eigh(information)
+    most = values[:, -1:] if values.shape[1] else values
+    seen = values > _NULL * np.maximum(most, np.finfo(float).tiny)
+    inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    turned = np.swapaxes(vectors, 1, 2)
+    blind = np.where(seen, 0.0, ANYTHING)
+    return (vectors * inverse[:, None, :]) @ turned, (vectors * blind[:, None, :]) @ turned
+
+
+def _whole(reduced: Reduced, variances: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Information (p, p), gradient (p,) and cost with what the units say, flanges erring."""
+    weights = np.linalg.inv(reduced.covariance + variances[:, :, None] * np.eye(variances.shape[1]))
+    weighted = weights @ reduced.slopes
+    cost = np.einsum("ui,uij,uj->", reduced.errors, weights, reduced.errors)
+    return (
+        reduced.information + gram(reduced.slopes, weighted),
+        reduced.gradient + gram(weighted, reduced.errors),
+        reduced.cost + float(cost),
+    )
+
+
+def _weights(problem: Problem, noise: Noise) -> FloatArray:
+    return np.asarray(np.linalg.inv(problem.covariance(noise)))
+
+
+def normal_equations(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Information (p, p) and gradient (p,) of half the whitened squared error."""
+    return _equations(problem, state, noise, problem.linear(state))
+
+
+def _equations(
+    problem: Problem, state: State, noise: Noise, linear: Linear
+) -> tuple[FloatArray, FloatArray]:
+    reduced = reduce(problem, state, linear, _weights(problem, noise))
+    return _whole(reduced, problem.error_variances(noise))[:2]
+
+
+def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:
+    """Covariance (p, p) of what a fit moves, where it was measured; zero of all else.
+
+    It is that for tests of residuals, from which the fit has taken so much.
+    """
+    return covariance_among(normal_equations(problem, state, noise)[0], problem.moving)
+
+
+def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
+    """Covariance (p, p) of the unknowns, where all chains close exactly; zero of what is fixed.
+
+    It is that of the result: held values count with what is known of them.
+    """
+    linear = problem.linear(solution.state, ideal=True)
+    information, _ = _equations(problem, solution.state, solution.noise, linear)
+    return covariance_among(information, problem.counted)
+
+
+def estimate_noise(
+    problem: Problem, state: State, noise: Noise, *, from_above: bool = False
+) -> Noise:
+    """Estimates the noise's levels from the residuals at some state.
+
+    Robots' by restricted likelihood (REML); a sensor's by the share of its residuals that the fit
+    has left of it (Foerstner and Wrobel 2016, section 4.2.4), the others being known.
+
+    Args:
+        problem: The observations.
+        state: The unknowns, near the best ones.
+        noise: The levels to start from.
+        from_above: Whether robots' levels are to be sought from above what the residuals show,
+            since they may be anything: a start that is too low may stay there.
+    """
+    noise = replace(noise, robots=_robots(problem, state, noise, from_above=from_above))
+    if not len(noise.sensors):
+        return noise
+    squares, left = posterior(problem, state, noise)
+    sensors = noise.sensors.copy()
+    for at in range(len(sensors)):
+        mine = problem.observations.sensors == at
+        redundancy = float(left[mine].sum())
+        if redundancy > 1.0:
+            factor = np.sqrt(float(squares[mine].sum()) / redundancy)
+            sensors[at] = np.clip(sensors[at] * factor, *_SENSOR_RANGE)
+    if len(problem.least_levels):
+        sensors = np.maximum(sensors, problem.least_levels)
+    return replace(noise, sensors=sensors)
+
+
+def _robots(problem: Problem, state: State, noise: Noise, *, from_above: bool) -> FloatArray:
+    _, members = problem.units
+    if not len(members):
+        return noise.robots
+    reduced = reduce(problem, state, problem.linear(state), _weights(problem, noise))
+    count, width = len(problem.robots), members.shape[1]
+    parts = np.zeros((2 * count, len(members), 6 * width, 6 * width))
+    for robot in range(count):
+        rows, slots = np.nonzero(members == robot)
+        for axis in range(3):
+            at = 6 * slots + axis
+            parts[2 * robot, rows, at, at] = parts[2 * robot + 1, rows, at + 3, at + 3] = 1.0
+    seen = np.array([(members == it).any() for it in range(count)])
+    places = tuple((2 * it, 2 * it + 1) for it in np.flatnonzero(seen).tolist())
+    start = np.maximum(_ABOVE * noise.robots.ravel(), _ABOVE_NOTHING)
+    if from_above:
+        squares = np.mean(reduced.errors.reshape(-1, 2, 3) ** 2, axis=(0, 2))
+        start = np.tile(np.maximum(np.sqrt(squares), _START_SIGMA), count)
+    moving = problem.moving
+    sigmas, _ = estimate_sigmas(
+        reduced.errors,
+        reduced.slopes[:, :, moving],
+        Components(reduced.covariance, parts),
+        Knowledge(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
+        np.where(np.repeat(seen, 2), start, noise.robots.ravel()),
+        replace(RATIO_PRIOR, places=places),
+        np.repeat(seen, 2),
+    )
+    return sigmas.reshape(count, 2)
+
+
+def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """What the fit leaves of each observation once its flange's error is known as well as it is.
+
+    Returns:
+        (n,) squared residuals in units of their own noise, and (n,) the redundancy of each: how
+        many of its directions were left over to judge by, of which those squares are an estimate.
+    """
+    weights = _weights(problem, noise)
+    linear = problem.linear(state)
+    reduced = reduce(problem, state, linear, weights)
+    variances = problem.error_variances(noise)
+    known = covariance_among(_whole(reduced, variances)[0], problem.moving)
+    of, _ = problem.units
+    residuals, slopes = linear.residuals.copy(), linear.jacobian.copy()
+    gone = np.zeros_like(weights)
+    rows = of >= 0
+    if rows.any():
+        # The flanges' errors as their prior and their observations have them together.
+        unit = np.eye(variances.shape[1])
+        shrink = np.linalg.inv(reduced.covariance + variances[:, :, None] * unit)
+        gain = variances[:, :, None] * shrink
+        left = variances[:, :, None] * unit - gain * variances[:, None, :]
+        by_errors = linear.by_errors[rows]
+        flange = (gain @ reduced.errors[:, :, None])[of[rows]]
+        residuals[rows] -= (by_errors @ flange)[:, :, 0]
+        slopes[rows] -= by_errors @ (gain @ reduced.slopes)[of[rows]]
+        gone[rows] = by_errors @ left[of[rows]] @ np.swapaxes(by_errors, 1, 2)
+    gone = gone + slopes @ known @ np.swapaxes(slopes, 1, 2)
+    squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
+    directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
+    return squares, directions - np.einsum("nij,nji->n", weights, gone)
+
+
+def mahalanobis_sq(
+    problem: Problem, used: Mask, solution: Solution
+) -> tuple[FloatArray, FloatArray]:
+    """How far each observation is from what the others predict, its flange's error being free.
+
+    For a used one it is the deletion residual's, by the identity of Cook and Weisberg (1982,
+    section 2.2).
+
+    Args:
+        problem: All n observations.
+        used: (n,) those that the fit was made from.
+        solution: The unknowns and the noise.
+
+    Returns:
+        (n,) squared Mahalanobis distances, and (n,) in how many directions they were measured.
+    """
+    linear = problem.linear(solution.state)
+    known = fitted_covariance(problem.subset(used), solution.state, solution.noise)
+    noise = problem.total_covariance(linear, solution.noise)
+    taken = linear.jacobian @ known @ np.swapaxes(linear.jacobian, 1, 2)
+    left = noise + np.where(used, -1.0, 1.0)[:, None, None] * taken
+    squares, directions = squared_lengths(linear.residuals, left, noise)
+    unmeasured = np.where(problem.observations.has_rotation, 0, 3)
+    return squares, np.asarray(directions - unmeasured, dtype=float)
+
+
+def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
+    """Squared distances (n,) from what is predicted, the unknowns being as they are."""
+    linear = problem.linear(solution.state)
+    total = problem.total_covariance(linear, solution.noise)
+    white = np.linalg.solve(total, linear.residuals[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(linear.residuals * white, axis=1))
+
+
+def equations_by_stop(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Information (s, p, p) and gradient (s, p) of each stop's observations by themselves."""
+    state, noise = solution.state, solution.noise
+    weights = _weights(problem, noise)
+    linear = problem.linear(state)
+    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    weighted = weights @ every
+    stops, of = problem.observations.stops, problem.units[0]
+    total = np.zeros((int(stops.max()) + 1, every.shape[2], every.shape[2]))
+    np.add.at(total, stops, np.swapaxes(every, 1, 2) @ weighted)
+    rows = of >= 0
+    if rows.any():
+        variances = problem.error_variances(noise)
+        slopes = np.swapaxes(linear.by_errors[rows], 1, 2)
+        own = np.array([np.diag(it) for it in 1.0 / variances])
+        cross = np.zeros((len(own), own.shape[1], every.shape[2]))
+        np.add.at(own, of[rows], slopes @ weights[rows] @ linear.by_errors[rows])
+        np.add.at(cross, of[rows], slopes @ weighted[rows])
+        stop_of = np.zeros(len(own), dtype=np.int64)
+        stop_of[of[rows]] = stops[rows]
+        np.subtract.at(total, stop_of, np.swapaxes(cross, 1, 2) @ np.linalg.solve(own, cross))
+    return total[:, :-1, :-1], total[:, :-1, -1]
+
+
+def score_gain(
+    information: FloatArray, gradient: FloatArray, among: Mask, fewer: Mask | None = None
+) -> float:
+    """By how much the squared error falls when columns are free (Rao's score test).
+
+    Args:
+        information: (p, p).
+        gradient: (p,) of half the squared error.
+        among: (p,) the free columns.
+        fewer: (p,) those that are free already; none where None.
+    """
+    found = float(gradient @ covariance_among(information, among) @ gradient)
+    return found if fewer is None else found - score_gain(information, gradient, fewer)
