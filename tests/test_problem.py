@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems import ROBOT_SIGMAS, away, moved, observed, true_state, world
+from problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
 from visioncal.estimation.outliers import agree, settle
-from visioncal.estimation.problem import EdgePrior, Effect, Noise, State
+from visioncal.estimation.problem import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -293,7 +293,7 @@ def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
     turn, place = plain.edges[at][:3, :3], plain.edges[at][:3, 3]
     before = turn @ spread[3:, problem.edge_columns("target_a")][:, 3:] @ turn.T
     sigma_m = float(np.sqrt(before[0, 0]))
-    prior = EdgePrior("target_a", (0,), (place[0] + 1e-4,), sigma_m)
+    prior = FramePrior("flange_a", "target_a", (0,), (place[0] + 1e-4,), sigma_m)
     found, _ = solve_problem(replace(problem, priors=(prior,)), plain, NOISE)
     # As sure as the observations: half-way. Of second order are a few thousandths of a step.
     assert found.edges[at][0, 3] - place[0] == pytest.approx(0.5e-4, rel=0.02)
@@ -301,3 +301,19 @@ def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
     block = narrower[problem.edge_columns("target_a"), problem.edge_columns("target_a")][3:, 3:]
     turned = found.edges[at][:3, :3]
     assert (turned @ block @ turned.T)[0, 0] == pytest.approx(0.5 * sigma_m**2, rel=0.02)
+
+
+def test_priors_of_frames_have_the_slopes_of_central_differences():
+    cell, problem = problem_of(15, stops=4)
+    rotation = pose((4, -2, -58), (0.0, 0.0, 0.0))[:3, :3]
+    state, step = true_state(cell, problem.tree), 1e-6
+    for prior in (
+        # Up to the cell and down again, along two axes; and an edge by itself, with its rotation.
+        FramePrior("cam_left", "cam_right", (0, 2), (0.1, 0.2), 1e-3),
+        FramePrior("flange_b", "target_b", (0, 1, 2), (0.0, 0.0, 0.1), 1e-3, rotation, 2e-3),
+    ):
+        _, slopes = problem.prior_rows(prior, state)
+        for at, column in enumerate(np.eye(problem.size) * step):
+            ends = [problem.prior_rows(prior, state.moved(it))[0] for it in (column, -column)]
+            # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
+            np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), slopes[:, at], atol=1e-6)

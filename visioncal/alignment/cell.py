@@ -7,7 +7,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from visioncal.alignment.priors import priors_of
 from visioncal.errors import DataError
+from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
@@ -39,6 +41,7 @@ class Cell:
         rows: The observations that can be used.
         reasons: Why others cannot, by view.
         stops: What the session calls each station: its stop's number, or its first view's.
+        priors: Where frames were measured to be, beside the observations.
     """
 
     session: Session
@@ -48,6 +51,7 @@ class Cell:
     rows: tuple[Row, ...]
     reasons: Mapping[int, str] = field(default_factory=dict)
     stops: tuple[int, ...] = ()
+    priors: tuple[FramePrior, ...] = ()
 
     def without(self, reasons: Mapping[int, str]) -> "Cell":
         """Returns the cell without some views."""
@@ -62,6 +66,9 @@ class Cell:
             (place[name], place[branch.parent])
             for name, branch in self.tree.branches.items()
             if branch.known is not None
+        ]
+        pairs += [
+            (place[it.first], place[it.second]) for it in self.priors if it.matrix is not None
         ]
         for seer, seen in {(it.seer, it.seen) for it in self.rows}:
             ends = [seer, seen]
@@ -111,7 +118,8 @@ def read_cell(session: Session) -> Cell:
         number = it.view.number if it.view.stop is None else it.view.stop
         stations.setdefault(it.station, number)
     tree = Tree(_CELL, branches)
-    cell = Cell(session, tree, "", poses, tuple(rows), reasons)
+    priors = priors_of(session.declaration.prior, tree)
+    cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors)
     cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
     return cell.held_to(_reference(cell))
 

@@ -19,6 +19,7 @@ from visioncal.alignment.faults import (
 )
 from visioncal.alignment.judging import check_determined, judge, size_warnings, weakest_link
 from visioncal.alignment.looking import Looked, look_around
+from visioncal.alignment.priors import prior_components
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Untied
@@ -112,6 +113,13 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
 
 def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
     """Reasons for doubt that are no figure of the result."""
+    agreed = solved.agreed
+    used = agreed.problem.subset(agreed.used)
+    measured = [
+        it
+        for prior in solved.cell.priors
+        for it in prior_components(prior, used, agreed.fit, spread)
+    ]
     missing = [
         f"Robot {it} stays as it reports itself: its errors take joint angles and a known model."
         for it in solved.arms.unasked
@@ -123,6 +131,7 @@ def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
         *solved.cell.session.warnings,
         *looked.warnings,
         *size_warnings(solved, spread),
+        *(it.doubt for it in measured if it.is_contradicted),
     ]
 
 

@@ -9,6 +9,7 @@ from visioncal.alignment.arms import ArmsAsked, ArmsErrors, arms_errors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.lenses import with_looks
 from visioncal.alignment.looking import Looked
+from visioncal.alignment.priors import most_contradicted
 from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
@@ -85,8 +86,20 @@ def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
         agreed, seen = with_looks(cell, looked.cameras, views, agreed, arms)
     elif arms.effects:
         agreed = _with_arms(agreed, arms)
-    agreed = settle(agreed, _movable(agreed.problem))
+    agreed = _without_contradicted(settle(agreed, _movable(agreed.problem)))
     return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
+
+
+def _without_contradicted(agreed: Agreed) -> Agreed:
+    """Leaves out priors that the observations contradict, the worst first: it misleads the rest."""
+    for _ in agreed.problem.priors:
+        worst = most_contradicted(agreed.problem.subset(agreed.used), agreed.fit)
+        if worst is None:
+            break
+        kept = tuple(it for it in agreed.problem.priors if it is not worst)
+        problem = replace(agreed.problem, priors=kept)
+        agreed = settle(replace(agreed, problem=problem), _movable(problem))
+    return agreed
 
 
 def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
@@ -152,7 +165,10 @@ def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
     }
     robots = set(tree.robots)
     poses = {name: it for name, it in cell.poses.items() if name in robots}
-    return replace(cell.without(reasons), tree=tree, poses=poses)
+    priors = tuple(
+        it for it in cell.priors if it.first in tree.branches and it.second in tree.branches
+    )
+    return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
 
 
 def _started(
@@ -160,7 +176,7 @@ def _started(
 ) -> tuple[Cell, list[ViewPoses], Problem, State, tuple[str, ...]]:
     """Finds a start, and gives each view its one pose by it."""
     targets = _targets(cell)
-    tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets))
+    tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets), cell.priors)
     if tied.untied:
         untied_robots(cell, tied.untied, seen=True)
         kept = _without_frames(cell, tied.untied)
@@ -234,6 +250,7 @@ def _problem(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
             spread,
             ~places,
         ),
+        priors=cell.priors,
         points=frozenset(it.seen for it in cell.rows) - turned,
     )
 

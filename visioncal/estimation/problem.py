@@ -128,28 +128,56 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgePrior:
-    """Components of an unknown edge's origin that were measured by hand, in its parent's frame.
-
-    An edge moves on its right: a step v of its translation moves the origin by `R v`.
+class FramePrior:
+    """Where one frame is in another that no robot parts from it, as a gauge or a drawing has it.
 
     Attributes:
-        frame: The frame at the edge's end.
-        axes: (c,) which components were measured, 0 for x.
+        first: The frame in which it was measured.
+        second: The frame whose place it is.
+        axes: (c,) which components of its origin were measured, 0 for x, along the first's axes.
         values_m: (c,) what was measured [m].
         sigma_m: The standard deviation of each [m].
+        rotation: (3, 3) `first_from_second`, where that was measured, too.
+        sigma_rad: Its standard deviation about each axis [rad].
     """
 
-    frame: str
+    first: str
+    second: str
     axes: tuple[int, ...]
     values_m: tuple[float, ...]
     sigma_m: float
+    rotation: FloatArray | None = None
+    sigma_rad: float = 0.0
 
-    def whitened(self, edge: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (c,) in units of sigma at a (4, 4) edge, and slopes (c, 3) by its step."""
+    @property
+    def matrix(self) -> FloatArray | None:
+        """(4, 4) `first_from_second`; None where it is not known whole."""
+        if self.rotation is None or self.axes != (0, 1, 2):
+            return None
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = self.rotation, self.values_m
+        return found
+
+    def whitened(self, found: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (d,) in units of sigma, and their slopes (d, 6).
+
+        Args:
+            found: (4, 4) `first_from_second` as it is estimated; the slopes are by its right
+                perturbation.
+        """
         rows = list(self.axes)
-        away = edge[rows, 3] - np.array(self.values_m)
-        return away / self.sigma_m, edge[rows, :3] / self.sigma_m
+        away = (found[rows, 3] - np.array(self.values_m)) / self.sigma_m
+        slopes = np.concatenate([np.zeros((len(rows), 3)), found[rows, :3] / self.sigma_m], axis=1)
+        if self.rotation is None:
+            return away, slopes
+        between = np.eye(4)
+        between[:3, :3] = self.rotation.T @ found[:3, :3]
+        turn = log(between[None])
+        by_turn = inverse_right_jacobian(turn)[0, :3] / self.sigma_rad
+        return (
+            np.concatenate([turn[0, :3] / self.sigma_rad, away]),
+            np.concatenate([by_turn, slopes]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +236,7 @@ class Problem:
         poses: (s, 4, 4) `base_from_flange` by robot and stop; not a number where unknown.
         observations: What was measured.
         effects: The vectors of unknowns, in the order of their columns behind the edges.
-        priors: What was measured of edges by hand.
+        priors: What was measured of frames by hand.
         points: Frames of which only the place is asked for: their rotation is a matter of choice,
             and fixed.
         least_levels: (s,) below which no sensor's level is; where there are none, any.
@@ -218,7 +246,7 @@ class Problem:
     poses: Mapping[str, FloatArray]
     observations: Observations
     effects: tuple[Effect, ...] = ()
-    priors: tuple[EdgePrior, ...] = ()
+    priors: tuple[FramePrior, ...] = ()
     points: frozenset[str] = frozenset()
     least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
 
@@ -363,12 +391,24 @@ class Problem:
             change = self.values_of(it.name, state) - it.values
             gradient[columns] = it.known.pull + it.known.information @ change
         for prior in self.priors:
-            at = self.unknown[prior.frame]
-            away, slopes = prior.whitened(state.edges[at])
-            places = slice(6 * at + 3, 6 * at + 6)
-            information[places, places] += slopes.T @ slopes
-            gradient[places] += slopes.T @ away
+            away, slopes = self.prior_rows(prior, state)
+            information += slopes.T @ slopes
+            gradient += slopes.T @ away
         return Knowledge(np.asarray(information), gradient)
+
+    def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
+        """Residuals (d,) of a prior in units of its sigmas, and their slopes (d, p)."""
+        rest, by_edges = np.eye(4), np.zeros((6, self.size))
+        nowhere = np.zeros(0, dtype=np.int64)
+        for step in reversed(self.tree.path(prior.first, prior.second)):
+            edge = self._edge(step, state, nowhere)
+            before = invert(edge) @ rest if step.is_up else edge @ rest
+            if step.frame in self.unknown:
+                moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+                by_edges[:, self.edge_columns(step.frame)] += moved
+            rest = before
+        away, slopes = prior.whitened(rest)
+        return away, slopes @ by_edges
 
     def cost_of_knowledge(self, state: State) -> float:
         """The squared error of what is known, in units of its sigmas, up to a constant."""
@@ -377,7 +417,7 @@ class Problem:
             change = self.values_of(it.name, state) - it.values
             cost += float(change @ (2.0 * it.known.pull + it.known.information @ change))
         for prior in self.priors:
-            away, _ = prior.whitened(state.edges[self.unknown[prior.frame]])
+            away, _ = self.prior_rows(prior, state)
             cost += float(away @ away)
         return cost
 

@@ -181,6 +181,11 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
     for edge, prior in declaration.prior.items():
         if prior.x_m is None and prior.y_m is None and prior.z_m is None:
             yield f"prior.{edge}", "names no component, but must give x_m, y_m or z_m"
+        turn = prior.quaternion_xyzw
+        if (turn is None) != (prior.sigma_rad is None):
+            yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
+        if turn is not None and not 0.9 < sum(it * it for it in turn) < 1.1:
+            yield f"prior.{edge}.quaternion_xyzw", f"is {turn}, but its length must be 1"
 
 
 def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:
@@ -221,12 +226,15 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
     yield from _unknown_keys(declaration, "", label)
-    for edge in declaration.prior:
-        if declaration.is_network:
-            yield f"{label}: prior.{edge} is for one camera and one robot, and is ignored here."
-        elif edge not in _EDGES:
+    for edge, prior in declaration.prior.items():
+        if not declaration.is_network and edge not in _EDGES:
             hint = did_you_mean(edge, _EDGES)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
+        elif not declaration.is_network and prior.quaternion_xyzw is not None:
+            yield (
+                f"{label}: prior.{edge}.quaternion_xyzw is ignored: with one camera and one robot "
+                "a prior is of places alone."
+            )
     if declaration.camera is not None:
         yield from _camera_warnings(declaration.camera, f"{label}: camera")
     for name, camera in declaration.cameras.items():

@@ -60,12 +60,17 @@ class ClockTable(TableModel):
 
 
 class PriorTable(TableModel):
-    """`[prior.EDGE]`. Measured components of an unknown edge and their standard deviation [m]."""
+    """`[prior.A_from_B]`. Measured components of where frame B is in A, to sigma_m [m].
+
+    quaternion_xyzw: its rotation, to sigma_rad about each axis [rad]; in whole cells alone.
+    """
 
     x_m: FiniteFloat | None = None
     y_m: FiniteFloat | None = None
     z_m: FiniteFloat | None = None
     sigma_m: Positive
+    quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
+    sigma_rad: Positive | None = None
 
 
 class TargetTable(TableModel):

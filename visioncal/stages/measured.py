@@ -9,6 +9,7 @@ from visioncal.estimator.measured import Measured
 from visioncal.estimator.observability import SIGMA_LIMIT_M, edge_names
 from visioncal.figures import figure
 from visioncal.session import Session
+from visioncal.session.tables import PriorTable
 from visioncal.stages.handeye import HandEyeResult
 
 _COMPONENTS = ("x_m", "y_m", "z_m")
@@ -26,15 +27,19 @@ def measured_of(session: Session) -> tuple[Measured, ...]:
         prior = session.declaration.prior.get(edge)
         if prior is None or (place == 1 and len(session.boards) > 1):
             continue
-        values = [getattr(prior, it) for it in _COMPONENTS]
-        axes = tuple(axis for axis, value in enumerate(values) if value is not None)
-        stated = tuple(float(values[axis]) for axis in axes)
-        found.append(Measured(place, axes, stated, prior.sigma_m))
+        found.append(Measured(place, *axes_of(prior), prior.sigma_m))
     return tuple(found)
 
 
+def axes_of(prior: PriorTable) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Which components a prior states, 0 for x, and their values [m]."""
+    values = [getattr(prior, it) for it in _COMPONENTS]
+    axes = tuple(axis for axis, value in enumerate(values) if value is not None)
+    return axes, tuple(float(values[axis]) for axis in axes)
+
+
 @dataclass(frozen=True)
-class _Component:
+class Component:
     """A measured component beside what the views alone say of it [m]."""
 
     label: str
@@ -42,6 +47,7 @@ class _Component:
     sigma_m: float
     seen_m: float
     seen_sigma_m: float
+    is_used: bool = True
 
     @property
     def is_told(self) -> bool:
@@ -51,51 +57,72 @@ class _Component:
     @property
     def is_contradicted(self) -> bool:
         """Whether the views say otherwise, by more than both may be off."""
-        away = abs(self.seen_m - self.stated_m)
-        return self.is_told and away > _CONTRADICTION * np.hypot(self.sigma_m, self.seen_sigma_m)
+        return self.is_told and self.contradiction > _CONTRADICTION
+
+    @property
+    def contradiction(self) -> float:
+        """How far the views alone are from it, in units of what both are known to."""
+        apart_m = abs(self.seen_m - self.stated_m)
+        return float(apart_m / np.hypot(self.sigma_m, self.seen_sigma_m))
+
+    @classmethod
+    def beside(
+        cls, label: str, stated_m: float, sigma_m: float, off_m: float, found_sigma_m: float
+    ) -> "Component":
+        """Takes what was measured out of an answer again.
+
+        Args:
+            label: Of which frame it is.
+            stated_m: What was measured [m].
+            sigma_m: Its standard deviation [m].
+            off_m: How far the answer is from it [m].
+            found_sigma_m: What the answer is known to [m].
+        """
+        own = max(found_sigma_m**-2.0 - sigma_m**-2.0, 0.0)
+        spread = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
+        # Both together are their mean, each weighted with its information.
+        seen = stated_m + off_m + off_m * (spread / sigma_m) ** 2
+        return cls(label, stated_m, sigma_m, float(seen), float(spread))
+
+    @property
+    def remark(self) -> str:
+        """Says that the answer rests on it."""
+        alone = "leave it open"
+        if self.is_told:
+            alone = f"tell it to {figure(1e3 * self.seen_sigma_m)} mm"
+        return (
+            f"The measured {self.label} = {1e3 * self.stated_m:g} mm was used, known to "
+            f"{figure(1e3 * self.sigma_m)} mm; the views alone {alone}."
+        )
+
+    @property
+    def doubt(self) -> str:
+        """Says that the views contradict it."""
+        return (
+            f"The measured {self.label} = {1e3 * self.stated_m:g} mm, known to "
+            f"{figure(1e3 * self.sigma_m)} mm, is contradicted by the views, which alone say "
+            f"{1e3 * self.seen_m:.4g} mm to {figure(1e3 * self.seen_sigma_m)} mm; "
+            f"{'both count in the answer' if self.is_used else 'it is not used'}. Measure it "
+            "again, or leave it out."
+        )
 
 
 def remarks(session: Session, result: HandEyeResult) -> Iterator[str]:
     """Says which measured components the answer rests on."""
-    for it in _components(session, result):
-        if it.is_contradicted:
-            continue
-        alone = "leave it open"
-        if it.is_told:
-            alone = f"tell it to {figure(1e3 * it.seen_sigma_m)} mm"
-        yield (
-            f"The measured {it.label} = {1e3 * it.stated_m:g} mm was used, known to "
-            f"{figure(1e3 * it.sigma_m)} mm; the views alone {alone}."
-        )
+    return (it.remark for it in _components(session, result) if not it.is_contradicted)
 
 
 def doubts(session: Session, result: HandEyeResult) -> Iterator[str]:
     """Says which measured components the views contradict."""
-    for it in _components(session, result):
-        if it.is_contradicted:
-            yield (
-                f"The measured {it.label} = {1e3 * it.stated_m:g} mm, known to "
-                f"{figure(1e3 * it.sigma_m)} mm, is contradicted by the views, which alone say "
-                f"{1e3 * it.seen_m:.4g} mm to {figure(1e3 * it.seen_sigma_m)} mm; both count in "
-                "the answer. Measure it again, or leave it out."
-            )
+    return (it.doubt for it in _components(session, result) if it.is_contradicted)
 
 
-def _components(session: Session, result: HandEyeResult) -> Iterator[_Component]:
+def _components(session: Session, result: HandEyeResult) -> Iterator[Component]:
     """Takes what was measured out of the answer again, one component after the other."""
     edges = result.edges
     for known in measured_of(session):
         away = known.away_m(edges.x, edges.z)
         found = known.sigmas_m(result.covariance, edges.x, edges.z)
         for axis, stated, off, sigma in zip(known.axes, known.values_m, away, found, strict=True):
-            own = max(float(sigma) ** -2.0 - known.sigma_m**-2.0, 0.0)
-            spread = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
-            # Both together are their mean, each weighted with its information.
-            seen = stated + off + off * (spread / known.sigma_m) ** 2
-            yield _Component(
-                f"{_COMPONENTS[axis]} of {edge_names(session.mount)[known.edge]}",
-                stated,
-                known.sigma_m,
-                float(seen),
-                float(spread),
-            )
+            label = f"{_COMPONENTS[axis]} of {edge_names(session.mount)[known.edge]}"
+            yield Component.beside(label, stated, known.sigma_m, float(off), float(sigma))

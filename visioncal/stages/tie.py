@@ -6,11 +6,12 @@ transform; one that a robot parts gives two, as a hand-eye calibration does. Of 
 found the best transforms are taken first (Prim 1957), until every frame hangs on the tree.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Step, Tree
 from visioncal.stages.grow import grow
 from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
@@ -36,16 +37,27 @@ class Tied:
     ambiguous: tuple[str, ...]
 
 
-def tie(tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted) -> Tied:
+def tie(
+    tree: Tree,
+    poses: Mapping[str, FloatArray],
+    sighted: Sighted,
+    priors: Sequence[FramePrior] = (),
+) -> Tied:
     """Finds where the frames are.
 
     Args:
         tree: The frames; its root's body has its place by known edges.
         poses: (s, 4, 4) `base_from_flange` by robot and stop.
         sighted: What was seen.
+        priors: Where frames were measured to be.
     """
     growth = Growth(tree, poses, sighted, _pairs(tree, sighted), ())
     relations = [*_known(tree), *mounted_points(growth)]
+    for prior in priors:
+        if prior.matrix is not None:
+            unturned = np.eye(4)[None]
+            relation = Relation(prior.first, prior.second, prior.matrix, prior.sigma_m, unturned)
+            relations.append(relation)
     for pair in growth.oriented:
         relations += _solved(tree, poses, sighted, pair)
     placed, ambiguous = grow(replace(growth, relations=relations))

@@ -1,0 +1,109 @@
+"""What a session knows of a cell's frames beforehand: `[prior.A_from_B]`, and what became of it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DataError
+from visioncal.estimation.problem import FramePrior, Problem
+from visioncal.estimation.solve import Solution, covariance_of
+from visioncal.estimation.tree import Tree
+from visioncal.files import did_you_mean
+from visioncal.session.tables import PriorTable
+from visioncal.stages.measured import Component, axes_of
+from visioncal.types import FloatArray
+
+_BETWEEN = "_from_"
+_AXES = ("x_m", "y_m", "z_m")
+
+
+def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
+    """Reads the priors of a cell's frames.
+
+    Args:
+        tables: `[prior.A_from_B]` by its name: where frame B is in frame A.
+        tree: The frames.
+
+    Raises:
+        DataError: A frame is unknown, or a robot moves one of the two before the other.
+    """
+    return tuple(_prior(name, table, tree) for name, table in tables.items())
+
+
+def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
+    first, _, second = name.partition(_BETWEEN)
+    label = f"session.toml: prior.{name}"
+    for frame in (first, second):
+        if frame not in tree.branches:
+            known = [it for it in tree.branches if it != frame]
+            raise DataError(
+                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(known)}.",
+                culprits=[label],
+                next_step=did_you_mean(frame, known)
+                or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
+            )
+    moved_by = [it.robot for it in tree.path(first, second) if it.robot]
+    if moved_by or first == second:
+        why = f"robot {moved_by[0]} moves one before the other" if moved_by else "they are one"
+        raise DataError(
+            f"{label}: {first} and {second} have no fixed place in each other: {why}.",
+            culprits=[label],
+            next_step="State where two frames are that stand in the cell, or on one flange.",
+        )
+    axes, values = axes_of(table)
+    if table.quaternion_xyzw is None or table.sigma_rad is None:
+        return FramePrior(first, second, axes, values, table.sigma_m)
+    rotation = Rotation.from_quat(table.quaternion_xyzw).as_matrix()
+    return FramePrior(first, second, axes, values, table.sigma_m, rotation, table.sigma_rad)
+
+
+def prior_components(
+    prior: FramePrior, problem: Problem, solution: Solution, spread: FloatArray
+) -> tuple[Component, ...]:
+    """The measured components of a prior beside what the observations alone say of them.
+
+    Args:
+        prior: A prior, in the problem or left out of it.
+        problem: The observations in the fit.
+        solution: The fit.
+        spread: (p, p) covariance of the unknowns.
+    """
+    used = prior in problem.priors
+    away, slopes = problem.prior_rows(prior, solution.state)
+    sigmas = np.sqrt(np.einsum("dp,pq,dq->d", slopes, spread, slopes)) * prior.sigma_m
+    # Behind those of the rotation, which no word is said of.
+    places = slice(len(away) - len(prior.axes), len(away))
+    found = []
+    for axis, stated, off, sigma in zip(
+        prior.axes,
+        prior.values_m,
+        (away[places] * prior.sigma_m).tolist(),
+        sigmas[places].tolist(),
+        strict=True,
+    ):
+        label = f"{_AXES[axis]} of {prior.first}{_BETWEEN}{prior.second}"
+        if used:
+            found.append(Component.beside(label, stated, prior.sigma_m, off, sigma))
+        else:
+            found.append(Component(label, stated, prior.sigma_m, stated + off, sigma, False))
+    return tuple(found)
+
+
+def most_contradicted(problem: Problem, solution: Solution) -> FramePrior | None:
+    """The prior that the observations contradict most; None where they contradict none.
+
+    Args:
+        problem: The observations in the fit.
+        solution: The fit.
+    """
+    if not problem.priors:
+        return None
+    spread = covariance_of(problem, solution)
+    found = [
+        (it.contradiction, at)
+        for at, prior in enumerate(problem.priors)
+        for it in prior_components(prior, problem, solution, spread)
+        if it.is_contradicted
+    ]
+    return problem.priors[max(found)[1]] if found else None
