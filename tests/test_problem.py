@@ -317,3 +317,28 @@ def test_priors_of_frames_have_the_slopes_of_central_differences():
             ends = [problem.prior_rows(prior, state.moved(it))[0] for it in (column, -column)]
             # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
             np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), slopes[:, at], atol=1e-6)
+
+
+def test_repeated_views_of_a_still_board_count_as_one():
+    rng = np.random.default_rng(16)
+    cell = world(rng, 40, 1.0)
+    problem = replace(observed(cell, rng), with_repeats=True)
+    state = true_state(cell, problem.tree)
+    pairs = zip(problem.observations.observers, problem.observations.observed, strict=True)
+    still = np.array([pair == ("cam_left", "target_floor") for pair in pairs])
+    single = problem.observations.covariance[still][0]
+    # cam_left is held in the cell by all else, as if it were known: what is left is the board's.
+    fixed = replace(
+        problem, tree=problem.tree.with_known("cam_left", cell.truth["cam_left"])
+    ).subset(still)
+    edges = np.array([cell.truth[it] for it in fixed.tree.unknown])
+    for count in (1, 5, 40):
+        some = fixed.subset(np.arange(40) < count)
+        known = covariance_of(some, Solution(State(edges, np.zeros(0)), NOISE))
+        mine = known[some.edge_columns("target_floor"), some.edge_columns("target_floor")]
+        np.testing.assert_allclose(mine, single, atol=1e-6 * single.max())
+    # What the boards on the flanges tell is as without.
+    moving = problem.subset(~still & ~problem.observations.involves("target_floor"))
+    plain = replace(moving, with_repeats=False)
+    found = [covariance_of(it, Solution(state, NOISE)) for it in (moving, plain)]
+    np.testing.assert_array_equal(*found)

@@ -87,7 +87,18 @@ def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
     elif arms.effects:
         agreed = _with_arms(agreed, arms)
     agreed = _without_contradicted(settle(agreed, _movable(agreed.problem)))
+    agreed = _with_repeats(agreed)
     return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
+
+
+def _with_repeats(agreed: Agreed) -> Agreed:
+    """Fits once more, repeated views of still boards by still cameras sharing an error.
+
+    What moved was looked for without it: their differences do not share it.
+    """
+    problem = replace(agreed.problem, with_repeats=True)
+    fit = fit_problem(problem.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
+    return replace(agreed, problem=problem, fit=fit)
 
 
 def _without_contradicted(agreed: Agreed) -> Agreed:

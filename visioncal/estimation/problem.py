@@ -240,6 +240,8 @@ class Problem:
         points: Frames of which only the place is asked for: their rotation is a matter of choice,
             and fixed.
         least_levels: (s,) below which no sensor's level is; where there are none, any.
+        with_repeats: Whether repeated observations of one still frame by another share an error as
+            large as that of a single one: what a lens or a print does to one view it does to all.
     """
 
     tree: Tree
@@ -249,6 +251,7 @@ class Problem:
     priors: tuple[FramePrior, ...] = ()
     points: frozenset[str] = frozenset()
     least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
+    with_repeats: bool = False
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -334,12 +337,29 @@ class Problem:
 
     @cached_property
     def units(self) -> tuple[IntArray, IntArray]:
-        """Observations whose robots' errors belong together.
+        """Observations whose errors belong together: by the robots at one stop, or as repeats.
 
         Returns:
-            (n,) the unit of each observation, -1 where no robot has a part in it, and (u, w) the
-            robots of each unit by their places, -1 where it has fewer.
+            (n,) the unit of each observation, -1 where it has none, and (u, w) the robots of each
+            unit by their places, -1 where it has fewer; those of repeats come last and have none.
         """
+        of, robots = self._robot_units
+        found = of.copy()
+        for at, rows in enumerate(self.repeats, start=len(robots)):
+            found[rows] = at
+        none = np.full((len(self.repeats), max(robots.shape[1], 1)), -1, dtype=np.int64)
+        return found, np.concatenate([robots.reshape(-1, none.shape[1]), none])
+
+    @cached_property
+    def repeats(self) -> tuple[IntArray, ...]:
+        """The rows of each pair of frames that no robot parts, where they repeat each other."""
+        if not self.with_repeats:
+            return ()
+        still = [it.rows for it in self.groups if not any(step.robot for step in it.path)]
+        return tuple(rows for rows in still if len(rows) > 1)
+
+    @cached_property
+    def _robot_units(self) -> tuple[IntArray, IntArray]:
         count, joined = len(self.robots), []
         first = np.full(len(self), -1, dtype=np.int64)
         for group in self.groups:
@@ -508,6 +528,8 @@ class Problem:
                 if step.robot in self.by_flange:
                     effects[group.rows] += moved @ self.by_flange[step.robot][group.rows]
                 rest = before
+        for rows in self.repeats:
+            errors[rows, :, :6] = np.eye(6)
         return edges, errors, effects
 
     def change_of(self, frame: str, state: State) -> FloatArray:
@@ -552,16 +574,26 @@ class Problem:
         rows = of >= 0
         if rows.any():
             # Slots of robots that are not on an observation's path move nothing of it.
-            slopes, variances = linear.by_errors[rows], self.error_variances(noise)[of[rows]]
-            found[rows] += (slopes * variances[:, None, :]) @ np.swapaxes(slopes, 1, 2)
+            slopes, errors = linear.by_errors[rows], self.error_covariance(noise)[of[rows]]
+            found[rows] += slopes @ errors @ np.swapaxes(slopes, 1, 2)
         return found
 
-    def error_variances(self, noise: Noise) -> FloatArray:
-        """Variances (u, 6 w) of the flanges' errors of each unit."""
+    def error_covariance(self, noise: Noise) -> FloatArray:
+        """Covariances (u, 6 w, 6 w) of the errors of each unit."""
         _, members = self.units
+        width = 6 * members.shape[1]
+        if not len(members):
+            return np.zeros((0, width, width))
         levels = np.repeat(noise.robots, 3, axis=1) ** 2
-        found = np.where(members[:, :, None] >= 0, levels[members], ANYTHING)
-        return found.reshape(len(members), -1) if len(members) else np.zeros((0, 0))
+        variances = np.full((len(members), members.shape[1], 6), ANYTHING)
+        variances[members >= 0] = levels[members[members >= 0]]
+        found = variances.reshape(len(members), width)[:, :, None] * np.eye(width)
+        own = self.covariance(noise) if self.repeats else np.zeros((0, 6, 6))
+        first = len(members) - len(self.repeats)
+        for at, rows in enumerate(self.repeats, start=first):
+            # With it, the mean of n repeats is known as well as one of them.
+            found[at, :6, :6] = (1.0 - 1.0 / len(rows)) * own[rows].mean(axis=0)
+        return found
 
 
 def _places(error: FloatArray) -> FloatArray:

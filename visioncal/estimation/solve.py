@@ -94,11 +94,11 @@ def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, 
         The unknowns, and whether they converged.
     """
     weights = _weights(problem, noise)
-    variances, moving = problem.error_variances(noise), problem.moving
+    errors, moving = problem.error_covariance(noise), problem.moving
 
     def linearise(at: State) -> Linearised[State]:
         reduced = reduce(problem, at, problem.linear(at), weights)
-        information, gradient, cost = _whole(reduced, variances)
+        information, gradient, cost = _whole(reduced, errors)
         free, slope = information[np.ix_(moving, moving)], gradient[moving]
 
         def step(damping: float) -> State:
@@ -156,9 +156,9 @@ def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (vectors * inverse[:, None, :]) @ turned, (vectors * blind[:, None, :]) @ turned
 
 
-def _whole(reduced: Reduced, variances: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+def _whole(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Information (p, p), gradient (p,) and cost with what the units say, flanges erring."""
-    weights = np.linalg.inv(reduced.covariance + variances[:, :, None] * np.eye(variances.shape[1]))
+    weights = np.linalg.inv(reduced.covariance + errors)
     weighted = weights @ reduced.slopes
     cost = np.einsum("ui,uij,uj->", reduced.errors, weights, reduced.errors)
     return (
@@ -181,7 +181,7 @@ def _equations(
     problem: Problem, state: State, noise: Noise, linear: Linear
 ) -> tuple[FloatArray, FloatArray]:
     reduced = reduce(problem, state, linear, _weights(problem, noise))
-    return _whole(reduced, problem.error_variances(noise))[:2]
+    return _whole(reduced, problem.error_covariance(noise))[:2]
 
 
 def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:
@@ -252,10 +252,14 @@ def _robots(problem: Problem, state: State, noise: Noise, *, from_above: bool) -
         squares = np.mean(reduced.errors.reshape(-1, 2, 3) ** 2, axis=(0, 2))
         start = np.tile(np.maximum(np.sqrt(squares), _START_SIGMA), count)
     moving = problem.moving
+    known = reduced.covariance.copy()
+    if problem.repeats:
+        first = len(members) - len(problem.repeats)
+        known[first:] += problem.error_covariance(noise)[first:]
     sigmas, _ = estimate_sigmas(
         reduced.errors,
         reduced.slopes[:, :, moving],
-        Components(reduced.covariance, parts),
+        Components(known, parts),
         Knowledge(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
         np.where(np.repeat(seen, 2), start, noise.robots.ravel()),
         replace(RATIO_PRIOR, places=places),
@@ -274,18 +278,16 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     weights = _weights(problem, noise)
     linear = problem.linear(state)
     reduced = reduce(problem, state, linear, weights)
-    variances = problem.error_variances(noise)
-    known = covariance_among(_whole(reduced, variances)[0], problem.moving)
+    errors = problem.error_covariance(noise)
+    known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units
     residuals, slopes = linear.residuals.copy(), linear.jacobian.copy()
     gone = np.zeros_like(weights)
     rows = of >= 0
     if rows.any():
         # The flanges' errors as their prior and their observations have them together.
-        unit = np.eye(variances.shape[1])
-        shrink = np.linalg.inv(reduced.covariance + variances[:, :, None] * unit)
-        gain = variances[:, :, None] * shrink
-        left = variances[:, :, None] * unit - gain * variances[:, None, :]
+        gain = errors @ np.linalg.inv(reduced.covariance + errors)
+        left = errors - gain @ errors
         by_errors = linear.by_errors[rows]
         flange = (gain @ reduced.errors[:, :, None])[of[rows]]
         residuals[rows] -= (by_errors @ flange)[:, :, 0]
@@ -332,7 +334,12 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
 
 
 def equations_by_stop(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """Information (s, p, p) and gradient (s, p) of each stop's observations by themselves."""
+    """Information (s, p, p) and gradient (s, p) of each stop's observations by themselves.
+
+    Args:
+        problem: The observations, without errors that repeats share over stops.
+        solution: The unknowns and the noise.
+    """
     state, noise = solution.state, solution.noise
     weights = _weights(problem, noise)
     linear = problem.linear(state)
@@ -343,9 +350,9 @@ def equations_by_stop(problem: Problem, solution: Solution) -> tuple[FloatArray,
     np.add.at(total, stops, np.swapaxes(every, 1, 2) @ weighted)
     rows = of >= 0
     if rows.any():
-        variances = problem.error_variances(noise)
+        errors = problem.error_covariance(noise)
         slopes = np.swapaxes(linear.by_errors[rows], 1, 2)
-        own = np.array([np.diag(it) for it in 1.0 / variances])
+        own = np.linalg.inv(errors)
         cross = np.zeros((len(own), own.shape[1], every.shape[2]))
         np.add.at(own, of[rows], slopes @ weights[rows] @ linear.by_errors[rows])
         np.add.at(cross, of[rows], slopes @ weighted[rows])
