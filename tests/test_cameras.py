@@ -1,16 +1,20 @@
 """Cameras that need no client library: folders of images, and what OpenCV opens."""
 
 import os
+import threading
 import time
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from visioncal.drivers import extras
+from visioncal.drivers.grabbed import GrabbedPictures
 from visioncal.drivers.images import FolderCamera
+from visioncal.drivers.newest import Arrival
 from visioncal.drivers.oak import OakCamera
 from visioncal.drivers.oak_hosted import HostedOak
 from visioncal.drivers.protocols import CameraDevice, DeviceWishes
@@ -122,64 +126,86 @@ def test_what_cannot_be_opened_tells_where_to_look(tmp_path, capfd):
 
 
 class Queued:
-    """A capture as V4L2's: two old pictures at once, then one every 0.2 s."""
+    """A capture as V4L2's or a stream's: when pictures come, and what it tells of that [s]."""
 
-    def __init__(self, is_stamped):
-        self.is_stamped, self.number, self.began = is_stamped, -1, time.monotonic()
-        self.stamp = 0.0
+    def __init__(self, *pictures):
+        self.pictures, self.told_s = list(pictures), 0.0
 
     def grab(self):
         """Takes the next picture."""
-        self.number += 1
-        if self.number < 2:
-            self.stamp = self.began - 0.03 * (2 - self.number)
-        else:
-            time.sleep(0.2)
-            self.stamp = time.monotonic()
+        if not self.pictures:
+            return False
+        self.now_s, self.told_s = self.pictures.pop(0)
         return True
-
-    def retrieve(self):
-        """Gives it."""
-        return True, np.full((48, 64), max(self.number, 0), np.uint8)
 
     def get(self, what):
         """Tells when it came, where the driver does."""
-        return 1e3 * self.stamp if what == cv2.CAP_PROP_POS_MSEC and self.is_stamped else 0.0
+        return 1e3 * self.told_s if what == cv2.CAP_PROP_POS_MSEC else 0.0
+
+    def retrieve(self):
+        """Gives nothing."""
+        return False, None
+
+
+def arrivals_of(monkeypatch, *pictures, **words):
+    """What becomes of pictures that come, and are stamped, at given times."""
+    capture = Queued(*pictures)
+    clock = SimpleNamespace(monotonic=lambda: capture.now_s)
+    monkeypatch.setattr("visioncal.drivers.grabbed.time", clock)
+    source = GrabbedPictures(capture, "camera", **words)
+    return [source.grab() for _ in pictures], source
+
+
+def test_a_kernels_time_is_taken_where_it_can_be_true(monkeypatch):
+    told, source = arrivals_of(
+        monkeypatch, (100.0, 99.0), (101.0, 0.0), (102.0, 1.7e9), exposure_s=0.02, is_stream=False
+    )
+    assert told == [Arrival(99.0, 98.98), Arrival(101.0), Arrival(102.0)]
+    with pytest.raises(DriverError, match="gives no picture"):
+        source.take()
+    with pytest.raises(DriverError, match="unplugged"):
+        source.grab()
+
+
+def test_a_stream_whose_decoding_lags_is_stamped_as_if_it_did_not(monkeypatch):
+    # Its clock says 0.1 s a picture; decoding takes 0.3 s each. It then begins anew.
+    pictures = [(100.0, 5.0), (100.3, 5.1), (100.6, 5.2), (100.65, 5.9), (101.0, 2.0)]
+    found, _ = arrivals_of(monkeypatch, *pictures, is_stream=True)
+    # By 0.1 ms a second their clocks may run apart, which counts as a delay.
+    assert [it.stamp_s for it in found] == pytest.approx(
+        [100.0, 100.1, 100.2, 100.65, 101.0], abs=1e-4
+    )
+    assert [it.began_s for it in found[1:]] == [it.stamp_s for it in found[:-1]]
 
 
 class Hanging(Queued):
-    """A capture whose camera is lost."""
+    """A capture that gives one picture; then its camera is lost, and whoever waits hangs."""
+
+    def __init__(self):
+        super().__init__((0.0, 0.0))
+        self.freed = threading.Event()
+        self.isOpened, self.set = (lambda *_: True,) * 2
 
     def grab(self):
-        """Hangs for longer than anybody waits."""
-        time.sleep(1.0)
-        return False
+        """Gives the first, then hangs."""
+        return super().grab() or not self.freed.wait()
 
+    def retrieve(self):
+        """Gives it."""
+        return True, np.zeros((48, 64, 3), np.uint8)
 
-def a_camera_with(capture, monkeypatch):
-    """A camera on a capture as OpenCV would open it, with one picture that tells its resolution."""
-    capture.isOpened, capture.set, capture.release = (lambda *_: True,) * 3
-    grab, capture.grab = capture.grab, lambda: True
-    monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture)
-    camera = UvcCamera(0)
-    capture.grab = grab
-    return camera
-
-
-@pytest.mark.parametrize(("is_stamped", "wanted"), [(True, 2), (False, 3)])
-def test_pictures_that_were_queued_are_passed_by(is_stamped, wanted, monkeypatch):
-    # A busy machine may well halt this process for some milliseconds; those are no waiting.
-    monkeypatch.setattr("visioncal.drivers.uvc._WAITED_S", 0.1)
-    camera = a_camera_with(Queued(is_stamped), monkeypatch)
-    # Without times of its own the first picture that was waited for may have begun before.
-    assert camera.frame(timeout_s=10.0).image[0, 0] == wanted
+    def release(self):
+        """Frees nobody."""
 
 
 def test_a_camera_that_hangs_is_told_in_time(monkeypatch):
-    camera = a_camera_with(Hanging(is_stamped=False), monkeypatch)
-    with pytest.raises(DriverError, match="unplugged"):
-        camera.frame(timeout_s=0.05)
-    # Nobody touches it again while its driver hangs.
+    capture = Hanging()
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture)
+    camera = UvcCamera(0)
+    for _ in range(2):
+        with pytest.raises(DriverError, match=r"camera 0 stalls: no picture has come for 0\.\d s"):
+            camera.frame(timeout_s=0.01)
+    capture.freed.set()
     with pytest.raises(DriverError, match="unplugged"):
         camera.frame(timeout_s=10.0)
     camera.close()

@@ -1,76 +1,80 @@
 """Cameras that OpenCV opens: USB video class, a device file, a stream's URL, or a video file."""
 
 import math
-import threading
 import time
 from collections.abc import Mapping
-from queue import Empty, Queue
 from types import MappingProxyType
 
 import cv2
-import numpy as np
 
+from visioncal.drivers.grabbed import FilePictures, GrabbedPictures
+from visioncal.drivers.multipart import MultipartPictures, open_multipart, without_password
+from visioncal.drivers.newest import Arrival, Newest
 from visioncal.drivers.protocols import DeviceWishes, Frame
 from visioncal.errors import DriverError
+from visioncal.finders.imaging import decode_image
 from visioncal.types import Camera, Image
 
-# A picture that comes after as long a wait was not in the driver's queue [s].
-_WAITED_S = 0.008
 # Some cameras take their time for the first picture [s].
 _OPENING_S = 5.0
 # How long a stream may take to open, and for a picture [ms].
 _OPEN_MS, _READ_MS = 5000, 1500
+# Streams whose pictures carry the camera's own times.
+_TIMED = ("rtsp", "rtsps", "rtmp", "srt")
 # V4L2's word for exposure that the user sets, and its unit [s].
 _MANUAL_EXPOSURE = 1.0
 _EXPOSURE_UNIT_S = 1e-4
 
 
 class UvcCamera:
-    """A camera device through OpenCV's VideoCapture.
+    """A camera device through OpenCV's VideoCapture, or a stream of JPEG files over HTTP.
 
     What is asked for is set where the camera can; `settings` tell what it then says of itself.
     Autofocus, which would move the intrinsics, is switched off. Exposure that is not wished stays
-    as the camera has it, which is automatic for most.
+    as the camera has it, which is automatic for most. All that comes is read at once, so that no
+    old picture waits in a buffer; of a video file every picture counts.
 
     Args:
         source: The camera's index, the path of its device, a URL, or a video file.
-        wishes: What is asked of it.
+        wishes: What is asked of it; of a URL, which resolution it is to have.
 
     Raises:
-        DriverError: It cannot be opened or gives no picture, or refuses the resolution.
+        DriverError: It cannot be opened or gives no picture, or refuses what is wished.
     """
 
     def __init__(self, source: int | str, wishes: DeviceWishes | None = None) -> None:
-        self._source = source
-        self._capture = _opened(source)
-        self._is_lost = False
-        if not self._capture.isOpened():
-            self._capture.release()
-            raise DriverError(
-                f"The {self.name} cannot be opened.",
-                culprits=[str(source)],
-                next_step="Look at its cable, at whether another program holds it, and at whether "
-                "this user may read it (on Linux: the group video; v4l2-ctl --list-devices).",
-            )
         wishes = wishes or DeviceWishes()
-        self._settings = MappingProxyType(_set(self._capture, wishes))
+        self._name = f"camera {without_password(str(source))}"
         self._exposure_s = 1e-6 * (wishes.exposure_us or 0)
-        # A device has no number of pictures.
-        self._is_file = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
+        settings: dict[str, str | float] = {}
+        self._feed: Newest[bytes] | Newest[Image] | FilePictures
+        pictures = _multipart(source, wishes)
+        if pictures is not None:
+            self._feed = Newest(pictures, self.name)
+        else:
+            capture = _opened(source, self.name)
+            settings = _set(capture, wishes)
+            # A device has no number of pictures.
+            if int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0:
+                self._feed = FilePictures(capture, self.name)
+            else:
+                is_stream = _scheme(source) in _TIMED
+                grabbed = GrabbedPictures(capture, self.name, self._exposure_s, is_stream=is_stream)
+                self._feed = Newest(grabbed, self.name)
+        self._settings = MappingProxyType(settings)
         try:
-            self._grab(_OPENING_S)
-            first = self._retrieved()
-            self._resolution = (first.shape[1], first.shape[0])
-            self._check_resolution(wishes)
-        except DriverError:
+            first = self._frame(*self._feed.first(_OPENING_S))
+            self._check_resolution(first, wishes.resolution, "gives")
+        except BaseException:
             self.close()
             raise
-        self._unread = first if self._is_file else None
+        height, width = first.image.shape[:2]
+        self._resolution = (width, height)
 
     @property
     def name(self) -> str:
         """Which camera it is."""
-        return f"camera {self._source}"
+        return self._name
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -88,95 +92,85 @@ class UvcCamera:
         return self._settings
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
-        """Returns a picture whose exposure began after the call, as far as can be told.
+        """Returns a picture whose exposure began after the call, as far as can be known.
 
-        Old ones in the driver's queue are passed by. Of a video file every picture counts.
+        Where the driver knows no times that is the second picture to come after the call; what a
+        camera holds back for longer than one picture is not known. It is stamped when it came,
+        less half its exposure where that is known. Of a video file it is the next picture.
 
         Raises:
-            DriverError: None came: unplugged, or the file is at its end.
+            DriverError: None came, with for how long; or it has another resolution than before.
         """
-        asked = time.monotonic()
-        if self._unread is not None:
-            first, self._unread = self._unread, None
-            return Frame(first, asked)
-        waits = 0
-        while True:
-            waited_s = self._grab(asked + timeout_s - time.monotonic())
-            arrived = time.monotonic()
-            waits += waited_s > _WAITED_S
-            told = self._told_stamp(arrived)
-            stamp = arrived if told is None else told
-            # Where the driver tells no times, the first that was waited for began before the call.
-            began_after = waits > 1 if told is None else told - self._exposure_s > asked
-            if began_after or self._is_file:
-                exposure_s = self._exposure_s or None
-                return Frame(self._retrieved(), stamp - 0.5 * self._exposure_s, exposure_s)
+        frame = self._frame(*self._feed.after(time.monotonic(), timeout_s))
+        self._check_resolution(frame, self._resolution, "now gives")
+        return frame
 
     def close(self) -> None:
         """Lets go of it; may be called twice."""
-        # What hangs in its driver holds it until this process ends.
-        if not self._is_lost:
-            self._capture.release()
+        self._feed.close()
 
-    def _told_stamp(self, now: float) -> float | None:
-        """When a picture had come, by the clock of the kernel; only Linux' V4L2 tells it."""
-        told = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
-        return told if now - 1.0 < told <= now and not self._is_file else None
+    def _frame(self, arrival: Arrival, content: Image | bytes) -> Frame:
+        image = decode_image(content, colour=True) if isinstance(content, bytes) else content
+        if isinstance(image, str):
+            raise DriverError(
+                f"The {self.name} sent a picture that is {image}.",
+                culprits=[self.name],
+                next_step="Look at its network; then go on with --resume.",
+            )
+        return Frame(image, arrival.stamp_s - 0.5 * self._exposure_s, self._exposure_s or None)
 
-    def _grab(self, timeout_s: float) -> float:
-        """Takes the next picture and tells how long that took [s].
-
-        In a thread: the driver of a camera that is lost may hang for long.
-        """
-        if self._is_lost:
-            raise self._gone()
-        answers: Queue[tuple[bool, float]] = Queue()
-
-        def grab() -> None:
-            began = time.monotonic()
-            is_there = self._capture.grab()
-            answers.put((is_there, time.monotonic() - began))
-
-        threading.Thread(target=grab, daemon=True).start()
-        try:
-            is_there, took_s = answers.get(timeout=max(timeout_s, 0.0))
-        except Empty:
-            self._is_lost = True
-            raise self._gone() from None
-        if not is_there:
-            raise self._gone()
-        return took_s
-
-    def _retrieved(self) -> Image:
-        read, image = self._capture.retrieve()
-        if not read or image is None:
-            raise self._gone()
-        return np.asarray(image, np.uint8)
-
-    def _gone(self) -> DriverError:
-        return DriverError(
-            f"The {self.name} gives no picture: it is unplugged, or at its end.",
-            culprits=[str(self._source)],
-            next_step="Look at its cable; then go on with --resume.",
-        )
-
-    def _check_resolution(self, wishes: DeviceWishes) -> None:
-        if wishes.resolution in (None, self._resolution):
+    def _check_resolution(self, frame: Frame, needed: tuple[int, int] | None, how: str) -> None:
+        height, width = frame.image.shape[:2]
+        if needed is None or needed == (width, height):
             return
-        (width, height), wished = self._resolution, wishes.resolution
         raise DriverError(
-            f"The {self.name} gives {width}x{height} pixels, not {wished[0]}x{wished[1]}.",
-            culprits=[str(self._source)],
-            next_step="Ask for a resolution that it has (on Linux: v4l2-ctl --list-formats-ext).",
+            f"The {self.name} {how} {width}x{height} pixels, not {needed[0]}x{needed[1]}.",
+            culprits=[self.name],
+            next_step="Ask for a resolution that it has (on Linux: v4l2-ctl --list-formats-ext; of "
+            "a URL, on the camera's own page).",
         )
 
 
-def _opened(source: int | str) -> cv2.VideoCapture:
-    if isinstance(source, int) or "://" not in source:
-        return cv2.VideoCapture(source)
-    # Of itself it waits for half a minute.
-    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
-    return cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+def _scheme(source: int | str) -> str:
+    """The scheme of a URL; empty for what is none, as a GStreamer pipeline with one in it."""
+    if isinstance(source, int) or "!" in source.partition("://")[0]:
+        return ""
+    scheme, found, _ = source.partition("://")
+    return scheme.lower() if found else ""
+
+
+def _multipart(source: int | str, wishes: DeviceWishes) -> MultipartPictures | None:
+    """The JPEG files of a URL that sends such; None for every other source."""
+    if not _scheme(source):
+        return None
+    url = str(source)
+    if (wishes.exposure_us, wishes.gain, wishes.focus) != (None, None, None):
+        raise DriverError(
+            f"The camera {without_password(url)} cannot be set from here: a URL gives nothing but "
+            "pictures.",
+            culprits=["--exposure-us", "--gain", "--focus"],
+            next_step="Leave them out, and hold exposure and focus on the camera's own page.",
+        )
+    return open_multipart(url) if _scheme(url) in ("http", "https") else None
+
+
+def _opened(source: int | str, name: str) -> cv2.VideoCapture:
+    if isinstance(source, int) or not _scheme(source):
+        capture = cv2.VideoCapture(source)
+    else:
+        # Of itself it waits for half a minute, and decoding in n threads keeps n pictures back.
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS]
+        limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS, cv2.CAP_PROP_N_THREADS, 1]
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+    if not capture.isOpened():
+        capture.release()
+        raise DriverError(
+            f"The {name} cannot be opened.",
+            culprits=[name],
+            next_step="Look at its cable, at whether another program holds it, and at whether "
+            "this user may read it (on Linux: the group video; v4l2-ctl --list-devices).",
+        )
+    return capture
 
 
 def _set(capture: cv2.VideoCapture, wishes: DeviceWishes) -> dict[str, str | float]:

@@ -1,0 +1,128 @@
+"""A network camera on the loopback: numbered JPEG pictures over HTTP, and what it knows of each."""
+
+import base64
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+
+from visioncal.types import Image
+
+# Bits of a number, dark or light in blocks along the picture's upper edge, a tenth of it high.
+_BITS, _HIGH = 16, 10
+
+
+def with_number(image: Image, number: int) -> Image:
+    """Writes a number into a grey picture so that it survives JPEG."""
+    height, width = image.shape
+    bits = (number >> np.arange(_BITS) & 1).astype(np.uint8)
+    edges = np.linspace(0, width, _BITS + 1).astype(int)
+    image = image.copy()
+    image[: height // _HIGH] = np.repeat(255 * bits, np.diff(edges))
+    return image
+
+
+def number_of(image: Image) -> int:
+    """Reads it."""
+    height, width = image.shape[:2]
+    middles = ((np.arange(_BITS) + 0.5) * width / _BITS).astype(int)
+    bits = image[height // (2 * _HIGH), middles].reshape(_BITS, -1)[:, 0] > 127
+    return int(bits @ (1 << np.arange(_BITS)))
+
+
+@dataclass(eq=False)
+class NetworkCamera:
+    """What a camera sends to whoever asks, and what may befall it.
+
+    Attributes:
+        draw: Draws what the camera sees, (h, w) grey.
+        period_s: From one picture to the next [s].
+        boundary: What it states to stand between pictures.
+        is_sized: Whether it states how long each is.
+        password: `user:password` that it asks for; empty for none.
+        cut: Numbers of pictures that it sends half.
+        stalls_at: The picture from which on it sends nothing.
+        ends_at: The picture from which on it is closed.
+        drawn_s: When each picture was drawn, by its number, on the monotonic clock [s].
+    """
+
+    draw: Callable[[], Image]
+    period_s: float = 0.02
+    boundary: str = "frame"
+    is_sized: bool = True
+    password: str = ""
+    cut: tuple[int, ...] = ()
+    stalls_at: int = 1 << _BITS
+    ends_at: int = 1 << _BITS
+    drawn_s: list[float] = field(default_factory=list)
+    ended: threading.Event = field(default_factory=threading.Event)
+
+    def wait_for(self, number: int) -> None:
+        """Waits until a picture has been drawn."""
+        while len(self.drawn_s) <= number and not self.ended.is_set():
+            time.sleep(0.5 * self.period_s)
+
+    def parts(self) -> Iterator[bytes]:
+        """The parts of the answer, at the camera's pace."""
+        due_s = time.monotonic()
+        while len(self.drawn_s) < self.ends_at and not self.ended.is_set():
+            if len(self.drawn_s) >= self.stalls_at:
+                self.ended.wait()
+                return
+            time.sleep(max(due_s - time.monotonic(), 0.0))
+            due_s += self.period_s
+            yield self._part(len(self.drawn_s))
+
+    def _part(self, number: int) -> bytes:
+        drawn_s = time.monotonic()
+        _, jpeg = cv2.imencode(".jpg", with_number(self.draw(), number))
+        self.drawn_s.append(drawn_s)
+        content = jpeg.tobytes()
+        if number in self.cut:
+            content = content[: len(content) // 2]
+        size = f"Content-Length: {len(content)}\r\n" if self.is_sized else ""
+        head = f"--{self.boundary}\r\nContent-Type: image/jpeg\r\n{size}\r\n"
+        return head.encode() + content + b"\r\n"
+
+
+@contextmanager
+def served(camera: NetworkCamera) -> Iterator[str]:
+    """Serves a camera for as long as the block lasts, at the URL that is given."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            """Answers with pictures until the client or the camera ends."""
+            expected = f"Basic {base64.b64encode(camera.password.encode()).decode()}"
+            if camera.password and self.headers.get("Authorization") != expected:
+                self.send_response(401)
+                self.send_header("WWW-Authenticate", 'Basic realm="camera"')
+                self.end_headers()
+                return
+            self.send_response(200)
+            kind = f"multipart/x-mixed-replace; boundary={camera.boundary}"
+            self.send_header("Content-Type", kind)
+            self.end_headers()
+            with suppress(ConnectionError):
+                for part in camera.parts():
+                    self.wfile.write(part)
+
+        def log_message(self, *_: object) -> None:
+            """Says nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    # Whoever ends while a picture is under way to nobody must not wait for it.
+    server.daemon_threads, server.block_on_close = True, False
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/stream"
+    finally:
+        camera.ended.set()
+        server.shutdown()
+        server.server_close()
+        thread.join()
