@@ -63,9 +63,12 @@ class NetworkCamera:
     ended: threading.Event = field(default_factory=threading.Event)
 
     def wait_for(self, number: int) -> None:
-        """Waits until a picture has been drawn."""
-        while len(self.drawn_s) <= number and not self.ended.is_set():
-            time.sleep(0.5 * self.period_s)
+        """Waits until a picture has been drawn, or nobody has taken one for long."""
+        idle_s = 0.0
+        while len(self.drawn_s) <= number and idle_s < 1.0:
+            count = len(self.drawn_s)
+            time.sleep(self.period_s)
+            idle_s = 0.0 if len(self.drawn_s) > count else idle_s + self.period_s
 
     def parts(self) -> Iterator[bytes]:
         """The parts of the answer, at the camera's pace."""

@@ -213,8 +213,9 @@ def test_a_camera_that_hangs_is_told_in_time(monkeypatch):
 
 def test_a_stream_that_nobody_serves_is_told_in_seconds(capfd):
     began = time.monotonic()
-    with pytest.raises(DriverError, match="cannot be opened"):
-        UvcCamera("rtsp://127.0.0.1:9/none")
+    with pytest.raises(DriverError, match=r"camera rtsp://127\.0\.0\.1:9/none cannot be") as caught:
+        UvcCamera("rtsp://user:secret@127.0.0.1:9/none")
+    assert "its network" in caught.value.next_step
     # Refused at once here; a lost host takes its 5 s, where OpenCV would wait for 30.
     assert time.monotonic() - began < 25.0
     capfd.readouterr()

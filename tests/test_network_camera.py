@@ -4,6 +4,7 @@ import threading
 import time
 from contextlib import closing
 
+import cv2
 import numpy as np
 import pytest
 from mjpeg import NetworkCamera, number_of, served
@@ -12,7 +13,11 @@ from visioncal.drivers.protocols import CameraDevice, DeviceWishes
 from visioncal.drivers.uvc import UvcCamera
 from visioncal.errors import DriverError
 
-SMALL, LARGE = np.full((240, 320), 110, np.uint8), np.full((1944, 2592), 110, np.uint8)
+SMALL = np.full((240, 320), 110, np.uint8)
+# Five megapixels that take long to decode.
+LARGE = cv2.resize(
+    np.random.default_rng(5).integers(0, 255, (486, 648), dtype=np.uint8), (2592, 1944)
+)
 
 
 def frames_of(camera, count, *, timeout_s=10.0):

@@ -16,9 +16,12 @@ import rerun as rr
 from commands import Done, visioncal
 from drawn import column
 from live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from mjpeg import NetworkCamera, number_of, served
+from recorded import REPEATABILITY_M
 from scipy.spatial.transform import Rotation
 
 from visioncal.capture import devices
+from visioncal.capture.clock import HostClock
 from visioncal.cli import record as command
 from visioncal.errors import DataError, DriverError
 from visioncal.planning.plan import Request, make_plan
@@ -256,6 +259,27 @@ def test_a_guided_arm_is_followed(planned, cell, tmp_path):
     session = Session.load(tmp_path / "live")
     assert len(session.views) == 3
     assert session.robot_name == "ur5e"
+
+
+def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_path, monkeypatch):
+    arm, camera = fake_devices(read_plan(planned[0]))
+    arm.clock = HostClock()
+    start_move = arm.start_move
+    arm.start_move = lambda q, **_: start_move(q, speed=20.0, acceleration=100.0)
+    monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm})
+    sent = NetworkCamera(lambda: camera.frame().image)
+    with served(sent) as url:
+        words = ("--camera", f"uvc:{url}", "--plan", planned[0], "--yes", "--json")
+        done = visioncal("record", "-o", tmp_path / "live", *ARM, *QUICK, *words)
+    assert done.status == 0, done.err
+    session = Session.load(tmp_path / "live")
+    assert len(session.views) == 4
+    # One picture after the other was exposed, and the flange was there.
+    true_flanges = list(camera.exposures.values())
+    for view in session.views:
+        number = number_of(cv2.imread(str(tmp_path / "live" / view.image)))
+        off = view.base_from_flange().translation - true_flanges[number][:3, 3]
+        assert np.linalg.norm(off) < REPEATABILITY_M
 
 
 def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):

@@ -37,9 +37,9 @@ CameraOption: TypeAlias = Annotated[
     str,
     typer.Option(
         "--camera",
-        metavar="oak|uvc:N|folder:PATH",
-        help="The camera: an OAK (oak:SERIAL for one of several), a webcam or video URL, or "
-        "pictures that were taken already.",
+        metavar="oak|uvc:N|uvc:URL|folder:PATH",
+        help="The camera: an OAK (oak:SERIAL for one of several), a webcam, a network "
+        "camera's stream, or pictures that were taken already.",
     ),
 ]
 PlanOption: TypeAlias = Annotated[

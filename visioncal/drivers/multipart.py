@@ -12,6 +12,10 @@ from urllib.parse import unquote, urlsplit
 from visioncal.drivers.newest import Arrival
 from visioncal.errors import DriverError
 
+UNREACHED = (
+    "Look at its address, its power and its network: does another player on this computer show its "
+    "pictures?"
+)
 # How long it may take to answer, and how long it may then send nothing before it is given up [s].
 _SILENT_S = 5.0
 # More than any picture, and any line of a header, has [B].
@@ -46,8 +50,7 @@ def open_multipart(url: str) -> "MultipartPictures | None":
         raise DriverError(
             f"The camera {shown} cannot be opened: {getattr(error, 'reason', error)}.",
             culprits=[shown],
-            next_step="Look at its address, its power and its network; a browser on this computer "
-            "should show its pictures.",
+            next_step=UNREACHED,
         ) from error
     if response.headers.get_content_type() != "multipart/x-mixed-replace":
         response.close()

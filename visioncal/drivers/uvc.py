@@ -8,7 +8,12 @@ from types import MappingProxyType
 import cv2
 
 from visioncal.drivers.grabbed import FilePictures, GrabbedPictures
-from visioncal.drivers.multipart import MultipartPictures, open_multipart, without_password
+from visioncal.drivers.multipart import (
+    UNREACHED,
+    MultipartPictures,
+    open_multipart,
+    without_password,
+)
 from visioncal.drivers.newest import Arrival, Newest
 from visioncal.drivers.protocols import DeviceWishes, Frame
 from visioncal.errors import DriverError
@@ -167,8 +172,10 @@ def _opened(source: int | str, name: str) -> cv2.VideoCapture:
         raise DriverError(
             f"The {name} cannot be opened.",
             culprits=[name],
-            next_step="Look at its cable, at whether another program holds it, and at whether "
-            "this user may read it (on Linux: the group video; v4l2-ctl --list-devices).",
+            next_step=UNREACHED
+            if _scheme(source)
+            else "Look at its cable, at whether another program holds it, and at whether this user "
+            "may read it (on Linux: the group video; v4l2-ctl --list-devices).",
         )
     return capture
 
