@@ -134,6 +134,7 @@ def judge(
     moved: Sequence[Moved],
     untied: Sequence[Untied],
     warnings: Sequence[str],
+    notes: Sequence[str] = (),
     limits: Limits | None = None,
 ) -> Verdict:
     """Judges an alignment.
@@ -145,10 +146,12 @@ def judge(
         moved: What moved.
         untied: What nothing ties.
         warnings: Reasons for doubt that were found before.
+        notes: What is good to know.
         limits: Where doubt begins.
     """
     limits = limits or Limits()
     doubts: list[tuple[VerdictStatus, str]] = [("check", it) for it in warnings]
+    doubts += [("good", it) for it in notes]
     doubts += [("check", moved_words(it)) for it in moved]
     doubts += [("check", f"{it.frame} is tied to nothing. {it.remedy}") for it in untied]
     doubts += _weak(solved.cell, edges, limits)

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.alignment.arms import ArmsErrors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.outliers import Agreed
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import (
     fit_problem,
     fitted_covariance,
@@ -31,14 +30,14 @@ def with_looks(
     cameras: Mapping[str, CameraLook],
     views: Sequence[ViewPoses],
     agreed: Agreed,
-    arms: ArmsErrors,
+    others: Sequence[Effect],
 ) -> tuple[Agreed, Seen]:
-    """Fits lenses and boards with the rest, and the arms' errors where they are asked for."""
+    """Fits lenses and boards with the rest, and with other effects."""
     looks = _looks(cell, cameras, views)
-    agreed, seen = _settled(cell, looks, looks.first, agreed, arms)
-    wider = _wider(cell, seen, agreed, arms)
+    agreed, seen = _settled(cell, looks, looks.first, agreed, others)
+    wider = _wider(cell, seen, agreed, others)
     if len(wider) > len(seen.free):
-        agreed, seen = _settled(cell, seen.looks, wider, agreed, arms)
+        agreed, seen = _settled(cell, seen.looks, wider, agreed, others)
     return agreed, seen
 
 
@@ -66,13 +65,13 @@ def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPo
 
 
 def _settled(
-    cell: Cell, looks: Looks, free: IntArray, agreed: Agreed, arms: ArmsErrors
+    cell: Cell, looks: Looks, free: IntArray, agreed: Agreed, others: Sequence[Effect]
 ) -> tuple[Agreed, Seen]:
     """Linearises corners and fits the cell in turn, until lenses and boards stay."""
-    bent = arms.values
+    bent = np.concatenate([np.zeros(0), *(it.values for it in others)])
     for _ in range(_ROUNDS):
         seen = looks.seen(free)
-        problem = with_seen(cell, agreed.problem, seen, arms)
+        problem = with_seen(cell, agreed.problem, seen, others)
         part = problem.subset(agreed.used)
         values = seen.looks.values[free]
         start = State(agreed.fit.state.edges, np.concatenate([values, bent]))
@@ -87,18 +86,18 @@ def _settled(
     return agreed, seen
 
 
-def with_seen(cell: Cell, problem: Problem, seen: Seen, arms: ArmsErrors) -> Problem:
-    """The problem with poses as its lenses and boards make them, and the arms' errors."""
+def with_seen(cell: Cell, problem: Problem, seen: Seen, others: Sequence[Effect]) -> Problem:
+    """The problem with poses as its lenses and boards make them, and with other effects."""
     places = {view: at for at, view in enumerate(seen.views)}
     rows = np.array([places.get(it.view, -1) for it in cell.rows], dtype=np.int64)
     mine, before = rows >= 0, problem.observations
     measured, spread = before.measured.copy(), before.covariance.copy()
     measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
     wider = replace(problem, observations=replace(before, measured=measured, covariance=spread))
-    return wider.with_effects([seen.effect(rows), *arms.effects])
+    return wider.with_effects([seen.effect(rows), *others])
 
 
-def _wider(cell: Cell, seen: Seen, agreed: Agreed, arms: ArmsErrors) -> IntArray:
+def _wider(cell: Cell, seen: Seen, agreed: Agreed, others: Sequence[Effect]) -> IntArray:
     """What more the corners ask to set free: boards' bends, and lenses that were stated."""
     looks = seen.looks
     groups: list[IntArray] = [looks.shape_of(it) for it in range(len(looks.scales))]
@@ -109,7 +108,7 @@ def _wider(cell: Cell, seen: Seen, agreed: Agreed, arms: ArmsErrors) -> IntArray
     if not all(it.has_spare_corners for it in looks.problems.values()):
         return seen.free
     every = np.unique(np.concatenate([seen.free, *groups]))
-    problem = with_seen(cell, agreed.problem, looks.seen(every), arms)
+    problem = with_seen(cell, agreed.problem, looks.seen(every), others)
     bent = agreed.fit.state.values[len(seen.free) :]
     state = State(agreed.fit.state.edges, np.concatenate([looks.values[every], bent]))
     scores = normal_equations(problem.subset(agreed.used), state, agreed.fit.noise)

@@ -1,6 +1,7 @@
 """Aligning a whole cell: the way from a session to its frames, each with respect to all others."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 
 from visioncal.alignment.arms import ARMS_ASKED, ArmsAsked, erring_arms
 from visioncal.alignment.cell import Cell, read_cell
+from visioncal.alignment.clocks import Clocks, set_clocks
 from visioncal.alignment.faults import (
     Version,
     movements,
@@ -56,27 +58,33 @@ def align(
     if arms not in ARMS_ASKED:
         raise DataError(f"arms is {arms!r}, one of {', '.join(ARMS_ASKED)} is needed.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    cell = read_cell(loaded)
-    looked = look_around(cell, corners, progress)
+    looked = look_around(read_cell(loaded), corners, progress)
     if progress is not None:
         progress("align", 0, 1)
     with one_blas_thread():
-        solved = solve(cell, looked, arms)
-        return alignment_of(cell, looked, solved)
+        clocks = set_clocks(loaded, looked.poses)
+        cell = read_cell(clocks.session)
+        cell = replace(cell, reasons={**cell.reasons, **clocks.reasons})
+        solved = solve(cell, looked, clocks, arms)
+        return alignment_of(loaded, cell, looked, clocks, solved)
 
 
-def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
+def alignment_of(
+    session: Session, cell: Cell, looked: Looked, clocks: Clocks, solved: Solved
+) -> Alignment:
     """Puts the result together.
 
     Args:
+        session: The session.
         cell: The whole cell as it was read.
         looked: What its cameras saw.
+        clocks: The offsets of clocks by which its rows have poses.
         solved: The fit of what of it is tied.
 
     Raises:
         DegenerateError: The observations leave a frame open.
     """
-    agreed, session = solved.agreed, cell.session
+    agreed = solved.agreed
     problem = agreed.problem
     spread = covariance_of(problem.subset(agreed.used), agreed.fit)
     named = versions(solved)
@@ -106,8 +114,16 @@ def alignment_of(cell: Cell, looked: Looked, solved: Solved) -> Alignment:
         moved=moved,
         untied=untied,
         weakest=weakest_link(solved.cell, last),
-        verdict=judge(solved, last, noise, moved, untied, _warnings(solved, looked, spread)),
-        details=_details(solved, spread),
+        verdict=judge(
+            solved,
+            last,
+            noise,
+            moved,
+            untied,
+            [*clocks.warnings, *_warnings(solved, looked, spread)],
+            clocks.notes,
+        ),
+        details=_details(clocks, solved, spread),
     )
 
 
@@ -150,12 +166,14 @@ def _erring(solved: Solved) -> list[str]:
     ]
 
 
-def _details(solved: Solved, spread: FloatArray) -> dict[str, Any]:
-    """What was found of the arms, where it was asked for."""
-    if not solved.arms.effects:
-        return {}
-    agreed = solved.agreed
-    return {"arms": solved.arms.document(agreed.problem, agreed.fit.state, spread)}
+def _details(clocks: Clocks, solved: Solved, spread: FloatArray) -> dict[str, Any]:
+    """What was found of clocks, and of the arms where it was asked for."""
+    agreed, found = solved.agreed, {}
+    if clocks.found:
+        found["clocks"] = {it.words: at.clock.document() for it, at in clocks.found.items()}
+    if solved.arms.effects:
+        found["arms"] = solved.arms.document(agreed.problem, agreed.fit.state, spread)
+    return found
 
 
 def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.alignment.arms import ArmsAsked, ArmsErrors, arms_errors
 from visioncal.alignment.cell import Cell
+from visioncal.alignment.clocks import Clocks
 from visioncal.alignment.lenses import with_looks
 from visioncal.alignment.looking import Looked
 from visioncal.alignment.priors import most_contradicted
@@ -14,7 +15,7 @@ from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.outliers import Agreed, agree, settle
-from visioncal.estimation.problem import Observations, Problem, State
+from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.stages.choose import chosen, padded
 from visioncal.stages.pnp import ViewPoses
@@ -59,12 +60,13 @@ class Solved:
         return np.asarray(first + np.searchsorted(free, places))
 
 
-def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
+def solve(cell: Cell, looked: Looked, clocks: Clocks, asked: ArmsAsked = "reported") -> Solved:
     """Solves a whole cell.
 
     Args:
         cell: The cell.
         looked: What its cameras saw.
+        clocks: The offsets of clocks by which its rows have poses.
         asked: What is to be estimated of the robots' arms.
 
     Raises:
@@ -82,10 +84,11 @@ def solve(cell: Cell, looked: Looked, asked: ArmsAsked = "reported") -> Solved:
     agreed = agree(problem, state, _movable(problem))
     agreed = _levelled(cell, views, agreed)
     seen, arms = None, arms_errors(cell, asked)
+    others = (*clocks.effects(cell), *arms.effects)
     if looked.cameras:
-        agreed, seen = with_looks(cell, looked.cameras, views, agreed, arms)
-    elif arms.effects:
-        agreed = _with_arms(agreed, arms)
+        agreed, seen = with_looks(cell, looked.cameras, views, agreed, others)
+    elif others:
+        agreed = _with_effects(agreed, others)
     agreed = _without_contradicted(settle(agreed, _movable(agreed.problem)))
     agreed = _with_repeats(agreed)
     return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
@@ -142,9 +145,9 @@ def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
     )
 
 
-def _with_arms(agreed: Agreed, arms: ArmsErrors) -> Agreed:
-    problem = agreed.problem.with_effects(arms.effects)
-    state = State(agreed.fit.state.edges, arms.values)
+def _with_effects(agreed: Agreed, effects: Sequence[Effect]) -> Agreed:
+    problem = agreed.problem.with_effects(effects)
+    state = State(agreed.fit.state.edges, problem.start_values)
     fit = fit_problem(problem.subset(agreed.used), state, agreed.fit.noise)
     return replace(agreed, problem=problem, fit=fit)
 

@@ -27,7 +27,7 @@ from visioncal.session import STREAMS, Session
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
 from visioncal.stages.choose import choose_by
-from visioncal.stages.clock import set_clock
+from visioncal.stages.clock import set_clock, sweep_of
 from visioncal.stages.detect import detect
 from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import robot_part, solve_hand_eye
@@ -117,7 +117,7 @@ def _clock(known: Known) -> Known:
     session = known.session
     if not waits_for_clock(session):
         return known
-    clocked = set_clock(session, known.poses, known.robot)
+    clocked = set_clock(sweep_of(session, known.robot), known.poses)
     known = replace(
         known,
         clock=clocked.clock,

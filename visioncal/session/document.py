@@ -53,6 +53,7 @@ class Declaration(TableModel):
     instruments: dict[str, Annotated[InstrumentTable, _short("name")]] = Field(default_factory=dict)
     frames: dict[str, Any] = Field(default_factory=dict)
     clock: ClockTable = ClockTable()
+    clocks: dict[str, ClockTable] = Field(default_factory=dict)
     prior: dict[str, PriorTable] = Field(default_factory=dict)
 
     def named(self, kind: Kind) -> dict[str, TableModel]:
@@ -178,6 +179,13 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
         yield "robot.model", "is missing"
     for kind in KINDS:
         yield from _several_contradictions(declaration, kind)
+    yield from _prior_contradictions(declaration)
+
+
+def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
+    for name in declaration.clocks:
+        if name not in declaration.cameras:
+            yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
     for edge, prior in declaration.prior.items():
         if prior.x_m is None and prior.y_m is None and prior.z_m is None:
             yield f"prior.{edge}", "names no component, but must give x_m, y_m or z_m"
@@ -262,6 +270,6 @@ def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
             yield from _unknown_keys(value, f"{path}{name}.", label)
-        elif name in ("prior", *(f"{it}s" for it in KINDS)):
+        elif name in ("prior", "clocks", *(f"{it}s" for it in KINDS)):
             for key, entry in cast(Mapping[str, BaseModel], value).items():
                 yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)

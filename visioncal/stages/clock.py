@@ -27,7 +27,7 @@ from visioncal.stages.offset import (
     why_untold,
 )
 from visioncal.stages.pnp import ViewPoses
-from visioncal.types import FloatArray, IntArray, Mask, Rejection
+from visioncal.types import FloatArray, IntArray, Mask, Mount, Rejection
 
 # A stated offset is taken to be known so well [s].
 _STATED_SIGMA_S = 1e-3
@@ -61,26 +61,56 @@ class Clocked:
     notes: tuple[str, ...]
 
 
-def set_clock(session: Session, poses: Mapping[int, ViewPoses], robot: Robot | None) -> Clocked:
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What one camera saw while one robot moved.
+
+    Attributes:
+        motion: The robot's stream.
+        mount: Where the camera is.
+        views: The rows; those that have a time and no pose of the robot wait for the clock.
+        stated_s: The stated offset; None where none is stated.
+    """
+
+    motion: Motion
+    mount: Mount
+    views: tuple[View, ...]
+    stated_s: float | None
+
+
+def sweep_of(session: Session, robot: Robot | None) -> Sweep:
+    """The sweep of a session of one camera and one robot that `waits_for_clock`.
+
+    Args:
+        session: The session.
+        robot: Its nominal robot, where it names a known one.
+
+    Raises:
+        DataError: The stream has no poses, and no joints that the robot's model knows.
+    """
+    clock = session.declaration.clock
+    stated_s = clock.camera_minus_robot_s if clock.model_fields_set else None
+    return Sweep(motion_of(session, robot), session.mount, session.views, stated_s)
+
+
+def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     """Gives views the robot's poses at their time.
 
     Args:
-        session: One that `waits_for_clock`.
+        sweep: What a camera saw while a robot moved.
         poses: What the camera saw, by view.
-        robot: The session's nominal robot, where it names a known one.
 
     Raises:
-        DataError: The stream has no poses, and no joints that the robot's model knows; or no view
-            lies within it.
+        DataError: No view lies within the stream.
         DegenerateError: The motion does not tell the offset, it is not stated, and too few views
             were taken at rest.
     """
-    motion = motion_of(session, robot)
-    views = [view for view in session.views if is_open(view) and view.number in poses]
+    motion = sweep.motion
+    views = [view for view in sweep.views if is_open(view) and view.number in poses]
     views.sort(key=lambda view: view.stamp_s or 0.0)
     fitted = [view for view in views if not view.holdout]
-    stated_s = _stated_s(session)
-    frames = _frames(session, fitted, poses)
+    stated_s = sweep.stated_s
+    frames = _frames(sweep.mount, fitted, poses)
     matches = turning_matches(motion.flange, frames, stated_s or 0.0)
     sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
     starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
@@ -89,19 +119,13 @@ def set_clock(session: Session, poses: Mapping[int, ViewPoses], robot: Robot | N
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         nearest_s = fit.offset_s
         match = min(sound, key=lambda it: abs(it.offset_s - nearest_s))
-        return _by_motion(session, motion, views, (fit, match), stated_s)
+        return _by_motion(sweep, views, (fit, match))
     if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
-        return _by_turning(session, motion, views, sound[0], stated_s)
-    return _untold(session, motion, views, (fits, matches), stated_s)
+        return _by_turning(sweep, views, sound[0])
+    return _untold(sweep, views, (fits, matches))
 
 
-def _stated_s(session: Session) -> float | None:
-    """The stated offset; None where none is stated."""
-    clock = session.declaration.clock
-    return clock.camera_minus_robot_s if clock.model_fields_set else None
-
-
-def _frames(session: Session, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
+def _frames(mount: Mount, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
     """What the camera saw over time: of several boards one, and where it can be of clear poses."""
     seen = [(view, poses[view.number]) for view in views]
     boards = [it.board for _, it in seen]
@@ -111,7 +135,7 @@ def _frames(session: Session, views: Sequence[View], poses: Mapping[int, ViewPos
     seen = clear if 2 * len(clear) > len(seen) else seen
     measured = bool(seen) and all(it.corners is not None for _, it in seen)
     return Frames(
-        "eye-in-hand" if session.mount == "eye-in-hand" else "eye-to-hand",
+        "eye-in-hand" if mount == "eye-in-hand" else "eye-to-hand",
         np.array([view.stamp_s for view, _ in seen], dtype=float),
         np.array([it.cam_from_target[0] for _, it in seen]).reshape(-1, 4, 4),
         np.array([it.covariance[0] for _, it in seen]) if measured else None,
@@ -119,44 +143,44 @@ def _frames(session: Session, views: Sequence[View], poses: Mapping[int, ViewPos
 
 
 def _by_motion(
-    session: Session,
-    motion: Motion,
+    sweep: Sweep,
     views: Sequence[View],
     told: tuple[ClockFit, Match],
-    stated_s: float | None,
 ) -> Clocked:
     fit, match = told
     clock = Clock(
-        fit.offset_s, fit.sigma_s, "motion", stated_s, fit.frames, match.correlation, speeds={}
+        fit.offset_s,
+        fit.sigma_s,
+        "motion",
+        sweep.stated_s,
+        fit.frames,
+        match.correlation,
+        speeds={},
     )
-    words, warnings = told_words(fit, match, motion.name), list(stated_doubts(clock, views))
-    return _placed(session, motion, views, clock, warnings, [words])
+    words, warnings = told_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
+    return _placed(sweep, views, clock, warnings, [words])
 
 
-def _by_turning(
-    session: Session, motion: Motion, views: Sequence[View], match: Match, stated_s: float | None
-) -> Clocked:
+def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:
     """Takes the offset at which both turn alike, where the chain as it is read does not close."""
     clock = Clock(
-        match.offset_s, match.sigma_s, "turning", stated_s, 0, match.correlation, speeds={}
+        match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
     )
     warnings = [turning_words(match), *stated_doubts(clock, views)]
-    return _placed(session, motion, views, clock, warnings, [])
+    return _placed(sweep, views, clock, warnings, [])
 
 
 def _untold(
-    session: Session,
-    motion: Motion,
+    sweep: Sweep,
     views: Sequence[View],
     tried: tuple[Sequence[ClockFit], Sequence[Match]],
-    stated_s: float | None,
 ) -> Clocked:
     """Does without an estimate: by what is stated, or with views at rest."""
-    why = why_untold(*tried)
+    why, stated_s = why_untold(*tried), sweep.stated_s
     offset_s = stated_s or 0.0
     correlation = max((it.correlation for it in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
-    resting = at_rest(motion.flange, stamps_s - offset_s)
+    resting = at_rest(sweep.motion.flange, stamps_s - offset_s)
     clock = Clock(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
     if resting.all() and len(views):
         note = (
@@ -164,22 +188,22 @@ def _untold(
             f"{'as stated' if stated_s is not None else 'as nothing is stated'}: the views were "
             "taken at rest, where this does not count."
         )
-        return _placed(session, motion, views, clock, [], [note])
+        return _placed(sweep, views, clock, [], [note])
     if stated_s is not None:
         warning = (
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
             f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
         )
         clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
-        return _placed(session, motion, views, clock, [warning], [])
+        return _placed(sweep, views, clock, [warning], [])
     if resting.sum() < FEWEST_VIEWS:
-        raise no_offset(motion, views, resting, why)
+        raise no_offset(sweep.motion, views, resting, why)
     warning = (
         f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
         f"between the clocks is not known: {why}."
     )
     kept = [view for view, it in zip(views, resting, strict=True) if it]
-    placed = _placed(session, motion, kept, clock, [warning], [])
+    placed = _placed(sweep, kept, clock, [warning], [])
     rejected = {it.view: it for it in placed.rejections} | {
         view.number: Rejection(view.number, _IN_MOTION)
         for view, it in zip(views, resting, strict=True)
@@ -189,8 +213,7 @@ def _untold(
 
 
 def _placed(
-    session: Session,
-    motion: Motion,
+    sweep: Sweep,
     views: Sequence[View],
     clock: Clock,
     warnings: Sequence[str],
@@ -198,25 +221,25 @@ def _placed(
 ) -> Clocked:
     """Gives views their poses at an offset, and chooses among very many."""
     at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
-    covered = motion.flange.covers(at_s)
+    covered = sweep.motion.flange.covers(at_s)
     inside = [view for view, it in zip(views, covered, strict=True) if it]
-    poses, speeds = motion.flange.at(at_s[covered]), motion.flange.speeds(at_s[covered])
+    poses, speeds = sweep.motion.flange.at(at_s[covered]), sweep.motion.flange.speeds(at_s[covered])
     chosen = _chosen(inside, poses, speeds)
     taken = [inside[at].number for at in chosen]
-    rows = dict(zip(taken, motion.numbers(at_s[covered][chosen]), strict=True))
+    rows = dict(zip(taken, sweep.motion.numbers(at_s[covered][chosen]), strict=True))
     if clock.method != "rest":
         clock = replace(clock, speeds=dict(zip(taken, speeds[chosen], strict=True)))
         notes = [*notes, speed_words(clock, speeds[chosen], len(inside))]
-    lost = dict(_uncovered(motion, views, at_s, covered))
+    lost = dict(_uncovered(sweep.motion, views, at_s, covered))
     # A sweep may be longer than the stream beside it.
     beyond = {it for it, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
     spared = {it.number: _SPARED for it in inside if it.number not in rows}
-    lost |= {it.number: _NO_TIME for it in session.views if _knows_nothing(it)}
+    lost |= {it.number: _NO_TIME for it in sweep.views if _knows_nothing(it)}
     return Clocked(
         clock,
         tuple(
             replace(it, numbers={**it.numbers, **rows.get(it.number, {})})
-            for it in session.views
+            for it in sweep.views
             if it.number in rows or not (is_open(it) or _knows_nothing(it))
         ),
         tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),

@@ -73,23 +73,29 @@ def is_open(view: View) -> bool:
 
 def _stream_name(session: Session) -> str | None:
     """The stream of the robot: the one of that name, or the only one with poses or joints."""
-    moving = [name for name, it in session.streams.items() if _tells_motion(it)]
+    moving = [name for name, it in session.streams.items() if has_motion(it)]
     if ROBOT_STREAM in moving:
         return ROBOT_STREAM
     return moving[0] if len(moving) == 1 else None
 
 
-def _tells_motion(stream: Stream) -> bool:
+def has_motion(stream: Stream) -> bool:
+    """Whether a stream has poses or joints of a robot."""
     return POSE[0] in stream or "q1_rad" in stream
 
 
-def motion_of(session: Session, robot: Robot | None) -> Motion:
-    """Reads the robot's stream of a session that `waits_for_clock`.
+def motion_of(session: Session, robot: Robot | None, name: str = "") -> Motion:
+    """Reads a robot's stream.
+
+    Args:
+        session: One that `waits_for_clock`, or that has a stream of this name.
+        robot: The robot's model, where it is known.
+        name: The stream; that of the only robot where empty.
 
     Raises:
         DataError: It has no poses, and no joints that the robot's model knows.
     """
-    name = _stream_name(session) or ROBOT_STREAM
+    name = name or _stream_name(session) or ROBOT_STREAM
     stream = session.streams[name]
     reported_s, poses = stream.poses()
     joints_s, q = stream.joints()

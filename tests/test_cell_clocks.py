@@ -1,0 +1,78 @@
+"""Streams and clocks of whole cells: a camera that sees a moving robot by a clock of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from swept_cells import AHEAD_S, cell_of, swept_session
+
+from visioncal.alignment import align
+from visioncal.errors import DataError
+from visioncal.simulation.layout import NetworkOptions
+from visioncal.transforms import invert, log
+
+CLOCK = "cam_side and robot b"
+
+
+@pytest.fixture(scope="module")
+def swept():
+    cell = cell_of(NetworkOptions(stops=16, seed=1))
+    return cell, *swept_session(cell)
+
+
+@pytest.fixture(scope="module")
+def found(swept):
+    _, session, corners = swept
+    return align(session, corners=corners)
+
+
+def test_the_offset_of_one_camera_is_found_by_the_motion(found):
+    clock = found.details["clocks"][CLOCK]
+    assert clock["method"] == "motion"
+    assert clock["sigma_s"] < 1e-4
+    # Four sigma: one run in fifteen thousand.
+    assert abs(clock["camera_minus_robot_s"] - AHEAD_S) < 4 * clock["sigma_s"]
+    said = f"{CLOCK}: The camera's clock is {1e3 * clock['camera_minus_robot_s']:+.2f} ms ahead"
+    assert any(it.startswith(said) for it in found.verdict.reasons)
+
+
+def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, found):
+    cell, session, _ = swept
+    edge = found.between("base_a", "cam_side")
+    away = log(invert(cell.between("base_a", "cam_side")) @ edge.matrix)
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert away @ np.linalg.solve(edge.covariance, away) < 22.0
+    assert edge.sigma_mm < 0.2
+    used = [it for it in found.sights if it.seer == "cam_side" and it.used]
+    assert len(used) > 30
+    assert found.session_sha256 == session.digest()
+
+
+def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
+    _, session, corners = swept
+    document = {**session.document, "clocks": {"side": {"camera_minus_robot_s": 0.02}}}
+    found = align(replace(session, document=document), corners=corners)
+    (doubt,) = [it for it in found.verdict.reasons if "is stated as +20.00 ms" in it]
+    assert doubt.startswith(CLOCK)
+    assert found.details["clocks"][CLOCK]["stated_s"] == 0.02
+    assert found.verdict.status == "check"
+
+
+def test_a_clock_of_no_camera_is_refused(swept):
+    _, session, corners = swept
+    document = {**session.document, "clocks": {"sied": {"camera_minus_robot_s": 0.02}}}
+    with pytest.raises(DataError, match=r"clocks\.sied is of no camera"):
+        align(replace(session, document=document), corners=corners)
+
+
+def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
+    """A twentieth of the sweep: too short to say when."""
+    _, session, corners = swept
+    timed = [it for it in session.views if it.stamp_s is not None]
+    views = tuple(it for it in session.views if it.stamp_s is None or it in timed[:8])
+    found = align(replace(session, views=views), corners=corners)
+    lost = [it for it in found.sights if it.seer == "cam_side"]
+    assert len(lost) == 8
+    assert all(not it.used and "clock" in it.reason for it in lost)
+    assert "cam_side" in {it.frame for it in found.untied}
+    assert any(it.startswith(CLOCK) for it in found.verdict.reasons)
