@@ -7,6 +7,7 @@ checkerboard inner corner 0, for a single marker its centre; x runs along column
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from visioncal import transforms
 from visioncal.errors import DataError
 from visioncal.files import Table, did_you_mean, find_described, parse_toml, read_text
-from visioncal.types import FloatArray, IntArray, Target
+from visioncal.types import FloatArray, IntArray, Mask, Target
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
 DEFAULT_RELATIVE_SIGMA = 1e-3
@@ -91,7 +92,8 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     if kind == "checkerboard":
         return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
     marker_m = table.number("marker_m", positive=True)
-    if marker_m >= square_m:
+    # OpenCV compares the sides in single precision.
+    if not 0.0 < np.float32(marker_m) < np.float32(square_m):
         raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
     dictionary = table.text("dictionary")
     markers, needed = _dictionary_size(table, dictionary), columns * rows // 2
@@ -214,6 +216,28 @@ def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
     return low, side * np.array([target.columns, target.rows], dtype=float)
 
 
+def marker_cells(dictionary_name: str, marker_id: int) -> Mask:
+    """The (n, n) dark cells of a marker, its border of one cell included."""
+    dictionary = aruco_dictionary(dictionary_name)
+    size = dictionary.markerSize
+    code = dictionary.bytesList[marker_id : marker_id + 1]
+    bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
+    return np.pad(bits == 0, 1, constant_values=True)
+
+
+def marked_squares(target: Target) -> IntArray:
+    """The (m, 2) light squares of a ChArUco board, as column and row, in the order of their ids.
+
+    Raises:
+        DataError: The target is of another kind.
+    """
+    # OpenCV says where the markers lie; the squares between them are dark.
+    places = np.asarray(charuco_board(target).getObjPoints(), dtype=float)[..., :2]
+    return np.asarray(np.floor(places.mean(axis=1) / target.square_m), dtype=np.int64)
+
+
+# Kept, because OpenCV warns of a narrow rim around the markers as often as it builds the board.
+@lru_cache(maxsize=64)
 def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     """Builds OpenCV's board for a ChArUco target.
 

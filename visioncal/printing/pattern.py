@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from visioncal.targets import aruco_dictionary, charuco_board
+from visioncal.targets import marked_squares, marker_cells
 from visioncal.types import FloatArray, Mask, Target
 
 # White that finders need around squares; markers need one of their own modules.
@@ -34,7 +33,7 @@ def draw_pattern(target: Target) -> Pattern:
     side = target.square_m
     match target.kind:
         case "marker":
-            dark = _marker_cells(target.dictionary, target.marker_id)
+            dark = marker_cells(target.dictionary, target.marker_id)
             module_m = side / len(dark)
             loops = _moved(dark, np.full(2, -0.5 * side), module_m)
             return Pattern(loops, (-side / 2, -side / 2, side / 2, side / 2), module_m)
@@ -100,27 +99,14 @@ def _moved(dark: Mask, corner_m: FloatArray, cell_m: float) -> tuple[FloatArray,
     return tuple(corner_m + cell_m * loop for loop in outlines(dark))
 
 
-def _marker_cells(dictionary_name: str, marker_id: int) -> Mask:
-    """The dark cells of a marker, its border of one cell included."""
-    dictionary = aruco_dictionary(dictionary_name)
-    size = dictionary.markerSize
-    code = dictionary.bytesList[marker_id : marker_id + 1]
-    bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
-    return np.pad(bits == 0, 1, constant_values=True)
-
-
 def _charuco_loops(target: Target) -> tuple[FloatArray, ...]:
-    board = charuco_board(target)
-    ids = np.ravel(np.asarray(board.getIds())).tolist()
-    # OpenCV says where the markers lie; the squares between them are dark.
-    places = np.asarray(board.getObjPoints(), dtype=float)[..., :2]
-    light = np.floor(places.mean(axis=1) / target.square_m).astype(int)
+    light = marked_squares(target)
     dark = np.ones((target.rows, target.columns), dtype=bool)
     dark[light[:, 1], light[:, 0]] = False
     loops = list(_moved(dark, np.zeros(2), target.square_m))
     inset = (target.square_m - target.marker_m) / 2
-    for marker_id, square in zip(ids, light, strict=True):
-        cells = _marker_cells(target.dictionary, marker_id)
+    for marker_id, square in enumerate(light):
+        cells = marker_cells(target.dictionary, marker_id)
         corner_m = target.square_m * square + inset
         loops += _moved(cells, corner_m, target.marker_m / len(cells))
     return tuple(loops)

@@ -137,7 +137,7 @@ def _print(target: Target, columns: int, rows: int, texels: int) -> Image:
     inset = round(0.5 * (1.0 - target.marker_m / target.square_m) * texels)
     for number, (row_at, column_at) in enumerate(np.argwhere(white)):
         y, x = row_at * texels + inset, column_at * texels + inset
-        side = texels - 2 * inset
+        side = max(texels - 2 * inset, 1)
         image[y : y + side, x : x + side] = _marker(target, number, side)
     return image
 
