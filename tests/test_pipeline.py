@@ -8,6 +8,7 @@ from cells import calibrated, error_of, known_of, session_of
 
 from visioncal.errors import DataError
 from visioncal.pipeline.steps import STAGES
+from visioncal.pipeline.views import view_evidence
 from visioncal.simulation import (
     CellOptions,
     fine_camera,
@@ -16,7 +17,7 @@ from visioncal.simulation import (
     wide_camera,
 )
 from visioncal.solvers import SOLVERS
-from visioncal.types import Target
+from visioncal.types import MOUNTS, Camera, Target
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 # Its corners look the same after half a turn, and at small tilts its mirrored pose fits as well.
@@ -114,6 +115,34 @@ def test_views_held_back_may_be_ambiguous(solver):
     assert all(len(known.poses[it].cam_from_target) == 1 for it in held)
     # Of the order of the used views': half a turn of the board would be metres.
     assert known.findings.holdout.mm < 5 * known.findings.held_out.mm
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose(given):
+    # A small board far away: in frontal views perspective hardly tells the tilt's sign.
+    small = Target("small", "checkerboard", 5, 4, 0.025, 2.5e-5)
+    far = CellOptions(
+        target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
+    )
+    known = calibrated(simulate(replace(far, state_intrinsics=given)))
+    assert known.reasons[4].startswith("ambiguous")
+    shown = {it.view: it for it in view_evidence(known)}
+    np.testing.assert_array_equal(shown[4].cam_from_target, known.poses[4].cam_from_target[0])
+    assert shown[4].predicted_px is None
+    assert all(shown[view].predicted_px is not None for view in known.used)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
+    matrix, bent = np.array([520.0, 519, 320, 190]), np.array([-0.37, 0.1, 0.001, 0.0, 0.03])
+    camera = Camera("brown", (640, 360), matrix, bent)
+    told = CellOptions(robot="ur3e", mount=mount, views=24, camera=camera, pixel_sigma_px=0.03)
+    cell = simulate(replace(told, robot_sigma_m=1e-4))
+    known = calibrated(cell, session=with_camera(cell, matrix))
+    refined = known.free.after(known.solved.edges.shared).camera
+    sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
+    # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
+    assert np.all(np.abs(refined.matrix - matrix) < 4.5 * sigma)
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -262,12 +263,27 @@ def test_arms_that_no_ur_program_drives_get_none(tmp_path):
 
 def test_advice_to_add_views_names_the_command_once():
     sentences = ("It is bent. Print it anew.", "Weak. Add views tilted.", "Few. Add 5 or more.")
-    first, second, third = with_proposal(sentences)
+    first, second, third = with_proposal(sentences, modelled=True)
     assert second == "Weak. Add views tilted. Let visioncal plan SESSION --add 5 propose them."
     assert (first, third) == (sentences[0], sentences[2])
-    (arm,) = with_proposal(["Add stops that move joint 5 by 60 deg or more."])
+    (arm,) = with_proposal(["Add stops that move joint 5 by 60 deg or more."], modelled=True)
     assert arm.endswith("Let visioncal plan SESSION --add 5 --for kinematics propose them.")
-    assert with_proposal(["Measure the board."]) == ("Measure the board.",)
+    assert with_proposal(["Measure the board."], modelled=True) == ("Measure the board.",)
+
+
+def test_advice_names_no_command_that_refuses_for_want_of_a_robot(one_axis, tmp_path):
+    bare = shutil.copytree(one_axis, tmp_path / "bare")
+    words = (bare / "session.toml").read_text(encoding="utf-8")
+    words, cut = re.subn(r"(?m)^\[robot\]\n(\w.*\n)+", "", words)
+    assert cut == 1
+    (bare / "session.toml").write_text(words, encoding="utf-8")
+    refused = visioncal("calibrate", bare, "-o", tmp_path / "out")
+    assert refused.status == 2
+    assert "Let visioncal plan" not in refused.err
+    assert "Once [robot] model in session.toml names the arm" in refused.err
+    planned = visioncal("plan", bare, "--add", 5, "-o", tmp_path / "plan")
+    assert planned.status == 2
+    assert "([robot] model), or by --robot" in planned.err
 
 
 def test_a_folder_without_any_recording_is_refused_by_review(tmp_path):

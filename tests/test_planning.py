@@ -10,6 +10,7 @@ from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Edges, Noise, closure_information
+from visioncal.estimator.linalg import covariance, covariance_root
 from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Box
 from visioncal.planning.design import chosen, shortfall
@@ -127,6 +128,26 @@ def test_the_values_are_those_of_a_plain_inversion(views):
         history = [it.mm for it in design.history]
         assert len(history) == 10
         assert all(after <= before for before, after in pairwise(history))
+
+
+def test_what_is_known_beforehand_may_be_singular_to_rounding(views):
+    (world,) = worlds_of([true_cell(CELL)], HAND_EYE, views[:20])
+    size, sharp = len(world.prior), np.zeros(len(world.prior))
+    sharp[[11, 12]] = 1e-3, 1.0
+    # Two unknowns of which next to nothing but their difference is known, as of a rational lens.
+    stiff = replace(world, prior=world.prior + 1e24 * np.outer(sharp, sharp))
+    assert np.linalg.eigvalsh(stiff.prior)[0] < 1e-16 * np.linalg.eigvalsh(stiff.prior)[-1]
+    for criterion in CRITERIA:
+        assert len(chosen([stiff], 3, criterion=criterion).rows) == 3
+    # What is known beforehand is the identity in the new coordinates: as much of it as rounding
+    # leaves, which is some 1e-8 of the largest here.
+    root = covariance_root(world.prior)
+    np.testing.assert_allclose(root.T @ world.prior @ root, np.eye(size), atol=1e-9)
+
+
+def test_no_information_at_all_is_a_large_variance_and_no_nan():
+    assert np.isfinite(covariance(np.zeros((2, 6, 6)))).all()
+    assert covariance(np.zeros((6, 6)))[0, 0] > 1e12
 
 
 def test_it_stops_when_the_wish_is_predicted(views):

@@ -36,6 +36,8 @@ _FALSE_ALARM = 1e-4
 _SPARE = 10
 # Values that move by less than this share of their sigma have settled.
 _SETTLED, _ROUNDS = 0.02, 8
+# A step after which corners fit worse by this factor is too long; so often is it halved.
+_FOLLOWS, _HALVINGS = 2.0, 12
 # What is stated is contradicted by so many standard deviations.
 _CONTRADICTION = 3.0
 # Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
@@ -240,14 +242,34 @@ def settle(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
         sigma = np.sqrt(np.diag(spread)[12 : 12 + looks])
         if np.all(np.abs(state.fit.edges.shared[:looks]) <= _SETTLED * sigma):
             break
-        state = _fitted(problem, arm, moving, state.again())
+        state = _fit(problem, arm, _stepped(problem, moving, state), state.fit.edges)
     return state
 
 
 def _fitted(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
     seen = seen_at(problem, moving, start.appearance, start.poses)
+    return _fit(problem, arm, seen, start.edges)
+
+
+def _stepped(problem: Problem, moving: IntArray, state: State) -> Seen:
+    """Linearises where the fit came to rest, or on the way there as far as the corners follow.
+
+    Far from the answer, as where a lens was stated for images of another size, the whole step
+    leads to lenses that see nothing.
+    """
+    limit = _FOLLOWS * floored_sigma_px(state.seen.sigma_px)
+    change, poses = state.fit.edges.shared, state.seen.compressed.cam_from_target
+    for _ in range(_HALVINGS):
+        seen = seen_at(problem, moving, state.seen.free.after(change), poses)
+        if seen.sigma_px <= limit:
+            return seen
+        change = change / 2
+    return state.seen
+
+
+def _fit(problem: Problem, arm: Arm, seen: Seen, start: Edges) -> State:
     data = _chain(problem, arm, seen, seen.free)
-    at_rest = Edges(start.edges.x, start.edges.z, data.unchanged)
+    at_rest = Edges(start.x, start.z, data.unchanged)
     return State(seen, data, fit_closure(data, at_rest))
 
 

@@ -66,12 +66,24 @@ def covariance(information: FloatArray) -> FloatArray:
     A direction without information gets a large but finite variance, never a NaN; whoever asks
     for a covariance has looked at the spectrum before.
     """
+    values, vectors, scale = _floored(information)
+    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
+
+
+def covariance_root(information: FloatArray) -> FloatArray:
+    """Factors `covariance(information)` as (..., n, n) `root @ root^T`, however singular."""
+    values, vectors, scale = _floored(information)
+    return np.asarray(scale[..., :, None] * vectors / np.sqrt(values)[..., None, :])
+
+
+def _floored(information: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Eigenvalues (..., n), none of them zero, and vectors of scaled matrices, and the scales."""
     scale = _scale(information)
-    outer = scale[..., :, None] * scale[..., None, :]
-    values, vectors = _eigen(information * outer)
-    floor = np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
-    inverse = (vectors / np.maximum(values, floor)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return np.asarray(inverse * outer)
+    values, vectors = _eigen(information * scale[..., :, None] * scale[..., None, :])
+    # Of a unit diagonal, the largest is at least one, unless there is no information at all.
+    floor = np.finfo(float).eps * np.maximum(values[..., -1:], 1.0)
+    return np.maximum(values, floor), vectors, scale
 
 
 def covariance_among(information: FloatArray, among: Mask) -> FloatArray:

@@ -121,7 +121,8 @@ def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
     """
     if seen is None:
         return error
-    hint, (planned,) = reading_hint(seen), with_proposal([error.next_step])
+    hint = reading_hint(seen)
+    (planned,) = with_proposal([error.next_step], modelled=seen.robot is not None)
     next_step = error.next_step if seen.scene is None else planned
     if hint:
         next_step = f"{hint} {error.next_step}".strip()

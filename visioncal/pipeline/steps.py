@@ -434,6 +434,7 @@ def _judge(known: Known) -> Known:
         notes=known.notes,
         workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
         mount=known.session.mount,
+        modelled=known.robot is not None,
     )
     return replace(known, findings=findings, verdict=judge(findings))
 

@@ -103,12 +103,15 @@ def _evidence(known: Known, view: int) -> ViewEvidence:
     reported = known.base_from_flange.get(view)
     base_from_flange = None if reported is None else known.flange_poses([view])[0]
     predicted = cam_from_target = None
-    if poses is not None and reported is not None and poses.board in known.boards:
+    if poses is not None and len(poses.cam_from_target) > 1:
+        # Never chosen from: neither how they move with lens and board nor the corners' numbering
+        # is known.
+        cam_from_target = poses.cam_from_target[0]
+    elif poses is not None and reported is not None and poses.board in known.boards:
         data = known.closure([view]).under(edges.shared)
         own = known.shown([view]).moved(edges.shared).first_from_own[0]
         cam_from_target = data.camera[0] @ own
-        # Of several poses that were never chosen from, the corners' numbering is not known.
-        if corners is not None and len(poses.cam_from_target) == 1:
+        if corners is not None:
             where = data.predicted_camera(edges.x, edges.z)[0] @ own
             predicted = _predicted(known, where, corners)
     return ViewEvidence(

@@ -235,6 +235,9 @@ def _lacking(known: Known) -> DataError:
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
         culprits=[f"session {session.name!r}"],
+        next_step="Name the arm in session.toml ([robot] model), or by --robot."
+        if known.robot is None
+        else "",
     )
 
 

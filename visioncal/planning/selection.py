@@ -19,8 +19,8 @@ from functools import cached_property
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
+from visioncal.estimator.linalg import covariance_root
 from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.information import World
 from visioncal.types import FloatArray
@@ -85,9 +85,9 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     """Puts a world into the coordinates in which stops are chosen by a criterion."""
     prior = world.prior * (_LITTLE if criterion == "O1" else 1.0)
     size = len(prior)
-    root = np.linalg.cholesky(prior)
-    # theta = out @ phi, and phi has the identity for a prior.
-    out = solve_triangular(root, np.eye(size), lower=True).T
+    # theta = out @ phi, and phi has the identity for a prior. What corners tell of a rational lens
+    # is singular to rounding.
+    out = covariance_root(prior)
     factors = (world.factors.reshape(-1, size) @ out).reshape(-1, 6, size)
     rows = factors.reshape(-1, size)
     recorded = out.T @ world.recorded @ out

@@ -85,6 +85,7 @@ class Findings:
         workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
             the median; None for a nominal arm [mm].
         mount: What observed whom.
+        modelled: Whether the robot's model is known.
     """
 
     views: Sequence[ViewResult]
@@ -102,6 +103,7 @@ class Findings:
     notes: Sequence[str] = ()
     workspace_mm: float | None = None
     mount: Mount = "eye-in-hand"
+    modelled: bool = False
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
     ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     sentences = tuple(doubt.sentence for doubt in ordered)
     if findings.pixel_px is not None:
-        sentences = with_proposal(sentences)
+        sentences = with_proposal(sentences, modelled=findings.modelled)
     return Verdict(status, (*sentences, *findings.notes))
 
 

@@ -8,19 +8,25 @@ _ADD = re.compile(r"\bAdd (?:stops|views|\d+ or more)\b")
 _ARM = re.compile(r"\bAdd (?:stops|views in which the arm)\b")
 
 
-def with_proposal(sentences: Sequence[str]) -> tuple[str, ...]:
+def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...]:
     """Points to `visioncal plan` behind the first advice to add views; once is enough.
 
     Args:
         sentences: Advice, reasons of a verdict; changed is the first that asks for views.
+        modelled: Whether the robot's model is known, without which no stop can be proposed.
     """
     for at, sentence in enumerate(sentences):
         if _ADD.search(sentence):
-            told = f"{sentence} {_proposal(' '.join(sentences))}"
+            told = f"{sentence} {_proposal(' '.join(sentences), modelled)}"
             return (*sentences[:at], told, *sentences[at + 1 :])
     return tuple(sentences)
 
 
-def _proposal(words: str) -> str:
+def _proposal(words: str, modelled: bool) -> str:
+    if not modelled:
+        return (
+            "Once [robot] model in session.toml names the arm, visioncal plan SESSION --add 5 "
+            "proposes them."
+        )
     purpose = " --for kinematics" if _ARM.search(words) else ""
     return f"Let visioncal plan SESSION --add 5{purpose} propose them."
