@@ -111,6 +111,38 @@ def test_the_document_keeps_the_contract(result):
     assert len(document["camera"]["covariance"]) == 9
 
 
+@pytest.mark.parametrize(
+    ("form", "changed"),
+    [
+        ("translation_m", lambda old: [old[0], old[1], old[2] + 1e-3]),
+        ("quaternion_xyzw", lambda old: [-old[1], old[0], old[3], -old[2]]),
+        ("matrix", lambda old: [[*old[0][:3], old[0][3] + 2e-5], *old[1:]]),
+    ],
+)
+@pytest.mark.parametrize("place", ["transforms", "solvers"])
+def test_a_pose_whose_forms_contradict_each_other_is_refused(result, place, form, changed):
+    document = to_document(result)
+    found = document[place]["park"] if place == "solvers" else document[place]
+    pose = found["flange_from_cam"]
+    pose[form] = changed(pose[form])
+    with pytest.raises(
+        DataError, match=r"^cal\.json: flange_from_cam: \w+ is .* another pose"
+    ) as no:
+        Calibration.from_json(json.dumps(document), "cal.json")
+    assert form == "matrix" or any(form in it for it in no.value.culprits)
+
+
+def test_a_pose_that_was_rounded_to_six_places_is_the_same(result):
+    document = to_document(result)
+    pose = document["transforms"]["flange_from_cam"]
+    for form in ("translation_m", "quaternion_xyzw"):
+        pose[form] = [round(-it if form[0] == "q" else it, 6) for it in pose[form]]
+    again = Calibration.from_json(json.dumps(document), "cal.json")
+    np.testing.assert_array_equal(
+        again.edges["flange_from_cam"].matrix, result.edges["flange_from_cam"].matrix
+    )
+
+
 def test_what_is_saved_is_loaded(result, tmp_path):
     result.save(tmp_path / "calibration.json")
     for path in (tmp_path, tmp_path / "calibration.json"):

@@ -1,5 +1,6 @@
 """The pick: where a feature lies in the base, what is open about that, and what is refused."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,20 +17,23 @@ from picks import (
 )
 
 import visioncal
-from visioncal.calibration import Calibration, CameraResult, Edge, Verdict
+from visioncal.calibration import Calibration, CameraResult, Edge, Verdict, to_document
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.errors import DataError
 from visioncal.finders.imaging import decode_image
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
+from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
     charuco_target,
     exact,
+    project,
     read_truth,
     simulate,
     wide_camera,
+    write_session,
 )
 from visioncal.transforms import exp, invert, log
 
@@ -410,3 +414,27 @@ def test_a_board_in_a_rendered_image_lies_where_it_stands(rendered):
     assert 1e3 * np.linalg.norm(found.p_base - place) < 1.5 * found.radius95_mm
     assert found.radius95_mm < 2.0
     assert not found.warnings
+
+
+@pytest.mark.parametrize("target", [True, False], ids=["target named", "no target"])
+def test_a_camera_that_was_stated_beside_measured_poses_looks(tmp_path, target):
+    cell = simulate(CellOptions(views=12))
+    told = Session.load(write_session(cell, tmp_path / "session", images=False))
+    table = {"camera": session_of(cell).document["camera"]}
+    if target:
+        table["target"] = cell.options.target.name
+        told = replace(told, target=cell.options.target)
+    calibration = visioncal.calibrate(replace(told, document=told.document | table))
+    stated = cell.options.camera
+    np.testing.assert_array_equal(calibration.camera.camera.matrix, stated.matrix)
+    assert not calibration.camera.estimated
+    again = Calibration.from_json(json.dumps(to_document(calibration)), "calibration.json")
+    point = np.array([0.1, 0.1, 0.0])
+    in_cam = cell.cam_from_target[0][:3, :3] @ point + cell.cam_from_target[0][:3, 3]
+    base_from_target = cell.transforms["base_from_target"]
+    expected = base_from_target[:3, :3] @ point + base_from_target[:3, 3]
+    plane = Plane.through(base_from_target[:3, 2], expected)
+    px = project(stated, in_cam[None])
+    (found,) = locate(again, px, plane, cell.base_from_flange[0], sigma_px=0.1)
+    assert found.holds(expected)
+    assert found.radius95_mm < 1.0

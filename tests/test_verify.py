@@ -11,6 +11,7 @@ from commands import visioncal
 from later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
 from pages import Page
 
+from visioncal import calibrate
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.pipeline.result import result_of
@@ -25,7 +26,7 @@ from visioncal.verification import facts_of, load_policy, outcomes, sentences, t
 from visioncal.verification.check import check
 from visioncal.verification.footing import Footing
 from visioncal.verification.page import page_of
-from visioncal.verification.seeing import known_before, seen_by
+from visioncal.verification.seeing import known_before, see_again, seen_by
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 
@@ -213,6 +214,31 @@ def test_one_of_two_boards_that_moved_is_named():
     with pytest.raises(DataError, match="several boards") as refused:
         check(moved, footing, board_placed_anew=True)
     assert "the one that moved is named" in refused.value.next_step
+
+
+def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(tmp_path):
+    cell = simulate(CellOptions(views=24, second=Second(), seed=3))
+    two = Session.load(write_session(cell, tmp_path / "two", images=False))
+    footing = Footing.of(calibrate(two))
+    named = dict(reversed(two.targets.items()))
+    turned = replace(two, targets=named)
+    assert check(see_again(turned, footing), footing).passed
+    for name, board in two.targets.items():
+        shown = tuple(it for it in two.views if it.text["target"] == name)
+        alone = {key: it for key, it in two.document.items() if key != "targets"}
+        one = replace(two, document=alone, target=board, targets={}, views=shown)
+        found = check(see_again(one, footing), footing)
+        assert found.passed
+        assert len(found.seen.stops) == len(shown)
+        with pytest.raises(DataError, match="which of the targets"):
+            see_again(replace(one, target=None), footing)
+        with pytest.raises(DataError, match="columns = 11"):
+            see_again(replace(turned, targets={**named, name: replace(board, columns=11)}), footing)
+        with pytest.raises(DataError, match="is none of those") as refused:
+            see_again(two, Footing.of(calibrate(one)))
+        assert "that target alone" in refused.value.next_step
+        with pytest.raises(DataError, match="is none of those"):
+            see_again(replace(one, target=replace(board, columns=11)), footing)
 
 
 def test_other_cells_are_refused_by_what_differs():

@@ -24,6 +24,11 @@ class VisioncalError(Exception):
         culprits = (*self.culprits, *more)
         return type(self)(self.message, culprits=culprits, next_step=self.next_step)
 
+    def within(self, label: str) -> Self:
+        """Returns the same error with the file that it is in before its message."""
+        message = f"{label}: {self.message}"
+        return type(self)(message, culprits=self.culprits, next_step=self.next_step)
+
     def __str__(self) -> str:
         return f"{self.message} {self.next_step}".strip()
 

@@ -244,6 +244,8 @@ class Alignment:
             return cls(**_fields(json.loads(text)))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise DataError(f"{label}: not JSON: {error}.", culprits=[label]) from error
+        except DataError as error:
+            raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
                 f"{label}: not an alignment that this version can read: {error!r}.",
@@ -265,7 +267,7 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
         "reference": document["reference"],
         "frames": dict(document["frames"]),
         "robots": dict(document["robots"]),
-        "edges": {name: read_edge(edge) for name, edge in document["transforms"].items()},
+        "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
         "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
         "cameras": {name: read_camera(it) for name, it in document["cameras"].items()},
         "noise": {name: dict(it) for name, it in document["noise"].items()},

@@ -126,7 +126,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "session_sha256": document["session"]["sha256"],
         "created": document["created"],
         "mount": document["mount"],
-        "edges": {name: read_edge(edge) for name, edge in document["transforms"].items()},
+        "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
         "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
         "solvers": {name: _solver(it) for name, it in document["solvers"].items()},
         "noise": dict(document["noise"]),
@@ -142,7 +142,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _solver(document: Mapping[str, Any]) -> SolverResult:
-    poses = {name: read_pose(it) for name, it in document.items() if isinstance(it, Mapping)}
+    poses = {name: read_pose(it, name) for name, it in document.items() if isinstance(it, Mapping)}
     return SolverResult(poses, document["rms_mm"], document.get("rms_deg"))
 
 

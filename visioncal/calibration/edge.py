@@ -5,9 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from visioncal.errors import DataError
 from visioncal.types import FloatArray
+
+# Forms of one pose that were rounded to six places agree to this [m, rad]; no cell is known better.
+_SAME = 5e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,21 +66,40 @@ def edge_document(edge: Edge) -> dict[str, Any]:
     }
 
 
-def read_edge(document: Mapping[str, Any]) -> Edge:
+def read_edge(document: Mapping[str, Any], name: str) -> Edge:
     """Reads what `edge_document` wrote.
+
+    Args:
+        document: What was written.
+        name: Of the edge, for messages.
 
     Raises:
         LookupError, TypeError, ValueError: The document is another.
+        DataError: Its forms are of different poses.
     """
-    return Edge(read_pose(document), read_array(document, "covariance", (6, 6)))
+    return Edge(read_pose(document, name), read_array(document, "covariance", (6, 6)))
 
 
-def read_pose(document: Mapping[str, Any]) -> FloatArray:
+def read_pose(document: Mapping[str, Any], name: str) -> FloatArray:
     """Reads the (4, 4) matrix of a pose; its errors are those of `read_edge`."""
     matrix = read_array(document, "matrix", (4, 4))
     rotation = matrix[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
         raise ValueError("a matrix is not a rigid transform")
+    translation = read_array(document, "translation_m", (3,))
+    quaternion = read_array(document, "quaternion_xyzw", (4,))
+    turned = Rotation.from_quat(quaternion).as_matrix()
+    for form, said, same in (
+        ("translation_m", translation, np.allclose(translation, matrix[:3, 3], 0.0, _SAME)),
+        ("quaternion_xyzw", quaternion, np.allclose(turned, rotation, 0.0, _SAME)),
+    ):
+        if not same:
+            raise DataError(
+                f"{name}: {form} is {said.tolist()}, and its matrix is that of another pose: "
+                f"{matrix.tolist()}.",
+                culprits=[f"{name}: {form}", f"{name}: matrix"],
+                next_step="Somebody changed one of them: take the file as calibrate wrote it.",
+            )
     return matrix
 
 

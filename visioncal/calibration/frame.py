@@ -90,10 +90,13 @@ class FrameFile:
         Raises:
             DataError: It is missing, or no file of frames of a known schema.
         """
+        content = read_bytes(path)
         try:
-            return cls(_read_file(json.loads(read_bytes(path))))
+            return cls(_read_file(json.loads(content)))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise DataError(f"{path}: not JSON: {error}.", culprits=[str(path)]) from error
+        except DataError as error:
+            raise error.within(str(path)) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
                 f"{path}: no frames that this version can read: {error!r}.",
@@ -132,7 +135,7 @@ def read_frames(document: Mapping[str, Any]) -> dict[str, Frame]:
     Raises:
         LookupError, TypeError, ValueError: The document is another.
     """
-    return {name: _read_frame(it) for name, it in document.items()}
+    return {name: _read_frame(it, name) for name, it in document.items()}
 
 
 def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
@@ -143,12 +146,12 @@ def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
     return read_frames(document["frames"])
 
 
-def _read_frame(document: Mapping[str, Any]) -> Frame:
+def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
     verdict = document["verdict"]
     if verdict["status"] not in get_args(VerdictStatus):
         raise ValueError(f"verdict.status is {verdict['status']!r}")
     return Frame(
-        read_edge(document),
+        read_edge(document, name),
         document["oriented"],
         document["method"],
         document["source"],

@@ -236,6 +236,8 @@ class Calibration:
             return cls(**fields_from_document(json.loads(text)))
         except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise DataError(f"{label}: not JSON: {error}.") from error
+        except DataError as error:
+            raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
                 f"{label}: not a calibration that this version can read: {error!r}.",

@@ -309,7 +309,10 @@ def _camera(known: Known) -> CameraResult | None:
     with all that was added to it since, errors of the arm and inflation. Given intrinsics of which
     only a part is open, the matrix and not the distortion, have zeros for the rest.
     """
-    result, free = known.solved, known.free
+    result, free, stated = known.solved, known.free, known.session.camera
+    if known.camera is None and stated is not None:
+        # Measured poses do without it; whoever looks through it later does not.
+        return CameraResult(stated, estimated=False)
     if known.camera is None or free is None:
         return known.camera
     columns = free.columns[free.columns < free.lens_count]

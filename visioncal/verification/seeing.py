@@ -15,11 +15,12 @@ from visioncal.pipeline import STAGES
 from visioncal.pipeline.known import Known
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.boards import COLUMN
 from visioncal.stages.choose import choose_by
 from visioncal.stages.handeye import robot_part
 from visioncal.targets import target_document
 from visioncal.transforms import invert, pose_difference
-from visioncal.types import FloatArray, Progress
+from visioncal.types import FloatArray, Progress, Target
 from visioncal.verification.footing import Footing
 
 # Models that place the flange alike to this are of one robot; tables are written with six digits.
@@ -84,8 +85,7 @@ def known_before(session: Session, footing: Footing, progress: Progress | None =
     """
     calibration = footing.calibration
     check_mount(session, calibration)
-    if any(view.image for view in session.views):
-        _check_targets(session, footing)
+    session = _with_its_targets(session, footing)
     document, robot = session.robot_document, calibration.robot
     if robot is not None and document is not None:
         _check_robot(session, Robot.from_document(document), robot)
@@ -193,8 +193,56 @@ def _noise_px(known: Known) -> float:
     return float(np.sqrt(np.sum(left**2) / max(freedom, 1)))
 
 
+def _with_its_targets(session: Session, footing: Footing) -> Session:
+    """Numbers the session's targets as the calibration does, by their names.
+
+    The only one of a session has no name: where several were calibrated with, it is the one among
+    them that is printed alike.
+
+    Raises:
+        DataError: They are others than were calibrated with, or it is not known which of them.
+    """
+    known, shown = footing.targets, session.boards
+    if len(known) < 2 and len(shown) < 2:
+        if any(view.image for view in session.views):
+            _check_targets(session, footing)
+        return session
+    name = ""
+    if "" in shown:
+        alike = [it for it, target in known.items() if not _differing(target, shown[""])]
+        name = alike[0] if len(alike) == 1 else ""
+    if not name:
+        _check_targets(session, footing)
+    if not shown:
+        raise DataError(
+            f"session {session.name!r} does not say which of the targets that were calibrated with "
+            f"({', '.join(known)}) its rows show.",
+            culprits=["session.toml: targets"],
+            next_step="Declare them as in the calibration's session, and name one in each row's "
+            "column target.",
+        )
+    views = session.views
+    if name:
+        views = tuple(replace(it, text={**it.text, COLUMN: name}) for it in views)
+    return replace(session, target=None, targets=known, views=views)
+
+
+def _differing(ours: Target, theirs: Target) -> list[str]:
+    """The fields in which two targets are printed differently."""
+    one, other = target_document(ours), target_document(theirs)
+    differing = [it for it in {**one, **other} if one.get(it) != other.get(it)]
+    return [it for it in differing if it != "square_sigma_m"]
+
+
 def _check_targets(session: Session, footing: Footing) -> None:
     """Refuses other targets than were calibrated with; how well a size is known may differ."""
+    if not footing.targets:
+        raise DataError(
+            f"calibration {footing.calibration.session_name!r} was made from measured poses, and "
+            f"does not say of which target; session {session.name!r} has images.",
+            culprits=["session.toml: target"],
+            next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
+        )
     for name, target in session.boards.items():
         known = footing.targets.get(name)
         if known is None:
@@ -203,13 +251,12 @@ def _check_targets(session: Session, footing: Footing) -> None:
                 f"session {session.name!r}: target {name or target.name!r} is none of those that "
                 f"were calibrated with ({there}).",
                 culprits=["session.toml: target"],
-                next_step="Name the targets as in the calibration's session.",
+                next_step="Verify with views of that target alone."
+                if "" in footing.targets
+                else "Name the targets as in the calibration's session.",
             )
         ours, theirs = target_document(known), target_document(target)
-        other = [it for it in {**ours, **theirs} if ours.get(it) != theirs.get(it)]
-        for field in other:
-            if field == "square_sigma_m":
-                continue
+        for field in _differing(known, target):
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} has {field} = "
                 f"{theirs.get(field)!r}, and the calibration was made with {ours.get(field)!r}: it "
