@@ -18,6 +18,7 @@ LAYERS = (
     ("chance",),
     ("figures",),
     ("transforms",),
+    ("threads",),
     ("files",),
     ("conventions",),
     ("documents",),
@@ -55,7 +56,7 @@ LAYERS = (
 )
 # The session's loader hands recordings over; the package's front hands out names on first use.
 LAZY = {("session", "recording")}
-SIMULATION_MAY_USE = {"errors", "types", "transforms", "files", "session", "simulation"}
+SIMULATION_MAY_USE = {"errors", "types", "transforms", "files", "threads", "session", "simulation"}
 HOMES = {
     "rerun": {"recording", "viewer"},
     "pinocchio": {"robot"},

@@ -28,10 +28,10 @@ from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.reading import Recorded
 from visioncal.dynamics.validate import friction_of_known, predict, validate
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.robot import load_robot, small_urdf
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import Exercise, multi_sine, slow_sweep
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 
 WORLDS, SEARCH_S, RATE_HZ, REPEATS = 20, 25.0, 500.0, 3

@@ -26,11 +26,11 @@ from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
 from visioncal.estimator.kinematics import fit_level
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
 from visioncal.solvers import SOLVERS
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray
 

@@ -32,9 +32,9 @@ from scipy.stats import f as f_distribution
 
 from visioncal.errors import DataError
 from visioncal.estimator.features import fit_features
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.pointfit import fit_points
 from visioncal.estimator.pointpairs import PointPairs
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 
 COUNTS, SEEDS = (3, 4, 6, 12), 300

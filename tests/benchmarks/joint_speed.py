@@ -16,10 +16,11 @@ from results import write_section
 
 from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
 from visioncal.estimator.corners import CornerStack, reproject
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.poses import fit_poses
 from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
 from visioncal.targets import corner_positions
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.types import FloatArray
 

@@ -27,8 +27,8 @@ from visioncal.alignment.ties import untied_words
 from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Untied
 from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.session import Session
+from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, Progress
 
 
@@ -40,6 +40,8 @@ def align(
     progress: Progress | None = None,
 ) -> Alignment:
     """Aligns a cell of any number of robots, cameras and boards, in one joint adjustment.
+
+    Several threads may do so at once, as with `calibrate`.
 
     Args:
         session: A session, or the path of its folder or recording.

@@ -23,8 +23,8 @@ from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.objective import Objective
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.files import some_of
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, Progress
 
 # How long a motion may be [s], and of how many harmonics: fewer cannot tell the parameters of six

@@ -12,7 +12,7 @@ from scipy.fft import next_fast_len, rfft
 from scipy.linalg import qr, solve_triangular
 
 from visioncal.chance import chi2_limit
-from visioncal.estimator.linalg import one_blas_thread
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Mask
 
 # Rows that are decomposed at a time, so that they stay in the processor's cache.

@@ -17,11 +17,12 @@ from visioncal.estimator.closure import (
     fit_closure,
     residual_blocks,
 )
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.shared import Shared
 from visioncal.estimator.trajectory import Trajectory
 from visioncal.estimator.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
 from visioncal.solvers import SOLVERS
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray, Mask
 

@@ -1,15 +1,11 @@
 """Linear algebra of least squares: solving, covariance, and the spectrum of the information."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import eigh
-from threadpoolctl import ThreadpoolController
 
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -17,19 +13,6 @@ _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
 # Share of the noise's variance under which a fit has taken all of it.
 _VANISHED = 1e-6
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Keeps small dense solves on one thread: on a busy machine threads make them far slower."""
-    with _thread_pools().limit(limits=1):
-        yield
-
-
-@cache
-def _thread_pools() -> ThreadpoolController:
-    # Looking for the loaded libraries takes as long as a whole fit.
-    return ThreadpoolController()
 
 
 @dataclass(frozen=True, eq=False)

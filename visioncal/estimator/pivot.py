@@ -14,10 +14,10 @@ from visioncal.errors import DataError
 from visioncal.estimator.agreement import Agreement, agreeing_groups
 from visioncal.estimator.closure import Noise
 from visioncal.estimator.groups import GroupFit, fit_groups
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.observability import Direction
 from visioncal.estimator.touching import Placed, Touches, TouchProblem, in_tool
 from visioncal.estimator.turning import CARELESS_M, check_counts, check_turning
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, Mask
 
 # A touch that errs fits another point by chance in one of a thousand.

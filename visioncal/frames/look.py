@@ -16,13 +16,14 @@ from visioncal.estimator.appearance import (
 )
 from visioncal.estimator.corners import CornerStack
 from visioncal.estimator.gating import gate
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.planar import determines_pose
 from visioncal.finders import NotFound, find_target
 from visioncal.finders.imaging import blur_at_corners, why_hard_to_see
 from visioncal.frames.chain import Eye
 from visioncal.stages.pnp import ViewPoses, measure_poses
 from visioncal.targets import corner_positions, rotations
+from visioncal.threads import one_blas_thread
 from visioncal.types import Camera, Corners, FloatArray, Image, Target
 
 # Corners scatter more than this by chance in one look of ten thousand.

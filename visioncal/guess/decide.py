@@ -7,7 +7,6 @@ import numpy as np
 
 from visioncal.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.guess.chain import by_chain, is_half_turned
 from visioncal.guess.fit import is_about_one_axis
 from visioncal.guess.given import (
@@ -24,6 +23,7 @@ from visioncal.guess.result import Candidate, Guess
 from visioncal.guess.search import search
 from visioncal.guess.swaps import exchanged
 from visioncal.guess.words import notes, sentence
+from visioncal.threads import one_blas_thread
 from visioncal.types import MOUNTS, FloatArray, Mount
 
 # Readings this near to the best are as good; of them, the one with the fewest changes is meant.

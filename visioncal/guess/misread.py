@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.figures import figure
 from visioncal.guess.fit import Fit, distances, is_about_one_axis, robust_fit
 from visioncal.guess.given import SCORE_FLOOR, STANDS_OUT
 from visioncal.guess.joints import JointReading, declared_reading, joint_readings, with_zero
 from visioncal.guess.search import thinned
 from visioncal.robot import Robot
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray
 

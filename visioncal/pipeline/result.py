@@ -30,6 +30,7 @@ from visioncal.stages.kinematics import ASKED
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, Progress, SolverName
 
 _LEVELS = (*ASKED, "hand-eye")
@@ -57,6 +58,9 @@ def calibrate(
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrates a session.
+
+    Several threads may do so at once. While one does, BLAS has one thread for each, and OpenCV,
+    too, while targets are looked for; afterwards both have those that they had.
 
     Args:
         session: A session, or the path of its folder or recording.
@@ -97,7 +101,13 @@ def run(
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    known = Known(loaded, solver, progress, level=level, convention=convention)
+    with one_blas_thread():
+        return _run(Known(loaded, solver, progress, level=level, convention=convention))
+
+
+def _run(known: Known) -> Run:
+    """Takes a session through all stages."""
+    progress = known.progress
     seen: Known | None = None
     for at, stage in enumerate(STAGES):
         if progress is not None:

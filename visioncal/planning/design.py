@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.planning.accuracy import Accuracy, Wish
 from visioncal.planning.information import World
 from visioncal.planning.selection import CRITERIA, Criterion, Selection, reduced
+from visioncal.threads import one_blas_thread
 from visioncal.types import IntArray
 
 # An exchange must gain this share; so many of them a stop are enough.

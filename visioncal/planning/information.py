@@ -24,7 +24,7 @@ from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimator.closure import Closure, Edges, Noise, whitened_slopes
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.shared import Shared
 from visioncal.estimator.workspace import pose_slopes, postures, tool_slopes
 from visioncal.planning.cell import Box, PlanCell
@@ -32,6 +32,7 @@ from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.stages.handeye import robot_part
 from visioncal.targets import corner_positions
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 

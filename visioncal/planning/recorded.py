@@ -14,7 +14,7 @@ from visioncal.estimator.closure import (
     fit_closure,
     normal_equations,
 )
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.cell import Box, Limits, PlanCell
@@ -22,6 +22,7 @@ from visioncal.planning.information import Recorded
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.targets import first_corners
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray, Mount, Progress
 

@@ -18,6 +18,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D, Transform
 
 from visioncal.printing.page import FONT_PT, LINE_MM, Sheet
+from visioncal.threads import DRAWING
 from visioncal.types import FloatArray
 
 _MM_PER_INCH = 25.4
@@ -81,7 +82,7 @@ def _style() -> Iterator[None]:
         "savefig.transparent": False,
         "text.usetex": False,
     }
-    with mpl.rc_context():
+    with DRAWING, mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(settings)
         yield

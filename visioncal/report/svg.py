@@ -11,6 +11,8 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.typing import RcKeyType
 
+from visioncal.threads import DRAWING
+
 # Drawn with these stand-ins, figures get the page's own colours, in light, dark and print alike.
 INK, MUTED, LINE = "#010101", "#020202", "#030303"
 ACCENT, GOOD, BAD, CHECK = "#040404", "#050505", "#060606", "#070707"
@@ -53,8 +55,8 @@ _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Applies the report's style while figures are drawn."""
-    with mpl.rc_context(_STYLE):
+    """Applies the report's style while figures are drawn, by one thread at a time."""
+    with DRAWING, mpl.rc_context(_STYLE):
         yield
 
 
@@ -75,7 +77,7 @@ def inline(figure: Figure, name: str, words: str) -> Markup:
         The element, scaling with its container.
     """
     buffer = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": name}):
+    with DRAWING, mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, metadata=_NO_METADATA)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]

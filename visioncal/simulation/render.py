@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from visioncal.errors import DataError
 from visioncal.simulation.boards import bow_depth_m, outline_m
@@ -20,6 +19,7 @@ from visioncal.simulation.textures import (
     draw_wall,
     margin_m,
 )
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import compose, invert
 from visioncal.types import FloatArray, Image
 
@@ -148,7 +148,7 @@ def light_on(
         (height, width) light, defocused and vignetted, without noise [grey levels].
     """
     # Several BLAS threads on a busy machine wait for one another ten times as long as they work.
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         light, whole, shade = _behind(scene, cam_from_target, joints)
         if shows_board:
             _cover(light, scene, cam_from_target, samples)

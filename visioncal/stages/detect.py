@@ -14,6 +14,7 @@ from visioncal.finders import NotFound, find_target, fitting_layouts
 from visioncal.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions
+from visioncal.threads import Shared
 from visioncal.types import Corners, Image, IntArray, Progress, Rejection, Target
 
 # Images looked at to tell which layout was printed.
@@ -82,7 +83,7 @@ def detect(
     views = [view for view in (session.views if among is None else among) if view.image]
     looks: list[_Look] = []
     with (
-        _single_threaded_opencv(),
+        _ONE_OPENCV_THREAD.held(),
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
         for look in pool.map(lambda view: _look(session, view, options), views):
@@ -101,14 +102,17 @@ def detect(
 
 
 @contextmanager
-def _single_threaded_opencv() -> Iterator[None]:
-    """Keeps OpenCV from starting threads inside ours, which slows both down."""
+def _one_opencv_thread() -> Iterator[None]:
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+# OpenCV's threads inside ours slow both down.
+_ONE_OPENCV_THREAD = Shared(_one_opencv_thread)
 
 
 def image_of(session: Session, view: View) -> Image | Rejection:

@@ -12,10 +12,10 @@ from visioncal.estimator.boards import Boards
 from visioncal.estimator.budget import covariance_by_source, point_covariance
 from visioncal.estimator.closure import Closure, fit_closure
 from visioncal.estimator.intervals import noise_intervals
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.misfit import Drift, Neighbours, drift, neighbours
 from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.stages.handeye import HandEyeResult
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray
 
 # Fewer stops than this leave no residuals to be tested.

@@ -20,7 +20,7 @@ from visioncal.estimator.closure import (
     held_shift,
     solve_closure,
 )
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.observability import (
     Direction,
     check_observability,
@@ -29,6 +29,7 @@ from visioncal.estimator.observability import (
     title,
 )
 from visioncal.solvers import SOLVERS
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert
 from visioncal.types import FloatArray, Mount, SolverName
 

@@ -11,10 +11,10 @@ from visioncal.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.estimator.bundle import BundleFit, fit_bundle
 from visioncal.estimator.corners import CornerStack, mean_square_by_view
 from visioncal.estimator.gating import gate
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.planar import planar_poses
 from visioncal.estimator.poses import fit_poses
 from visioncal.targets import numbered_positions
+from visioncal.threads import one_blas_thread
 from visioncal.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
 
 Coefficients: TypeAlias = Literal["auto", 5, 8]

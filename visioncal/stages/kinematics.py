@@ -11,8 +11,8 @@ from visioncal.errors import DataError
 from visioncal.estimator.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimator.closure import Closure, Edges, noise_likelihood
 from visioncal.estimator.kinematics import LEVELS, LevelFit, fit_level, resized
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.figures import figure
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 
 NOMINAL = "nominal"

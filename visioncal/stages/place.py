@@ -14,7 +14,6 @@ from visioncal.errors import DegenerateError
 from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.closure import Closure, Edges, distances
 from visioncal.estimator.consensus import agreeing_views
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.observability import FEWEST_VIEWS
 from visioncal.stages.choose import (
     CLEAR_RATIO,
@@ -26,6 +25,7 @@ from visioncal.stages.choose import (
     padded,
 )
 from visioncal.stages.pnp import ViewPoses
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, mean_transform
 from visioncal.types import FloatArray, Mask, Mount, Rejection, Target
 

@@ -13,11 +13,12 @@ from visioncal.estimator.corners import (
     reproject,
 )
 from visioncal.estimator.gating import gate
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.planar import planar_poses
 from visioncal.estimator.poses import PoseFit, fit_poses
 from visioncal.session import Session
 from visioncal.targets import first_corners, numbered_positions, rotation_transforms
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import adjoint, invert
 from visioncal.types import Camera, Corners, FloatArray, Mask, Rejection, Target
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimator.closure import Closure, Edges
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.positions import (
     Mounting,
     Places,
@@ -24,6 +23,7 @@ from visioncal.files import did_you_mean, some_of
 from visioncal.instruments import Instrument, instrument_names, stated_instrument
 from visioncal.session import Session, View
 from visioncal.stages.pnp import ViewPoses
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Rejection
 
 # No tracker reads so far [m].

@@ -31,11 +31,12 @@ from visioncal.estimator.joint import (
     seen_at,
     settle,
 )
-from visioncal.estimator.linalg import covariance, one_blas_thread
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.observability import worst_directions
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import corner_positions, numbered_positions
+from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, IntArray
 
 

@@ -9,7 +9,6 @@ from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Closure
 from visioncal.estimator.indices import Indices
 from visioncal.estimator.lacking import Move, joints_to_move
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.estimator.parameters import (
     Parameter,
     free_parameters,
@@ -48,6 +47,7 @@ from visioncal.robot import (
     table_of,
 )
 from visioncal.stages.handeye import HandEyeResult
+from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Mask
 
 

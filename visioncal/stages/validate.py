@@ -9,8 +9,8 @@ from visioncal.camera import project
 from visioncal.estimator.appearance import Free
 from visioncal.estimator.boards import Boards
 from visioncal.estimator.closure import Closure, Edges, distances
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.stages.handeye import HandEyeResult, refit
+from visioncal.threads import one_blas_thread
 from visioncal.types import Camera, Corners, FloatArray, IntArray, SolverName
 
 # Up to here every view is left out by itself; beyond, ten groups tell the same.

@@ -24,11 +24,12 @@ from visioncal.estimator.closure import (
     residual_blocks,
 )
 from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step, one_blas_thread
+from visioncal.estimator.linalg import covariance, damped_step
 from visioncal.estimator.shared import Shared
 from visioncal.robot import Robot
 from visioncal.thermal.heating import Heating, Inputs, Kind
 from visioncal.thermal.model import ThermalModel
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert
 from visioncal.types import FloatArray
 

@@ -10,8 +10,8 @@ from visioncal.calibration import Calibration
 from visioncal.chance import f_limit
 from visioncal.errors import DataError
 from visioncal.estimator.causes import Belief, Cause, Explained, explain, undone
-from visioncal.estimator.linalg import one_blas_thread
 from visioncal.session import Session
+from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log, mean_transform
 from visioncal.types import FloatArray, Progress
 from visioncal.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of, placed_by
@@ -98,6 +98,8 @@ def verify(
     progress: Progress | None = None,
 ) -> Check:
     """Checks a calibration by a few new stops of its cell.
+
+    Several threads may do so at once, as with `calibrate`.
 
     Args:
         session: Five stops or more, with the same board where it was; nothing of it is fitted.

@@ -1,0 +1,73 @@
+"""Several threads calibrate and write at once, and leave the process as it was."""
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Barrier
+
+import cv2
+import matplotlib as mpl
+from kept import assert_same_evidence
+from threadpoolctl import threadpool_info
+
+from visioncal.outputs import write_outputs
+from visioncal.pipeline import run
+from visioncal.recording import read_evidence
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.threads import Shared
+
+THREADS = 4
+CREATED = "2026-11-21T00:00:00+00:00"
+
+
+def settings():
+    blas = sorted((it["filepath"], it["num_threads"]) for it in threadpool_info())
+    return cv2.getNumThreads(), blas, dict(mpl.rcParams)
+
+
+def test_threads_write_what_one_alone_writes(tmp_path):
+    write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
+    session = Session.load(tmp_path / "cell")
+
+    def written(number: int, barrier: Barrier) -> Path:
+        barrier.wait()
+        found = run(session)
+        found = replace(found, calibration=replace(found.calibration, created=CREATED))
+        barrier.wait()
+        write_outputs(tmp_path / str(number), session, found)
+        return tmp_path / str(number)
+
+    alone = written(THREADS, Barrier(1))
+    before = settings()
+    barrier = Barrier(THREADS)
+    with ThreadPoolExecutor(THREADS) as pool:
+        folders = list(pool.map(lambda number: written(number, barrier), range(THREADS)))
+    assert settings() == before
+    evidence = read_evidence(alone / "recording.rrd")
+    for folder in folders:
+        for name in ("calibration.json", "report.html"):
+            assert (folder / name).read_bytes() == (alone / name).read_bytes()
+        assert_same_evidence(read_evidence(folder / "recording.rrd"), evidence)
+
+
+def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():
+    log = []
+
+    @contextmanager
+    def setting():
+        log.append("made")
+        yield
+        log.append("undone")
+
+    shared = Shared(setting)
+    first, second = shared.held(), shared.held()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert log == ["made"]
+    second.__exit__(None, None, None)
+    assert log == ["made", "undone"]
+    with shared.held():
+        assert log == ["made", "undone", "made"]
