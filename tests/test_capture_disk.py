@@ -93,7 +93,7 @@ def test_what_a_killed_process_left_is_removed(plan, tmp_path):
     camera.hidden_at = (5,)
     folder = tmp_path / "live"
     recorded(folder, plan, arm, camera)
-    leftovers = [folder / ".1234.tmp", folder / "images" / ".5678.tmp"]
+    leftovers = [folder / f".{32 * '1'}.tmp", folder / "images" / f".{32 * '2'}.tmp"]
     for file in leftovers:
         file.write_bytes(b"half")
     # An image whose row did not come is written again.

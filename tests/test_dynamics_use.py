@@ -196,7 +196,7 @@ def test_friction_is_that_of_the_drives(world, run):
 @pytest.fixture(scope="module")
 def written(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("dynamics")
-    assert [it.name for it in write_dynamics(folder, run)] == [
+    assert [it.name for it in write_dynamics(folder, run).files] == [
         "dynamics.json",
         "report.html",
         "recording.rrd",

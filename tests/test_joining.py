@@ -47,7 +47,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_all_files_are_as_before_with_the_frames(sample, folder):
     joined = with_frames(sample).calibration
-    files = rewrite(folder, joined)
+    files = rewrite(folder, joined).files
     assert [it.name for it in files] == ["calibration.json", "report.html", "recording.rrd"]
     assert sorted(contents(folder)) == sorted(it.name for it in files)
     expected = to_document(sample.calibration) | {"frames": to_document(joined)["frames"]}
@@ -103,7 +103,7 @@ def test_a_write_that_fails_leaves_the_old_files(sample, folder, monkeypatch, pa
 
 def test_a_result_without_its_recording_keeps_the_rest(sample, folder):
     (folder / "recording.rrd").unlink()
-    files = rewrite(folder, with_frames(sample).calibration)
+    files = rewrite(folder, with_frames(sample).calibration).files
     assert [it.name for it in files] == ["calibration.json", "report.html"]
     assert sorted(contents(folder)) == ["calibration.json", "report.html"]
     assert Calibration.load(folder).frames.keys() == with_frames(sample).calibration.frames.keys()

@@ -7,12 +7,12 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
+from visioncal.asides import aside_file
 from visioncal.errors import DataError
 
 
@@ -25,7 +25,8 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
     """Writes a file so that a reader sees the old content or the new one, never a part.
 
     The data goes to a file of another name in the same folder, is flushed to the disk, and takes
-    the place of `path` in one step.
+    the place of `path` in one step. Killed before that, it leaves the other file behind, which the
+    next write in that folder removes.
 
     Args:
         path: The file to write; its folder must exist.
@@ -34,21 +35,35 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
     Raises:
         DataError: The folder is missing or cannot be written.
     """
-    path = Path(path)
-    content = data.encode("utf-8") if isinstance(data, str) else data
-    # A short name of its own: the folder may already hold names of the longest kind allowed.
-    aside = path.parent / f".{uuid4().hex}.tmp"
-    with named_errors(path):
-        try:
-            with aside.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            aside.replace(path)
-        except BaseException:
-            with suppress(OSError):
-                aside.unlink(missing_ok=True)
-            raise
+    with written_beside(Path(path)) as aside, aside.open("wb") as file:
+        file.write(data.encode("utf-8") if isinstance(data, str) else data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def written_beside(path: Path) -> Iterator[Path]:
+    """Gives an empty file in the same folder to write to, which takes the place of `path`.
+
+    Where something goes wrong it is removed, and `path` stays as it was.
+
+    Raises:
+        DataError: What is done within cannot be written; it names `path`.
+    """
+    with named_errors(path), aside_file(path.parent) as aside:
+        yield aside
+        aside.replace(path)
+
+
+def flush_folder(folder: Path) -> None:
+    """Waits until the names in a folder are on the disk; Windows has no way to ask for it."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 @contextmanager

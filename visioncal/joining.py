@@ -8,18 +8,17 @@ from visioncal.calibration import Calibration, Frame, FrameFile
 from visioncal.errors import DataError
 from visioncal.files import some_of
 from visioncal.frames.seen_frame import rests_on_camera
-from visioncal.outputs import CALIBRATION, write_outputs
+from visioncal.outputs import CALIBRATION, Written, write_outputs
 from visioncal.pipeline import Run
 from visioncal.stored import FRAMES, load_stored
 
 
-def rewrite(folder: Path, calibration: Calibration) -> tuple[Path, ...]:
+def rewrite(folder: Path, calibration: Calibration) -> Written:
     """Replaces the files of an output folder by those of the same session's extended result.
 
     Session and evidence come from the recording in the folder; its images stay as they are, byte by
     byte. Where there is no recording, or none that belongs to the result, it is left alone and the
-    report says what is missing. All files are made aside first: where one of them fails, those in
-    the folder stay as they were.
+    report says what is missing.
 
     Args:
         folder: What `visioncal calibrate` has written.
@@ -29,7 +28,8 @@ def rewrite(folder: Path, calibration: Calibration) -> tuple[Path, ...]:
         The files that were written: without the recording where that was left alone.
 
     Raises:
-        DataError: The folder has no result, one of another session, or cannot be written.
+        DataError: The folder has no result, one of another session, or cannot be written; the files
+            in it stay as they were.
     """
     stored = load_stored(folder)
     if stored.calibration.session_sha256 != calibration.session_sha256:

@@ -1,10 +1,11 @@
 """What `calibrate`, `align`, `verify`, `plan` and `dynamics` write into a folder."""
 
 import json
-import tempfile
+import traceback
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from visioncal.calibration import Alignment
 from visioncal.dynamics import FILE as DYNAMICS
@@ -12,7 +13,8 @@ from visioncal.dynamics import Run
 from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.written import MOTION_FILES, motion_files
 from visioncal.errors import DataError
-from visioncal.files import named_errors, write_atomically
+from visioncal.files import write_atomically
+from visioncal.generations import write_generation
 from visioncal.pipeline import Run as Calibrated
 from visioncal.planning.plan import Plan
 from visioncal.planning.written import program_of, stops_table
@@ -24,14 +26,41 @@ VERIFY = "verify.json"
 ALIGNMENT = "alignment.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 
+_Writer: TypeAlias = Callable[[Path], None]
+
+
+@dataclass(frozen=True)
+class Undrawn:
+    """A file that there is not, because drawing it failed: a bug, which takes no result away.
+
+    Attributes:
+        file: The file; one of an earlier result was taken away.
+        cause: The error and its place in the code.
+    """
+
+    file: Path
+    cause: str
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written into a folder.
+
+    Attributes:
+        files: The files, the result first.
+        undrawn: What is missing beside it.
+    """
+
+    files: tuple[Path, ...]
+    undrawn: tuple[Undrawn, ...] = ()
+
 
 def write_outputs(
     folder: Path, session: Session | None, run: Calibrated, note: str = ""
-) -> tuple[Path, ...]:
-    """Writes the three files into a folder.
+) -> Written:
+    """Writes the three files into a folder, all at once whenever it is killed.
 
-    They are made aside first: where one of them fails, none appears, and files that an earlier
-    calibration left there stay as they were.
+    Several threads may do so at once; their figures are drawn one at a time.
 
     Args:
         folder: Where to; it is made where there is none.
@@ -40,30 +69,35 @@ def write_outputs(
         note: What the reader should know of the report itself.
 
     Returns:
-        The files that were written.
+        The files that were written: the result even where drawing the report or recording failed.
 
     Raises:
-        DataError: The folder cannot be written.
+        DataError: The folder cannot be written; the files in it stay as they were.
     """
-    # Plots and the recording's codec take half a second to import, which help need not wait for.
-    from visioncal.recording import write_recording
-    from visioncal.report import write_report
-    from visioncal.viewer import blueprint
 
-    def write(aside: Path) -> None:
-        run.calibration.save(aside / CALIBRATION)
-        write_report(aside / REPORT, run.calibration, session, run.evidence, note)
-        if session is not None:
+    def report(path: Path) -> None:
+        # Plots and the recording's codec take half a second to import, which help need not wait
+        # for.
+        from visioncal.report import write_report
+
+        write_report(path, run.calibration, session, run.evidence, note)
+
+    drawings: dict[str, _Writer] = {REPORT: report}
+    if session is not None:
+
+        def record(path: Path) -> None:
+            from visioncal.recording import write_recording
+            from visioncal.viewer import blueprint
+
             layout = blueprint(session, run.calibration)
-            write_recording(aside / RECORDING, session, run.calibration, run.evidence, layout)
+            write_recording(path, session, run.calibration, run.evidence, layout)
 
-    # The result last: it is what the others are beside.
-    files = (*([] if session is None else [RECORDING]), REPORT, CALIBRATION)
-    return _write_together(folder, files, write)
+        drawings[RECORDING] = record
+    return _write(folder, {CALIBRATION: run.calibration.save}, drawings)
 
 
-def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], document: str) -> None:
-    """Writes a check's page and JSON into a folder, together or not at all.
+def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], document: str) -> Written:
+    """Writes a check's page and JSON into a folder, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
@@ -71,17 +105,20 @@ def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], documen
         triggers: What became of the policy's triggers.
         document: The content of verify.json.
 
+    Returns:
+        The files that were written: the JSON even where drawing the page failed.
+
     Raises:
-        DataError: The folder cannot be written.
+        DataError: The folder cannot be written; the files in it stay as they were.
     """
-    from visioncal.report.check import write_check as write_page
-    from visioncal.verification.page import page_of
 
-    def write(aside: Path) -> None:
-        write_page(aside / REPORT, page_of(check, triggers))
-        write_atomically(aside / VERIFY, document)
+    def page(path: Path) -> None:
+        from visioncal.report.check import write_check as write_page
+        from visioncal.verification.page import page_of
 
-    _write_together(folder, (REPORT, VERIFY), write)
+        write_page(path, page_of(check, triggers))
+
+    return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
 
 
 def refuse_calibration(folder: Path) -> None:
@@ -98,8 +135,8 @@ def refuse_calibration(folder: Path) -> None:
         )
 
 
-def write_alignment(folder: Path, session: Session, found: Alignment) -> tuple[Path, ...]:
-    """Writes the alignment of a cell, its report and its recording into a folder, or none of them.
+def write_alignment(folder: Path, session: Session, found: Alignment) -> Written:
+    """Writes the alignment of a cell, its report and its recording into a folder, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
@@ -107,26 +144,28 @@ def write_alignment(folder: Path, session: Session, found: Alignment) -> tuple[P
         found: The result.
 
     Returns:
-        The files that were written.
+        The files that were written: the result even where drawing the others failed.
 
     Raises:
-        DataError: The folder cannot be written.
+        DataError: The folder cannot be written; the files in it stay as they were.
     """
-    from visioncal.recording import write_cell_recording
-    from visioncal.report.cells import write_cell_report
-    from visioncal.viewer.cells import cell_blueprint
 
-    def write(aside: Path) -> None:
-        found.save(aside / ALIGNMENT)
-        write_cell_report(aside / REPORT, found)
-        layout = cell_blueprint(session, found)
-        write_cell_recording(aside / RECORDING, session, found, layout)
+    def report(path: Path) -> None:
+        from visioncal.report.cells import write_cell_report
 
-    return _write_together(folder, (RECORDING, REPORT, ALIGNMENT), write)
+        write_cell_report(path, found)
+
+    def record(path: Path) -> None:
+        from visioncal.recording import write_cell_recording
+        from visioncal.viewer.cells import cell_blueprint
+
+        write_cell_recording(path, session, found, cell_blueprint(session, found))
+
+    return _write(folder, {ALIGNMENT: found.save}, {REPORT: report, RECORDING: record})
 
 
-def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[Path, ...]:
-    """Writes a plan's table, program, preview and JSON into a folder, together or not at all.
+def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> Written:
+    """Writes a plan's table, program, preview and JSON into a folder, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
@@ -134,39 +173,33 @@ def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> tuple[P
         document: The content of plan.json.
 
     Returns:
-        The files that were written. Robots that are not programmed like a UR get no program, and
-        one that an earlier plan left is taken away.
+        The files that were written: all but the preview even where drawing that failed. Robots that
+        are not programmed like a UR get no program, and one that an earlier plan left is taken
+        away.
 
     Raises:
-        DataError: The folder cannot be written.
+        DataError: The folder cannot be written; the files in it stay as they were.
     """
-    from visioncal.planning.preview import preview_of
-    from visioncal.recording.preview import write_preview
-    from visioncal.viewer.planned import plan_blueprint
 
-    program = program_of(plan)
-    preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
+    def draw(path: Path) -> None:
+        from visioncal.planning.preview import preview_of
+        from visioncal.recording.preview import write_preview
+        from visioncal.viewer.planned import plan_blueprint
 
-    def write(aside: Path) -> None:
-        write_preview(aside / PREVIEW, preview, plan_blueprint(preview))
-        write_atomically(aside / STOPS, stops_table(plan))
-        if program:
-            write_atomically(aside / PROGRAM, program)
-        text = json.dumps(document, indent=2, allow_nan=False)
-        write_atomically(aside / PLAN, f"{text}\n")
+        preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
+        write_preview(path, preview, plan_blueprint(preview))
 
-    files = (PREVIEW, *([PROGRAM] if program else []), STOPS, PLAN)
-    written = _write_together(folder, files, write)
-    if not program:
-        with named_errors(folder / PROGRAM):
-            (folder / PROGRAM).unlink(missing_ok=True)
-    return written
+    texts = {PLAN: _json(document), STOPS: stops_table(plan)}
+    if program := program_of(plan):
+        texts[PROGRAM] = program
+    results = {name: _text(text) for name, text in texts.items()}
+    return _write(folder, results, {PREVIEW: draw}, (PROGRAM,))
 
 
 def write_motions(
     folder: Path, plan: MotionPlan, rate_hz: float, document: Mapping[str, Any]
-) -> tuple[Path, ...]:
-    """Writes planned motions as tables, programs, preview and JSON, together or not at all.
+) -> Written:
+    """Writes planned motions as tables, programs, preview and JSON, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
@@ -175,78 +208,97 @@ def write_motions(
         document: The content of plan.json.
 
     Returns:
-        The files that were written. Robots that are not programmed like a UR get no programs; what
-        an earlier plan left and this one has not is taken away.
+        The files that were written: all but the preview even where drawing that failed. Robots that
+        are not programmed like a UR get no programs; what an earlier plan left and this one has not
+        is taken away.
 
     Raises:
-        DataError: The folder cannot be written.
+        DataError: The folder cannot be written; the files in it stay as they were.
     """
-    from visioncal.planning.motion_preview import motion_preview
-    from visioncal.recording.motions import write_motion_preview
-    from visioncal.viewer.motions import motion_blueprint
 
-    texts = motion_files(plan, rate_hz)
-    preview = motion_preview(plan)
+    def draw(path: Path) -> None:
+        from visioncal.planning.motion_preview import motion_preview
+        from visioncal.recording.motions import write_motion_preview
+        from visioncal.viewer.motions import motion_blueprint
 
-    def write(aside: Path) -> None:
-        write_motion_preview(aside / PREVIEW, preview, motion_blueprint(preview))
-        for name, text in texts.items():
-            write_atomically(aside / name, text)
-        write_atomically(aside / PLAN, json.dumps(document, indent=2, allow_nan=False) + "\n")
+        preview = motion_preview(plan)
+        write_motion_preview(path, preview, motion_blueprint(preview))
 
-    written = _write_together(folder, (PREVIEW, *texts, PLAN), write)
-    for name in MOTION_FILES:
-        if name not in texts:
-            with named_errors(folder / name):
-                (folder / name).unlink(missing_ok=True)
-    return written
+    texts = {PLAN: _json(document), **motion_files(plan, rate_hz)}
+    results = {name: _text(text) for name, text in texts.items()}
+    return _write(folder, results, {PREVIEW: draw}, MOTION_FILES)
 
 
-def write_dynamics(folder: Path, run: Run) -> tuple[Path, ...]:
-    """Writes identified dynamics, their report and recording into a folder, together or not at all.
+def write_dynamics(folder: Path, run: Run) -> Written:
+    """Writes identified dynamics, their report and recording into a folder, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
         run: The result with its evidence.
 
     Returns:
-        The files that were written.
+        The files that were written: the result even where drawing the others failed.
 
     Raises:
-        DataError: The folder cannot be written.
+        DataError: The folder cannot be written; the files in it stay as they were.
     """
-    from visioncal.recording.dynamics import write_dynamics_recording
-    from visioncal.report.dynamics import write_dynamics_report
-    from visioncal.viewer.dynamics import dynamics_blueprint
+
+    def report(path: Path) -> None:
+        from visioncal.report.dynamics import write_dynamics_report
+
+        write_dynamics_report(path, run)
+
+    def record(path: Path) -> None:
+        from visioncal.recording.dynamics import write_dynamics_recording
+        from visioncal.viewer.dynamics import dynamics_blueprint
+
+        write_dynamics_recording(path, run, dynamics_blueprint(run))
+
+    return _write(folder, {DYNAMICS: run.identified.save}, {REPORT: report, RECORDING: record})
+
+
+def _write(
+    folder: Path,
+    results: Mapping[str, _Writer],
+    drawings: Mapping[str, _Writer],
+    others: Sequence[str] = (),
+) -> Written:
+    """Writes results, and what is drawn of them as far as that succeeds, as one generation.
+
+    Args:
+        folder: Where to.
+        results: What writes each file without which there is nothing; the one that counts first.
+        drawings: What draws the others.
+        others: Files that an earlier generation may have, and this one has not.
+    """
+    undrawn: list[Undrawn] = []
 
     def write(aside: Path) -> None:
-        run.identified.save(aside / DYNAMICS)
-        write_dynamics_report(aside / REPORT, run)
-        write_dynamics_recording(aside / RECORDING, run, dynamics_blueprint(run))
+        for name, save in results.items():
+            save(aside / name)
+        for name, draw in drawings.items():
+            try:
+                draw(aside / name)
+            except Exception as error:
+                # A disk without room is no bug, and ends as a result that cannot be written does.
+                if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
+                    raise
+                undrawn.append(Undrawn(folder / name, _cause(error)))
 
-    return _write_together(folder, (RECORDING, REPORT, DYNAMICS), write)
+    # The result last: it is what the others are beside.
+    mine = [*results, *drawings]
+    names = [*(it for it in others if it not in mine), *reversed(mine)]
+    return Written(write_generation(folder, names, write), tuple(undrawn))
 
 
-def _write_together(
-    folder: Path, files: Sequence[str], write: Callable[[Path], None]
-) -> tuple[Path, ...]:
-    """Has files written aside, and moves them into a folder once all are there."""
-    taken = [folder / file for file in files if (folder / file).is_dir()]
-    if taken:
-        raise DataError(
-            f"{taken[0]} is a folder, where a file is to be written.", culprits=[str(taken[0])]
-        )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-            aside = Path(name)
-            write(aside)
-            for file in files:
-                (aside / file).replace(folder / file)
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written: {error.strerror or error}.",
-            culprits=[str(folder)],
-            next_step="Make room in it, or choose another folder.",
-        ) from error
-    return tuple(folder / file for file in reversed(files))
+def _cause(error: Exception) -> str:
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"
+
+
+def _json(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def _text(content: str) -> _Writer:
+    return lambda path: write_atomically(path, content)

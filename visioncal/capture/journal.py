@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
@@ -11,10 +10,12 @@ from typing import Any
 import cv2
 import tomli_w
 
+from visioncal.asides import remove_abandoned
 from visioncal.capture.facts import Facts, view_of
 from visioncal.capture.take import Taken
 from visioncal.errors import DataError
 from visioncal.files import (
+    flush_folder,
     named_errors,
     parse_toml,
     read_bytes,
@@ -106,13 +107,13 @@ class Journal:
             DataError: The folder holds another recording, or something else.
         """
         path = folder / PROVENANCE
+        for place in (folder, folder / _IMAGES):
+            remove_abandoned(place)
         if not path.is_file():
-            _remove_leftovers(folder)
             with named_errors(folder), suppress(FileNotFoundError):
                 (folder / _IMAGES).rmdir()
             return cls.begin(folder, facts, unix_offset_s, views)
         _check_same(parse_toml(read_text(path), str(path)), facts, folder)
-        _remove_leftovers(folder)
         journal = cls(folder, facts, unix_offset_s)
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)
@@ -160,7 +161,7 @@ class Journal:
         try:
             write_atomically(path, data)
             with named_errors(path):
-                _flush_folder(path.parent)
+                flush_folder(path.parent)
         except DataError as error:
             cause = error.__cause__
             if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -211,22 +212,3 @@ def _short(value: object) -> str:
     if isinstance(value, str) and len(value) == _DIGEST:
         return f"{value[:8]}..."
     return json.dumps(value) if value not in ("", None) else "none"
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Removes what a killed process wrote aside and did not put in place."""
-    with named_errors(folder):
-        for place in (folder, folder / _IMAGES):
-            for file in place.glob(".*.tmp") if place.is_dir() else ():
-                file.unlink(missing_ok=True)
-
-
-def _flush_folder(folder: Path) -> None:
-    """Waits until the names in a folder are on the disk; Windows has no way to ask for it."""
-    if os.name == "nt":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

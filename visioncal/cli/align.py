@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from visioncal.alignment import ArmsAsked, align
 from visioncal.calibration import Alignment
-from visioncal.cli.console import messages, print_verdict, shown_progress
+from visioncal.cli.console import messages, print_verdict, shown_progress, tell_written
 from visioncal.figures import figure
 from visioncal.outputs import write_alignment
 from visioncal.session import Session
@@ -49,9 +49,9 @@ def align_into(session: Session, out: Path, *, arms: ArmsAsked = "reported", as_
     written = write_alignment(out, session, result)
     if as_json:
         typer.echo(json.dumps(result.document(), indent=2))
-        return
-    _tell(result)
-    messages().print(escape("wrote " + ", ".join(map(str, written))))
+    else:
+        _tell(result)
+    tell_written(written, quiet=as_json)
 
 
 def _tell(result: Alignment) -> None:

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from visioncal.calibration import to_document
 from visioncal.cli.align import align_into
-from visioncal.cli.console import messages, print_summary, shown_progress
+from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
 from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
@@ -52,8 +52,9 @@ def calibrate_command(
 
     Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
     earlier result there are kept in frames.json. Exit status 0: there is a result, with a verdict;
-    2: the input or the motion cannot give one, and an existing folder stays as it was. One robot
-    with several cameras is put in one frame, as align does it.
+    2: the input or the motion cannot give one, and an existing folder stays as it was; 1: drawing
+    the report or the recording failed, and calibration.json is there. One robot with several
+    cameras is put in one frame, as align does it.
     """
     loaded = Session.load(session)
     if len(loaded.cameras) > 1 and len(loaded.robots) == 1:
@@ -65,12 +66,11 @@ def calibrate_command(
         told("write", 0, 1)
         if left is not None:
             left.keep()
-        files = write_outputs(out, loaded, result)
+        written = write_outputs(out, loaded, result)
     if as_json:
         typer.echo(json.dumps(to_document(result.calibration), indent=2))
     else:
         print_summary(told_of(result.calibration, session), verbose=verbose)
-        for file in files:
-            messages().print(f"wrote {file}")
     if left is not None:
         messages().print(escape(left.words))
+    tell_written(written, quiet=as_json)

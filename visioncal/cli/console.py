@@ -14,9 +14,12 @@ from rich.table import Table
 from visioncal.calibration import Calibration, Verdict
 from visioncal.errors import VisioncalError
 from visioncal.files import some_of
+from visioncal.outputs import Written
 from visioncal.transforms import pose_difference
 from visioncal.types import Progress as Told
 
+# A bug of ours.
+_EXIT_BUG = 1
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 _LISTED_CULPRITS = 10
 _SAME_REASON = 20  # more views of one reason share a line
@@ -103,6 +106,31 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         console.print(f"  {escape(words)}")
     if verbose:
         console.print(_solver_table(calibration))
+
+
+def tell_written(written: Written, *, quiet: bool = False, status: int = 0) -> None:
+    """Says which files were written, and ends the command where there is more to say than that.
+
+    Args:
+        written: The files.
+        quiet: Whether to say only what is missing.
+        status: The exit status of the command's answer. Where that is 0, a file that could not be
+            drawn makes it 1.
+
+    Raises:
+        typer.Exit: The status is not 0.
+    """
+    console = messages()
+    for file in () if quiet else written.files:
+        console.print(escape(f"wrote {file}"))
+    for it in written.undrawn:
+        console.print(
+            f"[bold red]bug:[/] {escape(f'{it.file} could not be drawn ({it.cause}).')}\n"
+            f"The result is safe in {escape(str(written.files[0]))}. Please report this, with the "
+            "session if it can be given away."
+        )
+    if status or written.undrawn:
+        raise typer.Exit(status or _EXIT_BUG)
 
 
 def _unused(calibration: Calibration) -> Iterator[str]:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, print_summary, shown_progress
+from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
 from visioncal.outputs import write_outputs
 from visioncal.pipeline import run
 from visioncal.session import Session
@@ -35,13 +36,14 @@ def demo_command(
         loaded = Session.load(session)
         done = run(loaded, progress=told)
         told("write", 0, 1)
-        files = write_outputs(result, loaded, done)
+        written = write_outputs(result, loaded, done)
     print_summary(done.calibration, verbose=True)
     truth = read_truth(session)
     messages().print(truth_table(done.calibration, truth.transforms, truth.camera))
-    for file in (session, truth_path(session), *files):
-        messages().print(f"wrote {file}")
-    messages().print(f"Open {result / 'report.html'} in a browser to see it all.")
+    for file in (session, truth_path(session)):
+        messages().print(escape(f"wrote {file}"))
+    tell_written(written)
+    messages().print(escape(f"Open {result / 'report.html'} in a browser to see it all."))
 
 
 def _replace_session(options: CellOptions, folder: Path, progress: Callable[[float], None]) -> None:

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from visioncal.calibration import Verdict
-from visioncal.cli.console import messages, print_verdict
+from visioncal.cli.console import messages, print_verdict, tell_written
 from visioncal.cli.dynamics_options import (
     AgainstOption,
     CutoffOption,
@@ -85,14 +85,14 @@ def dynamics_identify_command(
     )
     run = identify_session(Session.load(session), request)
     identified = run.identified
-    written = () if output is None else write_dynamics(output, run)
+    written = None if output is None else write_dynamics(output, run)
     if as_json:
         write_stdout(json.dumps(to_document(identified), indent=2, allow_nan=False) + "\n")
-        return
-    _tell(identified)
-    for path in written:
-        messages().print(escape(f"wrote {path}"))
-    if not written:
+    else:
+        _tell(identified)
+    if written is not None:
+        tell_written(written, quiet=as_json)
+    elif not as_json:
         messages().print("nothing was written: -o names a folder for it")
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from rich.markup import escape
 
 from visioncal.cli import motion_options as options
-from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.console import messages, shown_progress, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.plan_options import BoxOption, Clearance, Floor, Margin
 from visioncal.cli.planned_cell import box_of, floor_of
@@ -77,17 +77,20 @@ def dynamics_plan_command(
     swept = None if no_sweeps else SweepRequest(speeds=sweep_speeds, seed=seed)
     plan = _planned(allowed, wished, swept, quiet=as_json)
     document = motion_document(plan)
-    files = write_motions(out, plan, rate_hz, document)
+    written = write_motions(out, plan, rate_hz, document)
     if as_json:
         write_stdout(json.dumps(document, indent=2, allow_nan=False) + "\n")
-        return
+    else:
+        _tell(plan)
+    tell_written(written, quiet=as_json)
+
+
+def _tell(plan: MotionPlan) -> None:
     console = messages()
     for words in plan_words(plan):
         console.print(escape(words))
     for words in plan_warnings(plan):
         console.print(f"[bold yellow]warning:[/] {escape(words)}")
-    for file in files:
-        console.print(escape(f"wrote {file}"))
 
 
 def _planned(

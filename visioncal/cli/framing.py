@@ -10,13 +10,13 @@ from rich.markup import escape
 
 from visioncal.calibration import Calibration, Frame, FrameFile
 from visioncal.calibration.frame import frames_document
-from visioncal.cli.console import messages, print_verdict
+from visioncal.cli.console import messages, print_verdict, tell_written
 from visioncal.cli.convert_options import names_in
 from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.formats import PoseWishes, Wishes
 from visioncal.joining import rewrite
-from visioncal.outputs import RECORDING
+from visioncal.outputs import RECORDING, Written
 from visioncal.robot import Robot, load_robot
 from visioncal.stored import load_calibration
 from visioncal.transforms import pose_difference
@@ -106,13 +106,13 @@ class Place:
                     next_step="Give this one another name with --name.",
                 )
 
-    def keep(self, frame: Frame) -> tuple[Path, ...]:
+    def keep(self, frame: Frame) -> Written:
         """Writes the frame where it goes; nowhere if nothing was named."""
         if self.file is not None:
             FrameFile(self._frames() | {self.name: frame}).save(self.file)
-            return (self.file,)
+            return Written((self.file,))
         if self.folder is None or self.calibration is None:
-            return ()
+            return Written(())
         frames = {**self.calibration.frames, self.name: frame}
         return rewrite(self.folder, replace(self.calibration, frames=frames))
 
@@ -165,10 +165,11 @@ def metres(millimetres: float | None, option: str) -> float | None:
     return 1e-3 * millimetres
 
 
-def tell(place: Place, frame: Frame, files: tuple[Path, ...], *, as_json: bool) -> None:
+def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None:
     """Prints a frame for people, or as JSON."""
     if as_json:
         typer.echo(json.dumps(frames_document({place.name: frame}), indent=2))
+        tell_written(written, quiet=True)
         return
     console = messages()
     print_verdict(frame.verdict, place.name)
@@ -190,16 +191,16 @@ def tell(place: Place, frame: Frame, files: tuple[Path, ...], *, as_json: bool) 
         )
     )
     _tell_before(place, frame)
-    for file in files:
-        console.print(escape(f"wrote {file}"))
-    if place.folder is not None and place.folder / RECORDING not in files:
+    undrawn = [it.file for it in written.undrawn]
+    if place.folder is not None and place.folder / RECORDING not in (*written.files, *undrawn):
         console.print(
             escape(
                 f"{place.folder / RECORDING} was not renewed: it is missing or of another result"
             )
         )
-    if not files:
+    if not written.files:
         console.print("nothing was written: -c joins it to a calibration, -o puts it into a file")
+    tell_written(written)
 
 
 def _tell_before(place: Place, frame: Frame) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from rich.markup import escape
 
 from visioncal.cli import plan_options as options
-from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.console import messages, shown_progress, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.planned_cell import (
     CellWords,
@@ -124,13 +124,12 @@ def plan_command(
         plan = make_plan(cell, request, begun=begun, progress=told)
         told("write", 0, 1)
         document = plan_document(plan, {"kind": start.words})
-        files = write_plan(out, plan, document)
+        written = write_plan(out, plan, document)
     if as_json:
         write_stdout(json.dumps(document, indent=2, allow_nan=False) + "\n")
-        return
-    _tell(plan)
-    for file in files:
-        messages().print(escape(f"wrote {file}"))
+    else:
+        _tell(plan)
+    tell_written(written, quiet=as_json)
 
 
 def _begin(

@@ -15,11 +15,12 @@ from rich.markup import escape
 
 from visioncal.calibration import Calibration
 from visioncal.cli.against_truth import truth_table
-from visioncal.cli.console import messages, print_summary
+from visioncal.cli.console import messages, print_summary, tell_written
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded
 from visioncal.drivers.extras import client_library
 from visioncal.errors import DataError
 from visioncal.files import write_atomically
+from visioncal.outputs import Written
 from visioncal.rehearsal.bench import Bench
 from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.rehearsal.compared import Explained, edge_errors, explained
@@ -70,8 +71,7 @@ def rehearse_command(
     whole.tell(out)
     if as_json:
         typer.echo(json.dumps(document, indent=2, allow_nan=False))
-    if not whole.error.passed:
-        raise typer.Exit(EXIT_WRONG)
+    tell_written(whole.written, quiet=True, status=0 if whole.error.passed else EXIT_WRONG)
 
 
 def _rehearse(
@@ -89,12 +89,14 @@ def _rehearse(
         _tell_devices(bench)
         taken = recorded(bench, scene, out / "session", [witness], fault, view=view)
     captured = time.monotonic()
-    found = calibrated(out / "session", out / "result").calibration
+    run, written = calibrated(out / "session", out / "result")
+    found = run.calibration
     ended = time.monotonic()
     return _Rehearsal(
         options,
         cell,
         found,
+        written,
         explained(found, cell.truth.transforms),
         taken,
         None if fault else pace_of(taken.steps, scene.planned, start_q, TAKING),
@@ -117,6 +119,7 @@ class _Rehearsal:
         options: What was asked for.
         cell: The cell.
         calibration: The result.
+        written: Where it is.
         error: Its error, weighed.
         taken: What was recorded.
         pace: How long the views took; None where a fault came between.
@@ -128,6 +131,7 @@ class _Rehearsal:
     options: RehearsalOptions
     cell: RehearsedCell
     calibration: Calibration
+    written: Written
     error: Explained
     taken: Recorded
     pace: Pace | None

@@ -11,12 +11,12 @@ from visioncal.capture.core import Step, Watcher, missed
 from visioncal.capture.journal import Journal
 from visioncal.capture.options import CaptureOptions
 from visioncal.capture.take import Taken
-from visioncal.cli.console import messages, report_error, shown_progress
+from visioncal.cli.console import messages, report_error, shown_progress, tell_written
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.record import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
 from visioncal.errors import DataError, DriverError, VisioncalError
-from visioncal.outputs import write_outputs, write_plan
+from visioncal.outputs import Written, write_outputs, write_plan
 from visioncal.pipeline import Run, run
 from visioncal.planning.plan import Request, make_plan
 from visioncal.planning.purposes import purpose_of
@@ -77,7 +77,8 @@ def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Sce
     )
     with shown_progress(quiet=False) as told:
         plan = make_plan(cell.known, request, progress=told)
-        write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
+        written = write_plan(folder, plan, plan_document(plan, {"kind": "rehearsal"}))
+    tell_written(written, quiet=True)
     messages().print(f"plan: {summary_of(plan)}")
     return scene_of(folder, target=None, robot=None, mount=None)
 
@@ -127,14 +128,13 @@ def recorded(
     return Recorded((*kept.steps, *rest), suffered)
 
 
-def calibrated(folder: Path, out: Path) -> Run:
-    """Calibrates what was recorded."""
+def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
+    """Calibrates what was recorded, and writes the result."""
     session = Session.load(folder)
     with shown_progress(quiet=not sys.stderr.isatty()) as told:
         found = run(session, progress=told)
         told("write", 0, 1)
-        write_outputs(out, session, found)
-    return found
+        return found, write_outputs(out, session, found)
 
 
 def _drive(

@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.console import messages, shown_progress, tell_written
 from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
-from visioncal.outputs import REPORT, VERIFY, refuse_calibration, write_check
+from visioncal.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 from visioncal.session import Session
 from visioncal.stored import load_calibration
 from visioncal.verification import (
@@ -77,14 +77,12 @@ def verify_command(
     facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)
     fired = outcomes(triggers, facts)
     document = json.dumps(to_document(check, fired), indent=2, allow_nan=False) + "\n"
-    if output is not None:
-        write_check(output, check, fired, document)
+    written = Written(()) if output is None else write_check(output, check, fired, document)
     if as_json:
         write_stdout(document)
     else:
         _tell(check, fired)
-    if not check.passed:
-        raise typer.Exit(_EXIT_FAILED)
+    tell_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
 
 
 def _tell(check: Check, triggers: Sequence[Outcome]) -> None:

@@ -10,9 +10,10 @@ from rerun.blueprint import BlueprintLike
 
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.figures import matched, significant
+from visioncal.files import written_beside
 from visioncal.recording import colours, paths
 from visioncal.recording.arm import log_arm
-from visioncal.recording.recorder import Recorder, beside
+from visioncal.recording.recorder import Recorder
 from visioncal.recording.writer import RecordingWriter
 from visioncal.types import FloatArray
 
@@ -40,13 +41,14 @@ def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | No
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
     session = run.session
-    with beside(path) as aside:
-        with RecordingWriter(
+    with (
+        written_beside(path) as aside,
+        RecordingWriter(
             aside, session, announced=len(session.views), blueprint=blueprint, label=path
-        ) as writer:
-            writer.add_session(session)
-            writer.draw(partial(_log, run))
-        aside.replace(path)
+        ) as writer,
+    ):
+        writer.add_session(session)
+        writer.draw(partial(_log, run))
 
 
 def _log(run: Run, recorder: Recorder) -> None:

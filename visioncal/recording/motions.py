@@ -10,10 +10,11 @@ import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.dynamics.motion import Motion
+from visioncal.files import written_beside
 from visioncal.recording import colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.obstacles import Obstacle, log_obstacles
-from visioncal.recording.recorder import Recorder, beside
+from visioncal.recording.recorder import Recorder
 from visioncal.recording.scene import log_pose
 from visioncal.robot import Robot
 from visioncal.types import FloatArray
@@ -77,18 +78,16 @@ def write_motion_preview(
     Raises:
         DataError: The file cannot be written.
     """
-    with beside(path) as aside:
-        with Recorder(aside) as recorder:
-            recorder.stream.send_recording_name(preview.name)
-            recorder.lay_out(blueprint)
-            _log_static(recorder.stream, preview)
-            begin_s = 0.0
-            for part in preview.parts:
-                _log_curves(recorder.stream, part, begin_s)
-                _log_way(recorder.stream, preview, part, begin_s)
-                begin_s += float(part.motion.times_s[-1])
-                recorder.keep()
-        aside.replace(path)
+    with written_beside(path) as aside, Recorder(aside) as recorder:
+        recorder.stream.send_recording_name(preview.name)
+        recorder.lay_out(blueprint)
+        _log_static(recorder.stream, preview)
+        begin_s = 0.0
+        for part in preview.parts:
+            _log_curves(recorder.stream, part, begin_s)
+            _log_way(recorder.stream, preview, part, begin_s)
+            begin_s += float(part.motion.times_s[-1])
+            recorder.keep()
 
 
 def _log_static(stream: rr.RecordingStream, preview: MotionPreview) -> None:

@@ -11,12 +11,13 @@ from rerun.blueprint import BlueprintLike
 
 from visioncal.camera import project
 from visioncal.evidence import ViewEvidence
+from visioncal.files import written_beside
 from visioncal.recording import board, colours, paths
 from visioncal.recording.arm import log_arm
 from visioncal.recording.charts import Charts
 from visioncal.recording.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.recording.obstacles import Obstacle, log_obstacles
-from visioncal.recording.recorder import Recorder, beside
+from visioncal.recording.recorder import Recorder
 from visioncal.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.recording.workspace import log_map
 from visioncal.robot import Robot
@@ -108,15 +109,13 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
     Raises:
         DataError: The file cannot be written.
     """
-    with beside(path) as aside:
-        with Recorder(aside) as recorder:
-            stream = recorder.stream
-            stream.send_recording_name(preview.name)
-            recorder.lay_out(blueprint)
-            charts = _charts(preview)
-            _log_static(stream, preview, charts)
-            _log_stops(recorder, preview, charts)
-        aside.replace(path)
+    with written_beside(path) as aside, Recorder(aside) as recorder:
+        stream = recorder.stream
+        stream.send_recording_name(preview.name)
+        recorder.lay_out(blueprint)
+        charts = _charts(preview)
+        _log_static(stream, preview, charts)
+        _log_stops(recorder, preview, charts)
 
 
 def _charts(preview: Preview) -> Charts:

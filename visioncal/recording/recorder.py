@@ -2,17 +2,13 @@
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
-from uuid import uuid4
 
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
-from visioncal.files import named_errors
 from visioncal.recording import paths
 from visioncal.recording.frames import scan
 
@@ -101,19 +97,3 @@ def _check_room(folder: Path) -> None:
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _ROOM_BYTES:
         raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")
-
-
-@contextmanager
-def beside(path: Path) -> Iterator[Path]:
-    """Gives a name for a file in the same folder, which is removed in the end if it is there.
-
-    Raises:
-        DataError: What is done within cannot be written; it names `path`.
-    """
-    aside = path.parent / f".{uuid4().hex}.tmp"
-    with named_errors(path):
-        try:
-            yield aside
-        finally:
-            with suppress(OSError):
-                aside.unlink(missing_ok=True)

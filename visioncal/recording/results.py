@@ -16,15 +16,16 @@ import pyarrow as pa
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
+from visioncal.asides import aside_file
 from visioncal.calibration import Calibration, to_document
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
-from visioncal.files import sha256
+from visioncal.files import named_errors, sha256
 from visioncal.recording import armtext, notes, overlays, paths, tools
 from visioncal.recording.frames import Frame, append, read_payload, scan
 from visioncal.recording.messages import recording_id
 from visioncal.recording.reader import chunks, read_session
-from visioncal.recording.recorder import Recorder, beside
+from visioncal.recording.recorder import Recorder
 from visioncal.recording.scene import Scene
 from visioncal.recording.thermal import Drift
 from visioncal.session import Session
@@ -55,7 +56,7 @@ def append_results(
         DataError: The recording cannot be read or written, or holds another session.
     """
     owner = _recording_of(path, session)
-    with beside(path) as aside:
+    with named_errors(path), aside_file(path.parent) as aside:
         with Recorder(aside, recording_id=owner) as recorder:
             recorder.lay_out(blueprint)
             log_results(recorder, session, calibration, evidence)

@@ -11,10 +11,10 @@ from rerun.blueprint import BlueprintLike
 from visioncal.calibration import Alignment, Calibration
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
-from visioncal.files import named_errors, sha256
+from visioncal.files import named_errors, sha256, written_beside
 from visioncal.recording import codec
 from visioncal.recording.cells import log_cell
-from visioncal.recording.recorder import Recorder, beside
+from visioncal.recording.recorder import Recorder
 from visioncal.recording.results import log_results
 from visioncal.session import Session
 from visioncal.session.checks import check_images_can_be_used
@@ -43,11 +43,11 @@ class RecordingWriter:
         """Begins the file.
 
         Args:
-            path: The `.rrd`, which must not exist.
+            path: The `.rrd`. It must not exist, unless it is written aside for another.
             session: What holds for all views; those that it has are not written.
             announced: How many views are to come, so that a reader can say how many were lost.
             blueprint: The layout to open the recording in.
-            label: The path that messages name; `path` where None.
+            label: The path that it is written aside for, which messages name; None for none.
 
         Raises:
             DataError: The file exists or cannot be written.
@@ -57,7 +57,8 @@ class RecordingWriter:
         self._numbers: set[int] = set()
         self._images: dict[str, str] = {}
         with named_errors(self._label):
-            path.open("xb").close()
+            if label is None:
+                path.open("xb").close()
             self._recorder = Recorder(path)
             self._recorder.stream.send_recording_name(session.name)
             header = codec.Header.of(session, codec.UNKNOWN if announced is None else announced)
@@ -232,10 +233,11 @@ def _whole(
     path: Path, session: Session, blueprint: BlueprintLike | None
 ) -> Iterator[RecordingWriter]:
     """A writer that has a session's views; the file appears once nothing went wrong."""
-    with beside(path) as aside:
-        with RecordingWriter(
+    with (
+        written_beside(path) as aside,
+        RecordingWriter(
             aside, session, announced=len(session.views), blueprint=blueprint, label=path
-        ) as writer:
-            writer.add_session(session)
-            yield writer
-        aside.replace(path)
+        ) as writer,
+    ):
+        writer.add_session(session)
+        yield writer

@@ -1,13 +1,12 @@
 """A session written as a folder that needs no other file; whole or not at all."""
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import tomli_w
 
+from visioncal.asides import aside_folder
 from visioncal.errors import DataError
 from visioncal.files import write_atomically
 from visioncal.robot import robot_file
@@ -37,20 +36,19 @@ def write_folder(
             culprits=[str(folder)],
             next_step="Choose another name, or remove it first.",
         )
-    aside = folder.parent / f".{uuid4().hex}.tmp"
     try:
-        aside.mkdir(parents=True)
-        try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with aside_folder(folder.parent) as (aside, _):
+            new = aside / "new"
+            new.mkdir()
             for path in paths:
                 if images.exists(path):
-                    _write_below(aside, path, images.read(path))
+                    _write_below(new, path, images.read(path))
             for path, text in texts.items():
-                _write_below(aside, path, text)
+                _write_below(new, path, text)
             if folder.exists():
                 folder.rmdir()
-            aside.replace(folder)
-        finally:
-            shutil.rmtree(aside, ignore_errors=True)
+            new.replace(folder)
     except OSError as error:
         raise DataError(
             f"{folder} cannot be written: {error.strerror or error}.", culprits=[str(folder)]
