@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -279,3 +280,26 @@ def test_rerun_without_a_web_viewer_is_an_error_with_a_next_step(out, stub):
     assert done.returncode == 2
     assert "compiled without web_viewer" in done.stderr
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize("request_line", [b"", b"GET /", b"GET /recording.rrd HTTP/1.1\r\n"])
+def test_a_connection_that_the_browser_resets_is_nothing_to_report(out, request_line):
+    with served(out) as (process, url):
+        address = urlsplit(url)
+        whole = request_line.endswith(b"\n")
+        for _ in range(3):
+            with socket.create_connection((address.hostname, address.port)) as connection:
+                connection.sendall(request_line)
+                if whole:
+                    connection.sendall(f"Host: {address.netloc}\r\n\r\n".encode())
+                    assert connection.recv(1)
+                # Closing sends a reset, as a browser does that drops a connection.
+                linger = struct.pack("ii", 1, 0)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        # It serves on, and says nothing.
+        assert ask(url, "/")[0] == 200
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "Traceback" not in said
+    assert "Exception" not in said

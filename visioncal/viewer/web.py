@@ -5,6 +5,7 @@ news. This one answers for a handful of names with a page that may load nothing 
 """
 
 import shutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from visioncal.errors import DataError
 from visioncal.files import read_bytes
@@ -101,12 +102,21 @@ def _routes(recording: Path) -> dict[str, _Route]:
 def _server(routes: Mapping[str, _Route], port: int) -> ThreadingHTTPServer:
     try:
         # A browser keeps connections in reserve; a thread for each keeps them apart.
-        return ThreadingHTTPServer((_HOST, port), partial(_Handler, routes))
+        return _Server((_HOST, port), partial(_Handler, routes))
     except OSError as error:
         raise DataError(
             f"port {port} of {_HOST} cannot be used: {error.strerror or error}.",
             next_step="Choose another --port; 0 takes one that is free.",
         ) from error
+
+
+class _Server(ThreadingHTTPServer):
+    """A server that takes it calmly when a page is closed while it is sent."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - its interface
+        """Reports what went wrong with a request; that a connection ended is nothing wrong."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -146,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(length))
             self.end_headers()
             if with_content:
-                self._copy(stream)
+                shutil.copyfileobj(stream, self.wfile)
 
     def _asked_for_here(self) -> bool:
         """Whether the page's own address was asked for.
@@ -156,13 +166,6 @@ class _Handler(BaseHTTPRequestHandler):
         """
         port = self.connection.getsockname()[1]
         return self.headers.get("Host", "") in (f"{_HOST}:{port}", f"localhost:{port}")
-
-    def _copy(self, stream: BinaryIO) -> None:
-        try:
-            shutil.copyfileobj(stream, self.wfile)
-        except (BrokenPipeError, ConnectionResetError):
-            # Whoever asked has closed the page meanwhile.
-            self.close_connection = True
 
     def end_headers(self) -> None:
         """Adds the headers that all answers carry."""
