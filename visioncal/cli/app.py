@@ -7,7 +7,7 @@ import typer
 
 from visioncal.cli.align import align_command
 from visioncal.cli.calibrate import calibrate_command
-from visioncal.cli.console import report_error
+from visioncal.cli.console import EXIT_NO_RESULT, report_error
 from visioncal.cli.convert import convert_command
 from visioncal.cli.correct import correct_command
 from visioncal.cli.demo import demo_command
@@ -22,15 +22,12 @@ from visioncal.cli.rehearse import rehearse_command
 from visioncal.cli.report import report_command
 from visioncal.cli.review import review_command
 from visioncal.cli.simulate import simulate_command
+from visioncal.cli.streams import guarded_streams
 from visioncal.cli.target import target_app
 from visioncal.cli.tcp import tcp_command
 from visioncal.cli.verify import verify_command
 from visioncal.errors import VisioncalError
 from visioncal.version import __version__
-
-# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check said
-# no (verify).
-EXIT_NO_RESULT = 2
 
 app = typer.Typer(
     name="visioncal",
@@ -79,8 +76,9 @@ def _options(
 
 def main() -> None:
     """Runs the command line; an error of the user's input ends with status 2 and one message."""
-    try:
-        app()
-    except VisioncalError as error:
-        report_error(error, as_json="--json" in sys.argv[1:])
-        sys.exit(EXIT_NO_RESULT)
+    with guarded_streams():
+        try:
+            app()
+        except VisioncalError as error:
+            report_error(error, as_json="--json" in sys.argv[1:])
+            sys.exit(EXIT_NO_RESULT)

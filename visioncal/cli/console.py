@@ -18,8 +18,9 @@ from visioncal.outputs import Written
 from visioncal.transforms import pose_difference
 from visioncal.types import Progress as Told
 
-# A bug of ours.
-_EXIT_BUG = 1
+# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check said
+# no (verify).
+_EXIT_BUG, EXIT_NO_RESULT = 1, 2
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 _LISTED_CULPRITS = 10
 _SAME_REASON = 20  # more views of one reason share a line

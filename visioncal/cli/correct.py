@@ -12,7 +12,6 @@ from rich.markup import escape
 from visioncal.calibration import Calibration
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
-from visioncal.cli.stdout import write_stdout
 from visioncal.compensation.arms import CalibratedArm, predicted_sigma_mm
 from visioncal.compensation.correction import WIDEST_RAD, Corrected, correct
 from visioncal.compensation.table import Targets, columns_to_send, read_targets, table_to_send
@@ -137,10 +136,10 @@ def correct_command(
         write_atomically(written_to, table_to_send(wanted, columns, rows))
     if as_json:
         document = _document(wanted, columns, rows, lost) | {"warnings": warnings}
-        write_stdout(json.dumps(document, indent=2) + "\n")
+        typer.echo(json.dumps(document, indent=2))
         return
     if written_to is None:
-        write_stdout(table_to_send(wanted, columns, rows))
+        typer.echo(table_to_send(wanted, columns, rows), nl=False)
     _tell(columns, rows, lost, warnings)
     if np.isnan(wanted.q_seed).all() and seed_joints is None:
         messages().print(escape(_posture(arm, corrected.q[rows[0]])))

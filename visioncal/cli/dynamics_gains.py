@@ -11,7 +11,6 @@ from rich.markup import escape
 from visioncal.cli.console import messages
 from visioncal.cli.dynamics_options import CutoffOption, SessionArgument
 from visioncal.cli.numbers import numbers_in
-from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics import BaseModel, DynamicModel, FrictionTerms, Gains, drive_gains
 from visioncal.dynamics.run import current_streams, robot_of
 from visioncal.errors import DataError
@@ -57,7 +56,7 @@ def dynamics_gains_command(
     found = drive_gains(base, empty, full, body)
     if as_json:
         document = [_row(name, found, at) for at, name in enumerate(robot.joint_names)]
-        write_stdout(json.dumps(document, indent=2) + "\n")
+        typer.echo(json.dumps(document, indent=2))
         return
     _tell(robot.joint_names, found)
 
@@ -99,4 +98,4 @@ def _tell(names: tuple[str, ...], found: Gains) -> None:
         messages().print(escape(f"{name}: {words}"))
     if found.told.all():
         gains = ",".join(f"{it:.5g}" for it in found.nm_per_a)
-        write_stdout(f"--gains {gains}\n")
+        typer.echo(f"--gains {gains}")

@@ -20,7 +20,6 @@ from visioncal.cli.dynamics_options import (
     identified_of,
     number_list,
 )
-from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics.document import stribeck_rows, to_document
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
@@ -87,7 +86,7 @@ def dynamics_identify_command(
     identified = run.identified
     written = None if output is None else write_dynamics(output, run)
     if as_json:
-        write_stdout(json.dumps(to_document(identified), indent=2, allow_nan=False) + "\n")
+        typer.echo(json.dumps(to_document(identified), indent=2, allow_nan=False))
     else:
         _tell(identified)
     if written is not None:
@@ -112,7 +111,7 @@ def dynamics_validate_command(
     request = Request(tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"))
     predictions = validate_session(Session.load(session), identified, request)
     if as_json:
-        write_stdout(json.dumps([_figures(it) for it in predictions], indent=2) + "\n")
+        typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))
         return
     for prediction in predictions:
         messages().print(escape(prediction.label))

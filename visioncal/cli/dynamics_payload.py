@@ -14,7 +14,6 @@ from visioncal.cli.dynamics_options import (
     identified_of,
     number_list,
 )
-from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics import Payload, estimate_payload
 from visioncal.dynamics.run import Request, conditioned_streams
 from visioncal.figures import matched, significant
@@ -46,9 +45,9 @@ def dynamics_payload_command(
     loaded = conditioned_streams(Session.load(session), identified, request)
     found = estimate_payload(identified, loaded, friction_changes=not same_friction)
     if as_json:
-        write_stdout(json.dumps(found.document(), indent=2) + "\n")
+        typer.echo(json.dumps(found.document(), indent=2))
         return
-    write_stdout("\n".join([*_lines(found), ""]))
+    typer.echo("\n".join(_lines(found)))
 
 
 def _lines(found: Payload) -> list[str]:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import typer
 from rich.markup import escape
 
 from visioncal.cli import motion_options as options
@@ -11,7 +12,6 @@ from visioncal.cli.console import messages, shown_progress, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.plan_options import BoxOption, Clearance, Floor, Margin
 from visioncal.cli.planned_cell import box_of, floor_of
-from visioncal.cli.stdout import write_stdout
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.limits import Allowed, Missing, Share, allowed_motion
@@ -79,7 +79,7 @@ def dynamics_plan_command(
     document = motion_document(plan)
     written = write_motions(out, plan, rate_hz, document)
     if as_json:
-        write_stdout(json.dumps(document, indent=2, allow_nan=False) + "\n")
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
     else:
         _tell(plan)
     tell_written(written, quiet=as_json)

@@ -7,7 +7,6 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
 from visioncal.files import check_free, read_text, write_atomically
@@ -110,7 +109,7 @@ def export_command(
     for it in written.warnings:
         messages().print(f"[bold red]warning:[/] {escape(it)}")
     if out is None or out == Path("-"):
-        write_stdout(written.text)
+        typer.echo(written.text, nl=False)
         return
     check_free(out, force=force)
     write_atomically(out, written.text)

@@ -16,7 +16,6 @@ from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.planes import FORMS, plane_of
 from visioncal.cli.seeing import refuse_given
-from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.files import some_of
@@ -286,10 +285,10 @@ def _target(words: str) -> Target:
 
 def _tell(found: Sequence[_Found], *, as_json: bool) -> None:
     if as_json:
-        write_stdout(json.dumps([_document(it) for it in found], indent=2) + "\n")
+        typer.echo(json.dumps([_document(it) for it in found], indent=2))
         return
     for it in found:
-        write_stdout(f"{it.words}: {_line(it.located)}\n")
+        typer.echo(f"{it.words}: {_line(it.located)}")
         for warning in it.located.warnings:
             told = warning if warning.startswith(it.words) else f"{it.words}: {warning}"
             messages().print(f"[bold yellow]warning:[/] {escape(told)}")

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import typer
 from rich.markup import escape
 
 from visioncal.cli import plan_options as options
@@ -18,7 +19,6 @@ from visioncal.cli.planned_cell import (
     find_source,
     floor_of,
 )
-from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.files import some_of
 from visioncal.outputs import write_plan
@@ -126,7 +126,7 @@ def plan_command(
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(out, plan, document)
     if as_json:
-        write_stdout(json.dumps(document, indent=2, allow_nan=False) + "\n")
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
     else:
         _tell(plan)
     tell_written(written, quiet=as_json)

@@ -8,7 +8,6 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.files import check_free, write_atomically
 from visioncal.finders.identify import identify
@@ -190,9 +189,9 @@ def check_command(
         write_atomically(out, description)
     messages().print(escape(describe(identity)))
     if as_json:
-        write_stdout(json.dumps(to_document(identity, square_m), indent=2) + "\n")
+        typer.echo(json.dumps(to_document(identity, square_m), indent=2))
     elif out is None:
-        write_stdout(description)
+        typer.echo(description, nl=False)
     if out is not None:
         for note in identity.notes:
             messages().print(escape(note))

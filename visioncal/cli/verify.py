@@ -9,7 +9,6 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages, shown_progress, tell_written
-from visioncal.cli.stdout import write_stdout
 from visioncal.errors import DataError
 from visioncal.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 from visioncal.session import Session
@@ -79,7 +78,7 @@ def verify_command(
     document = json.dumps(to_document(check, fired), indent=2, allow_nan=False) + "\n"
     written = Written(()) if output is None else write_check(output, check, fired, document)
     if as_json:
-        write_stdout(document)
+        typer.echo(document, nl=False)
     else:
         _tell(check, fired)
     tell_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
