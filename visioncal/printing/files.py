@@ -6,6 +6,7 @@ import tomli_w
 
 from visioncal.errors import DataError
 from visioncal.files import check_free, named_errors, parse_toml, read_text, write_atomically
+from visioncal.generations import write_generation
 from visioncal.printing.page import Sheet
 from visioncal.targets import target_document, target_from_document
 from visioncal.types import Target
@@ -20,7 +21,7 @@ _LONGEST_NAME = 60
 def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
     """Writes a board as PDF, SVG, PNG and TOML, named after the target.
 
-    Everything is drawn before the first file appears. A `.toml` that is there and describes the
+    The files appear all at once. A `.toml` that is there and describes the
     same target stays as it is, with its comments.
 
     Args:
@@ -56,10 +57,12 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
     }
     if not kept:
         drawn["toml"] = _description(sheet)
-    with named_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    for ending, content in drawn.items():
-        write_atomically(files[ending], content)
+
+    def write(aside: Path) -> None:
+        for ending, content in drawn.items():
+            write_atomically(aside / files[ending].name, content)
+
+    write_generation(folder, [files[ending].name for ending in drawn], write)
     return tuple(files[ending] for ending in drawn)
 
 
