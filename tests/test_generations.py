@@ -106,6 +106,18 @@ def test_an_error_within_the_switch_leaves_one_generation(tmp_path, monkeypatch,
     expect_no_leftovers(tmp_path, LESS)
 
 
+def test_an_error_names_the_file_as_it_would_be_called(tmp_path):
+    def write(aside):
+        (aside / "report.html").mkdir()
+        write_atomically(aside / "report.html", "text")
+
+    with pytest.raises(DataError, match=r"report\.html cannot be written") as caught:
+        write_generation(tmp_path, NAMES, write)
+    assert caught.value.culprits == (str(tmp_path / "report.html"),)
+    assert ".tmp" not in caught.value.message
+    assert not list(tmp_path.iterdir())
+
+
 def breaking(*_: object, **__: object) -> None:
     raise ValueError("18 mm of 25 mm")
 

@@ -60,7 +60,8 @@ def write_generation(
         with aside_folder(folder) as (aside, is_locked):
             new = aside / _NEW
             new.mkdir()
-            write(new)
+            with _named_publicly(new, folder):
+                write(new)
             written = [name for name in names if (new / name).exists()]
             if is_locked:
                 with _switch(folder, aside) as switch:
@@ -74,6 +75,18 @@ def write_generation(
             next_step="Make room in it, or choose another folder.",
         ) from error
     return tuple(folder / name for name in reversed(written))
+
+
+@contextmanager
+def _named_publicly(new: Path, folder: Path) -> Iterator[None]:
+    """Has errors name the files as they would be called in the end."""
+    try:
+        yield
+    except DataError as error:
+        message, *culprits = (
+            it.replace(str(new), str(folder)) for it in (error.message, *error.culprits)
+        )
+        raise DataError(message, culprits=culprits, next_step=error.next_step) from error.__cause__
 
 
 @contextmanager
