@@ -1,5 +1,7 @@
 """Detection: what is found, and the reason where nothing can be used."""
 
+import struct
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -8,6 +10,7 @@ import pytest
 
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, Seen, find_target
+from visioncal.finders.headers import claimed_size
 from visioncal.finders.imaging import blur_at_corners, decode_image
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import (
@@ -190,6 +193,41 @@ def test_an_image_of_another_size_is_named_with_line_and_sizes(charuco):
     )
     with pytest.raises(DataError, match=r"line 3.*b\.png is 640 x 400 px.*1280 x 800"):
         detect(session)
+
+
+def claiming(width, height):
+    """A small png whose header claims a size, with sums that agree."""
+    png = encoded(np.zeros((8, 8), np.uint8))
+    header = b"IHDR" + struct.pack(">II", width, height) + png[24:29]
+    return png[:12] + header + zlib.crc32(header).to_bytes(4, "big") + png[33:]
+
+
+def test_a_size_that_no_sensor_has_is_refused_before_it_is_decoded(charuco, monkeypatch):
+    cell, images = charuco
+    decoded = []
+    plain = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *it: decoded.append(it) or plain(*it))
+    bomb, half = claiming(30000, 30000), claiming(3000, 3000)
+    files = {"a.png": encoded(images[0]), "b.png": bomb}
+    found = detect(session_of(files, cell.options.target))
+    assert list(found.corners) == [0]
+    assert "30000 x 30000 px" in found.rejections[0].reason
+    with pytest.raises(DataError, match=r"b\.png is 3000 x 3000 px"):
+        detect(session_of(files | {"b.png": half}, cell.options.target))
+    assert len(decoded) == 2  # the good one, twice
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".bmp"])
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
+def test_the_size_stands_in_the_header(ending, shape):
+    assert claimed_size(encoded(np.zeros(shape, np.uint8), ending)) == (64, 48)
+    assert claimed_size(encoded(np.zeros(shape, np.uint8), ending)[:20]) is None
+
+
+def test_an_image_that_is_no_picture_shows_no_board(charuco, checkerboard):
+    for cell, _ in (charuco, checkerboard):
+        for shape in ((1, 5), (3, 30000), (24000, 3)):
+            assert isinstance(find_target(np.zeros(shape, np.uint8), cell.options.target), NotFound)
 
 
 def test_blur_is_measured_in_pixels(charuco):

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from visioncal.documents import (
     as_numbers,
-    read_bounded,
     read_json,
     read_npy,
     read_npz,
@@ -27,6 +26,7 @@ from visioncal.documents import (
 from visioncal.documents.jsons import parse_json
 from visioncal.documents.yamls import parse_yaml
 from visioncal.errors import DataError
+from visioncal.files import read_bytes
 
 
 @pytest.fixture
@@ -259,7 +259,7 @@ def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
     with (tmp_path / "large.csv").open("wb") as large:
         large.truncate(60_000_000)
     with pytest.raises(DataError, match="more than 50 MB"):
-        read_bounded(tmp_path / "large.csv")
+        read_bytes(tmp_path / "large.csv")
 
 
 def npy(descr, shape, data=b""):

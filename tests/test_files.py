@@ -1,5 +1,6 @@
 """Files are written whole or not at all, and what cannot be read is named."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from visioncal.files import (
     parse_toml,
     read_bytes,
     read_text,
+    read_text_inside,
     write_atomically,
 )
 
@@ -44,10 +46,46 @@ def test_failed_write_leaves_the_old_content_and_nothing_else(
 def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere\.txt does not exist"):
         read_bytes(tmp_path / "nowhere.txt")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="is no regular file"):
         read_bytes(tmp_path)
     with pytest.raises(DataError, match="cannot be written"):
         write_atomically(tmp_path / "missing" / "a.txt", "")
+
+
+def test_what_might_never_end_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    for path in (tmp_path / "pipe.csv", Path("/dev/zero")):
+        with pytest.raises(DataError, match="is no regular file"):
+            read_bytes(path)
+    (tmp_path / "large.csv").write_bytes(bytes(11))
+    assert len(read_bytes(tmp_path / "large.csv", 11)) == 11
+    with pytest.raises(DataError, match="has more than"):
+        read_bytes(tmp_path / "large.csv", 10)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("ä" * 128, "longer than 255 bytes"), ("a\0b", "does not exist"), ("a/" * 3000, "too long")],
+)
+def test_names_that_no_file_has_are_refused(name: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=words):
+        read_bytes(tmp_path / name)
+
+
+def test_a_link_out_of_a_folder_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "secret.csv").write_text("secret")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "inner.csv").write_text("inner")
+    (folder / "alias.csv").symlink_to("inner.csv")
+    (folder / "out.csv").symlink_to(tmp_path / "secret.csv")
+    (folder / "loop.csv").symlink_to("loop.csv")
+    (tmp_path / "link").symlink_to(folder)
+    assert read_text_inside(tmp_path / "link", "alias.csv") == "inner"
+    with pytest.raises(DataError, match="leads out of its folder"):
+        read_text_inside(folder, "out.csv")
+    with pytest.raises(DataError):
+        read_text_inside(folder, "loop.csv")
 
 
 def test_text_may_have_a_byte_order_mark_but_must_be_utf8() -> None:
@@ -59,6 +97,20 @@ def test_text_may_have_a_byte_order_mark_but_must_be_utf8() -> None:
 def test_toml_errors_give_the_line() -> None:
     with pytest.raises(DataError, match=r"x\.toml is not valid TOML: .*line 2"):
         parse_toml("a = 1\nb = [1,, 2]", "x.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 3000 + "]" * 3000, "nested deeper"),
+        (".".join("a" * 100) + " = 1", "nested deeper"),
+        (f"a.b = {2**63}", r"a\.b has more than the 64 bits"),
+        ("a = " + "9" * 5000, "is not valid TOML"),
+    ],
+)
+def test_toml_that_no_one_writes_is_refused(text: str, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        parse_toml(text, "x.toml")
 
 
 def test_near_names_are_suggested() -> None:

@@ -109,32 +109,98 @@ def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
     )
 
 
-def read_bytes(path: Path | str) -> bytes:
-    """Reads a file.
+# Up to these sizes files are read [bytes]: a larger one is of another kind, or broken. Thousands of
+# views fill a few megabytes of a table or of JSON; a description is written by hand.
+MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000
+# The largest sensors have 150 million pixels, of 16 bits each where nothing packs them.
+MOST_IMAGE_BYTES = 300_000_000
+# File systems take no longer name [bytes].
+_LONGEST_NAME = 255
+# Matrices in lists in tables need six.
+_DEEPEST = 40
+
+
+def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
+    """Reads a regular file: a pipe might never end, and a device never does.
+
+    Args:
+        path: The file.
+        most: Up to how many bytes it may have.
 
     Raises:
-        DataError: It is missing or cannot be read.
+        DataError: It is missing, no regular file, too large, or cannot be read.
     """
     path = Path(path)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        missing = isinstance(error, FileNotFoundError)
-        what = "does not exist" if missing else f"cannot be read: {error.strerror or error}"
+    why_not = absence(path)
+    if why_not:
         raise DataError(
-            f"{path} {what}.",
+            f"{path} {why_not}.",
             culprits=[str(path)],
-            next_step="Check the path and its spelling." if missing else "",
+            next_step="Save what it gives as a file first."
+            if "regular" in why_not
+            else "Check the path and its spelling.",
+        )
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be read: {error.strerror or error}.", culprits=[str(path)]
         ) from error
+    if len(data) > most:
+        raise DataError(
+            f"{path} has more than {most / 1e6:.0f} MB; a file of its kind is read up to that "
+            "size.",
+            culprits=[str(path)],
+            next_step="Check that it is the right file, or cut it into parts.",
+        )
+    return data
 
 
-def read_text(path: Path | str) -> str:
+def absence(path: Path) -> str:
+    """Says why there is no regular file at a path, after its name; empty where there is one."""
+    if any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_NAME for part in path.parts):
+        return f"has a name longer than {_LONGEST_NAME} bytes, as no file has"
+    try:
+        if path.is_file():
+            return ""
+        return "is no regular file" if path.exists() else "does not exist"
+    except (OSError, ValueError) as error:
+        words = error.strerror if isinstance(error, OSError) and error.strerror else error
+        return f"cannot be read: {words}"
+
+
+def is_inside(path: Path, folder: Path) -> bool:
+    """Tells whether a path that need not exist lies in a folder, wherever links lead."""
+    try:
+        path.exists()  # raises where a part of it is too long
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: links in a circle
+        return False
+
+
+def read_text_inside(folder: Path, name: str, most: int = MOST_BYTES) -> str:
+    """Reads a text file of a folder that someone else may have made; see `read_text`.
+
+    Raises:
+        DataError: As `read_text`, or it is a link that leads out of the folder.
+    """
+    if not is_inside(folder / name, folder):
+        raise DataError(
+            f"{folder / name} is a link that leads out of its folder, and is not followed.",
+            culprits=[str(folder / name)],
+            next_step="Copy the file into the folder.",
+        )
+    return read_text(folder / name, most)
+
+
+def read_text(path: Path | str, most: int = MOST_BYTES) -> str:
     """Reads a UTF-8 text file, with or without a byte-order mark; line ends stay as they are.
 
     Raises:
-        DataError: It is missing, cannot be read, or is not UTF-8.
+        DataError: As `read_bytes`, or it is not UTF-8.
     """
-    return decode_text(read_bytes(path), str(path))
+    return decode_text(read_bytes(path, most), str(path))
 
 
 def decode_text(data: bytes, label: str) -> str:
@@ -162,20 +228,61 @@ def save_as_utf8(encoding: str) -> str:
     )
 
 
+def read_toml(path: Path, label: str) -> dict[str, Any]:
+    """Reads a TOML file; `label` names it in errors.
+
+    Raises:
+        DataError: As `read_text` and `parse_toml`.
+    """
+    return parse_toml(read_text(path, MOST_TOML_BYTES), label)
+
+
 def parse_toml(text: str, label: str) -> dict[str, Any]:
     """Parses TOML; `label` names its origin in errors.
 
     Raises:
-        DataError: The text is not TOML; the message gives line and column.
+        DataError: The text is not TOML; the message gives line and column. Or it is nested deeper
+            than any description is, or has a whole number of more than TOML's 64 bits.
     """
     try:
-        return tomllib.loads(text)
+        document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise DataError(
             f"{label} is not valid TOML: {error}.",
             culprits=[label],
             next_step='Text is written in "double quotes", lists in [brackets, like, this].',
         ) from error
+    except RecursionError as error:
+        raise _too_deep(label) from error
+    except ValueError as error:
+        # Python itself refuses whole numbers of thousands of digits, and impossible dates.
+        raise DataError(f"{label} is not valid TOML: {error}.", culprits=[label]) from error
+    _check_toml(document, label)
+    return document
+
+
+def _check_toml(document: dict[str, Any], label: str) -> None:
+    """Checks depth and numbers without recursion; errors name the field."""
+    pending: list[tuple[str, object, int]] = [("", document, 1)]
+    while pending:
+        path, value, depth = pending.pop()
+        if depth > _DEEPEST:
+            raise _too_deep(f"{label}: {path[:80]}")
+        if isinstance(value, dict):
+            pending += [(f"{path}.{key}".lstrip("."), it, depth + 1) for key, it in value.items()]
+        elif isinstance(value, list):
+            pending += [(f"{path}[{at}]", it, depth + 1) for at, it in enumerate(value)]
+        elif isinstance(value, int) and value.bit_length() > 63:
+            raise DataError(
+                f"{label}: {path} has more than the 64 bits of a whole number of TOML.",
+                culprits=[f"{label}: {path}"],
+            )
+
+
+def _too_deep(where: str) -> DataError:
+    return DataError(
+        f"{where}: nested deeper than {_DEEPEST} levels, as no description is.", culprits=[where]
+    )
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

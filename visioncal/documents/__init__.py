@@ -5,7 +5,6 @@ what is needed.
 """
 
 from visioncal.documents.arrays import read_npy, read_npz
-from visioncal.documents.bounds import read_bounded
 from visioncal.documents.jsons import read_json
 from visioncal.documents.opencv import read_opencv
 from visioncal.documents.tables import TextTable, is_number, read_table
@@ -20,7 +19,6 @@ __all__ = [
     "is_number",
     "mapping",
     "number",
-    "read_bounded",
     "read_json",
     "read_npy",
     "read_npz",

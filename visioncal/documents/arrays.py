@@ -12,8 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.documents.bounds import MAX_BYTES, read_bounded
 from visioncal.errors import DataError
+from visioncal.files import MOST_BYTES, read_bytes
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -35,7 +35,7 @@ def read_npy(path: Path) -> Array:
     Raises:
         DataError: It is missing, no .npy, holds Python objects, or is too large.
     """
-    return _parse_npy(read_bounded(path), str(path))
+    return _parse_npy(read_bytes(path), str(path))
 
 
 def read_npz(path: Path) -> Mapping[str, Array]:
@@ -45,7 +45,7 @@ def read_npz(path: Path) -> Mapping[str, Array]:
         DataError: It is missing, no .npz, damaged, holds Python objects, or unpacks to more than
             50 MB.
     """
-    where, stored = str(path), io.BytesIO(read_bounded(path))
+    where, stored = str(path), io.BytesIO(read_bytes(path))
     try:
         with zipfile.ZipFile(stored) as archive:
             unpacked = _unpacked(archive, where)
@@ -65,7 +65,7 @@ def _unpacked(archive: zipfile.ZipFile, where: str) -> dict[str, bytes]:
         raise DataError(
             f"{where} holds {len(members)} arrays; up to {_MAX_MEMBERS} are read.", culprits=[where]
         )
-    arrays, room = {}, MAX_BYTES
+    arrays, room = {}, MOST_BYTES
     for member in members:
         name = member.filename.removesuffix(".npy")
         if name in arrays:
@@ -82,7 +82,7 @@ def _unpacked(archive: zipfile.ZipFile, where: str) -> dict[str, bytes]:
         room -= len(arrays[name])
         if room < 0:
             raise DataError(
-                f"{where} unpacks to more than {MAX_BYTES / 1e6:.0f} MB.",
+                f"{where} unpacks to more than {MOST_BYTES / 1e6:.0f} MB.",
                 culprits=[where],
                 next_step="Keep the poses in a file of their own.",
             )
@@ -110,10 +110,10 @@ def _parse_npy(data: bytes, where: str) -> Array:
     plain = len(sizes) <= _MOST_AXES and all(len(it) <= 12 and it.isdecimal() for it in sizes)
     shape = tuple(int(it) for it in sizes) if plain else ()
     # An axis of none hides the others from the count of bytes.
-    if not plain or math.prod(max(it, 1) for it in shape) > MAX_BYTES:
+    if not plain or math.prod(max(it, 1) for it in shape) > MOST_BYTES:
         raise DataError(
             f"{where} has the shape ({header['shape'][:60]}); up to {_MOST_AXES} axes and "
-            f"{MAX_BYTES:,} entries are read.",
+            f"{MOST_BYTES:,} entries are read.",
             culprits=[where],
         )
     dtype = np.dtype(header["descr"])

@@ -3,47 +3,21 @@
 from pathlib import Path
 
 from visioncal.errors import DataError
-from visioncal.files import decode_text, save_as_utf8
+from visioncal.files import decode_text, read_bytes, save_as_utf8
 
-# Thousands of poses fill a few megabytes as text; more is another kind of file.
-MAX_BYTES = 50_000_000
 # Each value costs about a hundred bytes in memory once it is read.
 MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
 
 
-def read_bounded(path: Path, most: int = MAX_BYTES) -> bytes:
-    """Reads a file of at most so many bytes, 50 MB where nothing is said.
-
-    Raises:
-        DataError: It is missing, no file, cannot be read, or is larger.
-    """
-    try:
-        if not path.is_file():
-            what = "is no regular file" if path.exists() else "does not exist"
-            raise DataError(f"{path} {what}; a file is needed.", culprits=[str(path)])
-        with path.open("rb") as file:
-            data = file.read(most + 1)
-    except (OSError, ValueError) as error:
-        words = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise DataError(f"{path} cannot be read: {words}.", culprits=[str(path)]) from error
-    if len(data) > most:
-        raise DataError(
-            f"{path} has more than {most / 1e6:.0f} MB; up to that size is read.",
-            culprits=[str(path)],
-            next_step="Cut the recording into parts, or convert the poses alone.",
-        )
-    return data
-
-
 def read_plain_text(path: Path) -> str:
     """Reads a bounded UTF-8 text file, with or without a byte-order mark.
 
     Raises:
-        DataError: As `read_bounded`, or the bytes are not UTF-8 or hold NUL, as binary files do.
+        DataError: As `read_bytes`, or the bytes are not UTF-8 or hold NUL, as binary files do.
     """
-    data = read_bounded(path)
+    data = read_bytes(path)
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise DataError(

@@ -4,8 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from visioncal.documents.bounds import MAX_DEPTH, MAX_VALUES, read_bounded, too_deep, too_many
+from visioncal.documents.bounds import MAX_DEPTH, MAX_VALUES, too_deep, too_many
 from visioncal.errors import DataError
+from visioncal.files import read_bytes
 
 
 @dataclass
@@ -40,7 +41,7 @@ def read_xml(path: Path) -> Element:
     Raises:
         DataError: It is missing, no XML, declares a document type, or is too large or too deep.
     """
-    data, where = read_bounded(path), str(path)
+    data, where = read_bytes(path), str(path)
     parser = expat.ParserCreate()
     parser.buffer_text = True
     root = Element("", 0, {})

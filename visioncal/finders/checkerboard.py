@@ -6,6 +6,9 @@ import numpy as np
 from visioncal.finders.result import NotFound, Seen
 from visioncal.types import FloatArray, Image, Target
 
+# OpenCV's search takes 170 bytes and a microsecond a pixel, and fails beyond such sides.
+MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
+
 
 def find_checkerboard(image: Image, target: Target) -> Seen | NotFound:
     """Finds the inner corners of a checkerboard (Duda and Frese 2018, through OpenCV).
@@ -20,6 +23,12 @@ def find_checkerboard(image: Image, target: Target) -> Seen | NotFound:
     Returns:
         The corners, or why there are none.
     """
+    height, width = image.shape
+    if min(image.shape) < 2 or height + width > _MOST_SIDES or height * width > MOST_PIXELS:
+        return NotFound(
+            f"no board: in an image of {width} x {height} px no checkerboard is looked for (up to "
+            f"{MOST_PIXELS / 1e6:.0f} million pixels; a ChArUco board is found in larger ones)"
+        )
     size = (target.columns, target.rows)
     found, px = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
     if not found:

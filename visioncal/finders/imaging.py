@@ -10,21 +10,23 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from visioncal.errors import DataError
-from visioncal.files import read_bytes
+from visioncal.files import MOST_IMAGE_BYTES, read_bytes
+from visioncal.finders.headers import MOST_PIXELS, SIGNATURES, claimed_size, start_of_scan
 from visioncal.types import FloatArray, Image
 
 # Half-widths of the window around a corner in which its edges' width is measured [px].
 _REACH_PX = (4, 12)
 # Corners measured in an image: the median of these is stable to some percent.
 _SAMPLE = 12
-_SIGNATURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM")
+# Rows that are scaled at a time.
+_STRIP = 256
 # Under this many grey levels a picture shows nothing that a detector could use.
 _LEAST_CONTRAST = 12
 
 
 def looks_like_image(data: bytes) -> bool:
     """Tells whether a file begins as png, jpg, tif or bmp do; damage further on does not matter."""
-    return data.startswith(_SIGNATURES)
+    return data.startswith(SIGNATURES)
 
 
 def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
@@ -46,6 +48,14 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
         return "unreadable: the file is cut short"
     if data.startswith(b"\x89PNG") and _is_damaged_png(data):
         return "unreadable: the file is damaged"
+    size = claimed_size(data)
+    if size is None:
+        return "unreadable: not an image that can be decoded (png, jpg or tif is needed)"
+    if size[0] * size[1] > MOST_PIXELS:
+        return (
+            f"too large: its header claims {size[0]} x {size[1]} px, and up to "
+            f"{MOST_PIXELS / 1e6:.0f} million are decoded"
+        )
     flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -62,7 +72,7 @@ def read_image(path: Path) -> Image:
     Raises:
         DataError: The file is missing, or no image that can be read.
     """
-    image = decode_image(read_bytes(path))
+    image = decode_image(read_bytes(path, MOST_IMAGE_BYTES))
     if isinstance(image, str):
         raise DataError(
             f"{path} is {image}.",
@@ -75,9 +85,17 @@ def read_image(path: Path) -> Image:
 
 def _to_eight_bits(image: npt.NDArray[Any]) -> Image:
     """Scales by the brightest levels: cameras of 10 or 12 bits fill the lower part of 16."""
-    levels = np.nan_to_num(image.astype(np.float32))
-    top = float(np.percentile(levels[::4, ::4], 99.9))
-    return np.asarray(np.clip(levels * (255.0 / max(top, 1e-9)), 0, 255), dtype=np.uint8)
+    top = float(np.percentile(_levels(image[::4, ::4]), 99.9))
+    scaled = np.empty(image.shape, dtype=np.uint8)
+    # In strips: the largest images in floats would fill the memory.
+    for at in range(0, len(image), _STRIP):
+        strip = _levels(image[at : at + _STRIP])
+        scaled[at : at + _STRIP] = np.clip(strip * (255.0 / max(top, 1e-9)), 0, 255)
+    return scaled
+
+
+def _levels(image: npt.NDArray[Any]) -> FloatArray:
+    return np.nan_to_num(image.astype(np.float32))
 
 
 def _is_cut_short(data: bytes) -> bool:
@@ -85,7 +103,7 @@ def _is_cut_short(data: bytes) -> bool:
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-64:]
     if data.startswith(b"\xff\xd8"):
-        scan = _start_of_scan(data)
+        scan = start_of_scan(data)
         return scan < 0 or data.rfind(b"\xff\xd9") < scan
     return False
 
@@ -100,16 +118,6 @@ def _is_damaged_png(data: bytes) -> bool:
             return True
         at = end + 4
     return False
-
-
-def _start_of_scan(data: bytes) -> int:
-    """Walks a JPEG's header segments, whose thumbnails hold end marks of their own."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] == 0xDA:
-            return at
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return -1
 
 
 def blur_at_corners(image: Image, px: FloatArray) -> float:

@@ -20,6 +20,8 @@ def find_marker(image: Image, target: Target) -> Seen | NotFound:
     Returns:
         The corners, or why there are none.
     """
+    if min(image.shape) < 2:
+        return NotFound("the image is a line")
     px, found = _markers(image, target.dictionary)
     if target.marker_id not in found:
         seen = f"; seen instead: {', '.join(map(str, found[:5]))}" if found else ""

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.conventions import PoseNumbers, Reading
-from visioncal.documents import is_number, read_bounded
+from visioncal.documents import is_number
 from visioncal.errors import DataError
-from visioncal.files import some_of
+from visioncal.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
 from visioncal.finders.imaging import decode_image, looks_like_image
 from visioncal.formats.boards import described_target, target_name
 from visioncal.formats.foreign import Foreign, Sweep, rows_of
@@ -22,9 +22,6 @@ from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import MemoryImages, Session, Stream
 from visioncal.session import columns as known
 from visioncal.types import Mount
-
-# The largest sensors have 150 million pixels, of 16 bits each where nothing packs them.
-_MOST_IMAGE_BYTES = 300_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +36,13 @@ class FileImages:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return _image_bytes(self.files[path])
 
+    def absence(self, path: str) -> str:
+        """Says why there is no such image; empty where there is one."""
+        return absence(self.files[path]) if path in self.files else "is missing"
+
     def exists(self, path: str) -> bool:
         """Tells whether there is such an image."""
-        return path in self.files and self.files[path].is_file()
+        return not self.absence(path)
 
 
 def wished(foreign: Foreign, wishes: Wishes) -> Foreign:
@@ -330,7 +331,7 @@ def _image_size(file: Path) -> tuple[int, int] | None:
 
 
 def _image_bytes(file: Path) -> bytes:
-    data = read_bounded(file, _MOST_IMAGE_BYTES)
+    data = read_bytes(file, MOST_IMAGE_BYTES)
     # A camera that failed leaves empty files; what else is no image is not to be handed on.
     if data and not looks_like_image(data):
         raise DataError(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visioncal.errors import DataError
-from visioncal.files import natural
+from visioncal.files import is_inside, natural
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Enough to tell what a text file is about.
@@ -30,15 +30,6 @@ def listed(folder: Path) -> tuple[Path, ...]:
         return ()
     own = (it for it in files if not it.is_symlink() or is_inside(it, folder))
     return tuple(sorted(own, key=natural))
-
-
-def is_inside(path: Path, base: Path) -> bool:
-    """Tells whether a path that need not exist lies in a folder, wherever links lead."""
-    try:
-        path.exists()  # raises where a part of it is too long
-        return path.resolve().is_relative_to(base.resolve())
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: links in a circle
-        return False
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from visioncal.documents import is_number, read_npy, read_npz, read_table
 from visioncal.errors import DataError
+from visioncal.files import is_inside
 from visioncal.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
 from visioncal.formats.fields import fields_of_records, flattened
-from visioncal.formats.finding import is_inside, listed, number_in
+from visioncal.formats.finding import listed, number_in
 from visioncal.formats.foreign import Foreign
 from visioncal.formats.format import ForeignFormat
 from visioncal.formats.wishes import Wishes

@@ -95,6 +95,10 @@ class RecordedImages:
             raise moved
         return data
 
+    def absence(self, path: str) -> str:
+        """Says why there is no such image; empty where there is one."""
+        return "" if self.exists(path) else "is missing"
+
     def exists(self, path: str) -> bool:
         """Tells whether there is such an image."""
         return path in self.places

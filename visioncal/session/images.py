@@ -1,5 +1,6 @@
 """Where the bytes of a session's images come from."""
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from visioncal.errors import DataError
-from visioncal.files import read_bytes
+from visioncal.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
@@ -22,23 +23,44 @@ class ImageStore(Protocol):
             DataError: There is no such image, or it cannot be read.
         """
 
+    def absence(self, path: str) -> str:
+        """Says why there is no such image to read, after its name; empty where there is one."""
+
     def exists(self, path: str) -> bool:
-        """Tells whether there is such an image."""
+        """Tells whether there is such an image to read."""
 
 
 @dataclass(frozen=True)
 class FolderImages:
-    """Images below a session's folder."""
+    """Images below a session's folder; links that lead out of it are not followed."""
 
     folder: Path
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file."""
-        return read_bytes(self.folder / inside_path(path))
+        why_not = self.absence(path)
+        if why_not:
+            raise DataError(f"{self.folder / inside_path(path)} {why_not}.", culprits=[path])
+        return read_bytes(self.folder / inside_path(path), MOST_IMAGE_BYTES)
+
+    def absence(self, path: str) -> str:
+        """Says why there is no such image to read, after its name; empty where there is one."""
+        file = self.folder / inside_path(path)
+        why_not = absence(file)
+        if why_not:
+            return why_not.replace("does not exist", "is missing")
+        if not is_inside(file, self.folder):
+            return (
+                "is a link that leads out of the session's folder, and is not followed: copy the "
+                "images into the folder"
+            )
+        if file.stat().st_size > MOST_IMAGE_BYTES:
+            return f"has more than {MOST_IMAGE_BYTES / 1e6:.0f} MB, as no image has"
+        return "" if os.access(file, os.R_OK) else "cannot be read: permission denied"
 
     def exists(self, path: str) -> bool:
-        """Tells whether there is such an image."""
-        return (self.folder / inside_path(path)).is_file()
+        """Tells whether there is such an image to read."""
+        return not self.absence(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +74,10 @@ class MemoryImages:
         if path not in self.files:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return self.files[path]
+
+    def absence(self, path: str) -> str:
+        """Says why there is no such image; empty where there is one."""
+        return "" if self.exists(path) else "is missing"
 
     def exists(self, path: str) -> bool:
         """Tells whether there is such an image."""

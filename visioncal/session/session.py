@@ -10,7 +10,7 @@ import numpy as np
 import tomli_w
 
 from visioncal.errors import DataError
-from visioncal.files import parse_toml, read_text
+from visioncal.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
 from visioncal.session.boards import COLUMN, read_targets
@@ -96,13 +96,15 @@ class Session:
                 "recording, is needed.",
                 culprits=[str(path)],
             )
-        document = parse_toml(read_text(path / "session.toml"), "session.toml")
+        document = parse_toml(
+            read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"
+        )
         streams = read_streams(path)
         columns: tuple[str, ...] = ALONE
         rows: tuple[Row, ...] = ()
         # What an arm's drives needed is told by streams alone.
         if not streams or (path / "views.csv").exists():
-            columns, rows = parse_csv(read_text(path / "views.csv"), "views.csv")
+            columns, rows = parse_csv(read_text_inside(path, "views.csv"), "views.csv")
         session = _build(
             document,
             columns,

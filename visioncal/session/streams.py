@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.errors import DataError
-from visioncal.files import named_errors, read_text, sha256, some_of, write_atomically
+from visioncal.files import named_errors, read_text_inside, sha256, some_of, write_atomically
 from visioncal.session import columns as known
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -24,6 +24,8 @@ _NORM_TOLERANCE = 1e-3
 # between them.
 _GAP_RATIO, _GAP_S = 2.5, 0.02
 _SHOWN_PROBLEMS = 10
+# Half an hour of twenty columns at 500 Hz, of all streams together.
+_MOST_BYTES = 300_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,12 @@ def read_streams(folder: Path) -> dict[str, Stream]:
         DataError: A cell is no number; it is named.
     """
     paths = sorted((folder / FOLDER).glob("*.csv"))
-    return {path.stem: parse_stream(read_text(path), f"{FOLDER}/{path.name}") for path in paths}
+    found, left = {}, _MOST_BYTES
+    for path in paths:
+        text = read_text_inside(folder, f"{FOLDER}/{path.name}", left)
+        left -= len(text)
+        found[path.stem] = parse_stream(text, f"{FOLDER}/{path.name}")
+    return found
 
 
 def parse_stream(text: str, label: str) -> Stream:

@@ -5,12 +5,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Condition
 
 import cv2
 
 from visioncal.errors import DataError
 from visioncal.estimator.planar import determines_pose
 from visioncal.finders import NotFound, find_target, fitting_layouts
+from visioncal.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
+from visioncal.finders.headers import MOST_PIXELS, claimed_size
 from visioncal.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.session import Session, View
 from visioncal.targets import corner_positions
@@ -55,6 +58,29 @@ class _Look:
     misfit: bool = False
 
 
+class _Room:
+    """Bounds what threads work on at once, in shares of the largest image that is looked at."""
+
+    def __init__(self) -> None:
+        self._left = 1.0
+        self._changed = Condition()
+
+    @contextmanager
+    def taken(self, share: float) -> Iterator[None]:
+        """Waits until there is room for a share; one beyond all of it waits to be alone."""
+        share = min(max(share, 0.0), 1.0)
+        with self._changed:
+            # Shares add up to one but for rounding.
+            self._changed.wait_for(lambda: self._left >= share - 1e-9)
+            self._left -= share
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._left += share
+                self._changed.notify_all()
+
+
 def detect(
     session: Session,
     options: DetectOptions | None = None,
@@ -82,11 +108,12 @@ def detect(
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
     views = [view for view in (session.views if among is None else among) if view.image]
     looks: list[_Look] = []
+    room = _Room()
     with (
         _ONE_OPENCV_THREAD.held(),
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
-        for look in pool.map(lambda view: _look(session, view, options), views):
+        for look in pool.map(lambda view: _look(session, view, options, room), views):
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
@@ -118,18 +145,33 @@ _ONE_OPENCV_THREAD = Shared(_one_opencv_thread)
 def image_of(session: Session, view: View) -> Image | Rejection:
     """Reads a view's (h, w) grey image; or says why there is none."""
     if not session.images.exists(view.image):
-        return Rejection(view.number, f"{view.image} is missing")
-    image = decode_image(session.images.read(view.image))
+        return Rejection(view.number, f"{view.image} {session.images.absence(view.image)}")
+    return _decoded(view, session.images.read(view.image))
+
+
+def _decoded(view: View, data: bytes) -> Image | Rejection:
+    image = decode_image(data)
     return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
 
 
-def _look(session: Session, view: View, options: DetectOptions) -> _Look:
+def _look(session: Session, view: View, options: DetectOptions, room: _Room) -> _Look:
+    absence = session.images.absence(view.image)
+    if absence:
+        return _Look(Rejection(view.number, f"{view.image} {absence}"), None)
     name = session.board_of(view)
     target = session.boards[name]
-    image = image_of(session, view)
-    if isinstance(image, Rejection):
-        return _Look(image, None)
-    found, misfit = look_for(image, target, view.number, options, name=name)
+    data = session.images.read(view.image)
+    size = claimed_size(data) or (0, 0)
+    pixels = size[0] * size[1]
+    if session.resolution not in (None, size) and 0 < pixels <= MOST_PIXELS:
+        # Refused in any case: what another size shows need not be looked at.
+        return _Look(Rejection(view.number, f"{view.image} is of another size"), size)
+    most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
+    with room.taken(pixels / most):
+        image = _decoded(view, data)
+        if isinstance(image, Rejection):
+            return _Look(image, None)
+        found, misfit = look_for(image, target, view.number, options, name=name)
     return _Look(found, (image.shape[1], image.shape[0]), misfit)
 
 
