@@ -171,7 +171,7 @@ def test_what_is_no_urdf_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture
         load_robot("a.urdf", "x", tmp_path)
     capfd.readouterr()  # the parser speaks on its own
     (tmp_path / "b.urdf").write_bytes(b" " * 10_000_001)
-    with pytest.raises(DataError, match="a URDF of at most 10 MB"):
+    with pytest.raises(DataError, match="has more than 10 MB"):
         read_robot_document("b.urdf", folder=tmp_path)
 
 

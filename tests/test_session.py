@@ -157,7 +157,10 @@ def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> No
     edit(folder, "session.toml", '"board.toml"', '"../shared board.toml"')
     edit(folder, "session.toml", '"ur10e"', '"../arm.toml"')
     session = Session.load(folder)
-    assert session.warnings == ()
+    assert [it.partition(" = ")[0] for it in session.warnings] == [
+        "session.toml: target",
+        "session.toml: model",
+    ]
     copy = tmp_path / "copy"
     session.save(copy)
     (tmp_path / "shared board.toml").unlink()
@@ -166,6 +169,63 @@ def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> No
     assert again.document["target"] == "target.toml"
     assert again.robot_document == session.robot_document
     assert again.digest() == session.digest()
+
+
+@pytest.mark.parametrize(
+    ("field", "file", "content"),
+    [
+        ('"board.toml"', "board.toml", 'kind = "secret"\n'),
+        ('"board.toml"', "board.toml", "password: secret\n"),
+        ('"ur10e"', "arm.toml", '[[joint]]\nname = "secret"\n'),
+        ('"ur10e"', "arm.urdf", "<secret/>"),
+        ('"ur10e"', "arm.json", '{"kind": "secret"}'),
+    ],
+)
+def test_what_is_wrong_with_a_file_outside_is_said_without_its_content(
+    field: str, file: str, content: str, folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / file).write_text(content)
+    edit(folder, "session.toml", field, f'"../{file}"')
+    try:
+        said, session = "", Session.load(folder)
+    except DataError as error:
+        said, session = str(error), None
+    if session is not None:
+        said = "\n".join(session.warnings)
+        assert session.robot_document is None
+    assert f"{tmp_path / file}, outside of the session's folder, is no " in said
+    assert "secret" not in said
+
+
+def test_a_link_to_another_kind_of_file_is_no_board(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "passwords").write_text(BOARD)
+    (folder / "board.toml").unlink()
+    (folder / "board.toml").symlink_to(tmp_path / "passwords")
+    assert "passwords, outside of the session's folder, is no target" in str(refusal(folder))
+
+
+def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path: Path) -> None:
+    shutil.move(folder / "images" / "a.png", tmp_path / "a.png")
+    (folder / "images" / "a.png").symlink_to(tmp_path / "a.png")
+    images = Session.load(folder).images
+    assert not images.exists("images/a.png")
+    assert "copy the images into the folder" in images.absence("images/a.png")
+    assert images.read("images/b 2.png") == b"\x89PNG b"
+    with pytest.raises(DataError, match="leads out"):
+        images.read("images/a.png")
+    Session.load(folder).save(tmp_path / "copy")
+    assert not (tmp_path / "copy" / "images" / "a.png").exists()
+    (tmp_path / "link").symlink_to(folder)
+    assert Session.load(tmp_path / "link").images.exists("images/b 2.png")
+    shutil.move(folder / "views.csv", tmp_path / "views.csv")
+    (folder / "views.csv").symlink_to(tmp_path / "views.csv")
+    assert "leads out of its folder" in str(refusal(folder))
+
+
+def test_a_name_that_no_file_has_leaves_its_view_alone(folder: Path) -> None:
+    edit(folder, "views.csv", "images/missing.png", f"images/{'a' * 300}.png")
+    images = Session.load(folder).images
+    assert "longer than 255 bytes" in images.absence(f"images/{'a' * 300}.png")
 
 
 def test_a_packaged_target_stays_a_name(folder: Path, tmp_path: Path) -> None:

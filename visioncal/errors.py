@@ -25,8 +25,10 @@ class VisioncalError(Exception):
         return type(self)(self.message, culprits=culprits, next_step=self.next_step)
 
     def within(self, label: str) -> Self:
-        """Returns the same error with the file that it is in before its message."""
-        message = f"{label}: {self.message}"
+        """Returns the same error with the file that it is in before its message, once."""
+        message = self.message
+        if not message.startswith(label):
+            message = f"{label}: {message}"
         return type(self)(message, culprits=self.culprits, next_step=self.next_step)
 
     def __str__(self) -> str:

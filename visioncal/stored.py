@@ -9,7 +9,7 @@ from visioncal.dynamics import FILE as DYNAMICS
 from visioncal.dynamics import Identified
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
-from visioncal.files import read_bytes
+from visioncal.files import absence, read_bytes
 from visioncal.outputs import ALIGNMENT, CALIBRATION, RECORDING
 from visioncal.session import Session
 
@@ -138,7 +138,7 @@ def _cell_alone(path: Path) -> DataError:
 
 def _content(path: Path) -> dict[str, object]:
     """The content of a JSON file; empty of what is none."""
-    if path.suffix.lower() == ".rrd" or not path.is_file():
+    if path.suffix.lower() == ".rrd" or absence(path):
         return {}
     try:
         document = json.loads(read_bytes(path))

@@ -16,7 +16,7 @@ import numpy as np
 
 from visioncal import transforms
 from visioncal.errors import DataError
-from visioncal.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.files import Table, did_you_mean, find_described, read_toml
 from visioncal.types import FloatArray, IntArray, Mask, Target
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
@@ -63,7 +63,7 @@ def load_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
     path = find_described(
         name_or_path, what="target", shipped=_shipped(), suffixes=(".toml",), folder=folder
     )
-    document = parse_toml(read_text(path), path.name)
+    document = read_toml(path, path.name)
     return target_from_document(document, path.stem), document
 
 

@@ -13,6 +13,7 @@ from visioncal.calibration.document import camera_document, read_camera
 from visioncal.calibration.edge import Edge, edge_document, read_array, read_edge
 from visioncal.calibration.frame import present
 from visioncal.calibration.parts import CameraResult, Verdict, VerdictStatus
+from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.estimation.tree import Branch, Step, Tree
 from visioncal.files import did_you_mean, read_bytes, write_atomically
@@ -241,9 +242,7 @@ class Alignment:
             DataError: It is not an alignment of a known schema.
         """
         try:
-            return cls(**_fields(json.loads(text)))
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise DataError(f"{label}: not JSON: {error}.", culprits=[label]) from error
+            return cls(**_fields(parse_stored(text, label)))
         except DataError as error:
             raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -255,9 +254,9 @@ class Alignment:
 
 
 def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
+    if document.get("schema") != SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
     verdict = document["verdict"]
-    if document["schema"] != SCHEMA:
-        raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
     if verdict["status"] not in get_args(VerdictStatus):
         raise ValueError(f"verdict.status is {verdict['status']!r}")
     return {

@@ -1,5 +1,6 @@
 """calibration.json."""
 
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -22,6 +23,7 @@ from visioncal.calibration.parts import (
     VerdictStatus,
     ViewResult,
 )
+from visioncal.documents import Kinds
 from visioncal.robot import Robot
 from visioncal.types import Camera, FloatArray, Mount
 from visioncal.version import __version__
@@ -30,6 +32,15 @@ if TYPE_CHECKING:
     from visioncal.calibration.result import Calibration
 
 SCHEMA = 1
+# What the fields hold beside numbers, by their names.
+KINDS = Kinds(
+    re.compile("reasons?|method|status|level|name|source|created|mount|words|weight"),
+    re.compile(
+        "session|transforms|joint_covariance|solvers|noise|rms|validation|held_out|verdict|need"
+        "|kinematics|elastic|thermal|uncertainty|noise_95|joint_fit|observability|camera|conditions"
+    ),
+    re.compile("views|levels|parameters|left_out|stops|joints|course|observations"),
+)
 
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
@@ -112,8 +123,8 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         LookupError, TypeError, ValueError, AttributeError: It is no calibration of this schema.
     """
-    if document["schema"] != SCHEMA:
-        raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
+    if document.get("schema") != SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
     if document["mount"] not in get_args(Mount):
         raise ValueError(f"mount is {document['mount']!r}")
     if document["verdict"]["status"] not in get_args(VerdictStatus):

@@ -8,6 +8,7 @@ from typing import Any, Self, get_args
 
 from visioncal.calibration.edge import Edge, edge_document, read_edge
 from visioncal.calibration.parts import Verdict, VerdictStatus
+from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
 from visioncal.version import __version__
@@ -92,9 +93,7 @@ class FrameFile:
         """
         content = read_bytes(path)
         try:
-            return cls(_read_file(json.loads(content)))
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise DataError(f"{path}: not JSON: {error}.", culprits=[str(path)]) from error
+            return cls(_read_file(parse_stored(content, str(path))))
         except DataError as error:
             raise error.within(str(path)) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -141,8 +140,8 @@ def read_frames(document: Mapping[str, Any]) -> dict[str, Frame]:
 def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
     if "transforms" in document:
         raise ValueError("it is a calibration, whose folder is named with -c")
-    if document["schema"] != _SCHEMA:
-        raise ValueError(f"schema is {document['schema']!r}, this version reads {_SCHEMA}")
+    if document.get("schema") != _SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {_SCHEMA}")
     return read_frames(document["frames"])
 
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.calibration.document import fields_from_document, to_document
+from visioncal.calibration.document import KINDS, fields_from_document, to_document
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame
 from visioncal.calibration.parts import (
@@ -21,6 +21,7 @@ from visioncal.calibration.parts import (
     Verdict,
     ViewResult,
 )
+from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
 from visioncal.robot import Loads, Robot, bent_joints
@@ -233,9 +234,7 @@ class Calibration:
             DataError: It is not a calibration of a known schema.
         """
         try:
-            return cls(**fields_from_document(json.loads(text)))
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise DataError(f"{label}: not JSON: {error}.") from error
+            return cls(**fields_from_document(parse_stored(text, label, KINDS)))
         except DataError as error:
             raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError) as error:

@@ -17,9 +17,8 @@ from visioncal.errors import DataError
 from visioncal.files import (
     flush_folder,
     named_errors,
-    parse_toml,
     read_bytes,
-    read_text,
+    read_toml,
     write_atomically,
 )
 from visioncal.session import Session, View
@@ -113,7 +112,7 @@ class Journal:
             with named_errors(folder), suppress(FileNotFoundError):
                 (folder / _IMAGES).rmdir()
             return cls.begin(folder, facts, unix_offset_s, views)
-        _check_same(parse_toml(read_text(path), str(path)), facts, folder)
+        _check_same(read_toml(path, str(path)), facts, folder)
         journal = cls(folder, facts, unix_offset_s)
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)

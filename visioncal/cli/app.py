@@ -1,6 +1,7 @@
 """The application: its commands, and how their ends become exit statuses."""
 
 import sys
+from errno import ENAMETOOLONG
 from typing import Annotated
 
 import typer
@@ -26,7 +27,7 @@ from visioncal.cli.streams import guarded_streams
 from visioncal.cli.target import target_app
 from visioncal.cli.tcp import tcp_command
 from visioncal.cli.verify import verify_command
-from visioncal.errors import VisioncalError
+from visioncal.errors import DataError, VisioncalError
 from visioncal.version import __version__
 
 app = typer.Typer(
@@ -81,4 +82,10 @@ def main() -> None:
             app()
         except VisioncalError as error:
             report_error(error, as_json="--json" in sys.argv[1:])
+            sys.exit(EXIT_NO_RESULT)
+        except OSError as error:
+            if error.errno != ENAMETOOLONG:
+                raise
+            named = DataError(f"{error.filename} is longer than the name of any file.")
+            report_error(named, as_json="--json" in sys.argv[1:])
             sys.exit(EXIT_NO_RESULT)

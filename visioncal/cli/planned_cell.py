@@ -11,7 +11,7 @@ from visioncal.calibration import Calibration
 from visioncal.cli.numbers import numbers_in
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
-from visioncal.files import read_bytes, some_of
+from visioncal.files import absence, read_bytes, some_of
 from visioncal.formats.boards import described_target
 from visioncal.formats.intrinsics import read_intrinsics
 from visioncal.outputs import CALIBRATION
@@ -204,7 +204,7 @@ def pose_of(words: str, option: str) -> FloatArray:
 
 def _holds_a_result(path: Path) -> bool:
     """Tells a calibration.json from other files, such as an arm's."""
-    if not path.is_file() or path.suffix.lower() != ".json":
+    if absence(path) or path.suffix.lower() != ".json":
         return False
     try:
         document = json.loads(read_bytes(path))

@@ -129,8 +129,8 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         LookupError, TypeError, ValueError, AttributeError: It is none of this schema.
     """
-    if document["schema"] != SCHEMA:
-        raise ValueError(f"schema is {document['schema']!r}, this version reads {SCHEMA}")
+    if document.get("schema") != SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
     robot = Robot.from_document(document["robot"])
     terms = FrictionTerms(**document["friction"])
     base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from visioncal.documents import parse_stored
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
 from visioncal.dynamics.motion import Motion
@@ -119,7 +120,7 @@ class Identified:
         path = Path(path)
         path = path / FILE if path.is_dir() else path
         try:
-            return cls(**fields_from_document(json.loads(read_bytes(path))))
+            return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise DataError(
                 f"{path} is no {FILE} of this version: {error}.",

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.conventions import PoseNumbers, Reading
 from visioncal.errors import DataError
-from visioncal.files import parse_toml, read_text
+from visioncal.files import read_toml
 from visioncal.formats.assemble import assemble, pose_cells, spoken
 from visioncal.formats.foreign import Foreign
 from visioncal.guess import Candidate, Guess, guess_reading
@@ -90,10 +90,10 @@ def load_in_doubt(path: Path) -> Session:
         DataError: It is no session.
     """
     file = path / "session.toml"
-    name = parse_toml(read_text(file), file.name).get("target") if file.is_file() else None
+    name = read_toml(file, file.name).get("target") if file.is_file() else None
     if not isinstance(name, str) or not name.endswith(".toml"):
         return Session.load(path)
-    stated = parse_toml(read_text(path / name), name)
+    stated = read_toml(path / name, name)
     sides = [stated[it] for it in ("square_m", "size_m") if isinstance(stated.get(it), int | float)]
     if not sides or not LARGEST_M < sides[0] < _LARGEST_MM:
         return Session.load(path)

@@ -1,6 +1,5 @@
 """Reads the plan.json that `planning.written` writes: the stops to drive to, and their cell."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from visioncal.documents.jsons import parse_json
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
 from visioncal.files import Table, read_text
@@ -70,10 +70,7 @@ def read_plan(path: Path | str) -> PlanFile:
     path = Path(path)
     file = path / _FILE if path.is_dir() else path
     text = read_text(file)
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not valid JSON: {error}.", culprits=[str(file)]) from error
+    document = parse_json(text, str(file))
     if not isinstance(document, dict) or "stops" not in document or "cell" not in document:
         raise DataError(
             f"{file} is no plan: it has no stops and cell.",
@@ -83,7 +80,7 @@ def read_plan(path: Path | str) -> PlanFile:
     Table(document, str(file)).integer("schema", SCHEMA, SCHEMA)
     try:
         return _plan(document)
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise DataError(
             f"{file} is damaged: {error!r} where a plan is read.",
             culprits=[str(file)],

@@ -5,7 +5,7 @@ from pathlib import Path
 import tomli_w
 
 from visioncal.errors import DataError
-from visioncal.files import check_free, named_errors, parse_toml, read_text, write_atomically
+from visioncal.files import check_free, named_errors, read_toml, write_atomically
 from visioncal.generations import write_generation
 from visioncal.printing.page import Sheet
 from visioncal.targets import target_document, target_from_document
@@ -94,7 +94,7 @@ def _describes(path: Path, target: Target) -> bool:
     if not path.is_file():
         return False
     try:
-        there = target_from_document(parse_toml(read_text(path), path.name), target.name)
+        there = target_from_document(read_toml(path, path.name), target.name)
     except DataError:
         return False
     return there == target

@@ -7,8 +7,9 @@ from typing import Any
 
 import tomli_w
 
+from visioncal.documents.jsons import parse_json
 from visioncal.errors import DataError
-from visioncal.files import find_described, parse_toml, read_text
+from visioncal.files import find_described, read_text, read_toml
 from visioncal.robot.model import Robot
 
 # Far above any arm's URDF; a larger file is something else.
@@ -50,26 +51,20 @@ def read_robot_document(
         name_or_path, what="robot", shipped=_shipped(), suffixes=ROBOT_SUFFIXES, folder=folder
     )
     if path.suffix.lower() in (".toml", ".json"):
-        read = parse_toml if path.suffix.lower() == ".toml" else _parse_json
-        table = read(read_text(path), path.name)
+        is_toml = path.suffix.lower() == ".toml"
+        table = read_toml(path, path.name) if is_toml else _parse_json(read_text(path), path.name)
         named = {"name": path.stem, "tip": "flange"} | table
         return named if tip is None else named | {"tip": tip}
-    size = path.stat().st_size
-    if size > _MAX_URDF_BYTES:
-        raise DataError(
-            f"{path} has {size / 1e6:.0f} MB; a URDF of at most {_MAX_URDF_BYTES / 1e6:.0f} MB is "
-            "read.",
-            culprits=[str(path)],
-            next_step="Meshes belong into files of their own.",
-        )
-    return {"schema": 1, "name": path.stem, "tip": tip or "", "urdf": read_text(path)}
+    return {
+        "schema": 1,
+        "name": path.stem,
+        "tip": tip or "",
+        "urdf": read_text(path, _MAX_URDF_BYTES),
+    }
 
 
 def _parse_json(text: str, label: str) -> dict[str, Any]:
-    try:
-        found = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise DataError(f"{label} is not valid JSON: {error}.", culprits=[label]) from error
+    found = parse_json(text, label)
     if isinstance(found, dict) and "kind" in found:
         return found
     raise DataError(

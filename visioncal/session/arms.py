@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from visioncal.errors import DataError
-from visioncal.robot import read_robot_document
+from visioncal.robot import Robot, read_robot_document
 from visioncal.session.document import Declaration
+from visioncal.session.outside import outside_file, without_content
 from visioncal.session.tables import RobotTable
 
 
@@ -43,7 +44,11 @@ def read_robots(
 
 
 def _read(table: RobotTable, model: str, folder: Path | None) -> dict[str, Any]:
-    document = read_robot_document(model, tip=table.tip, folder=folder)
+    with without_content(model, "model", folder):
+        document = read_robot_document(model, tip=table.tip, folder=folder)
+        if outside_file(model, "model", folder) is not None:
+            # What is no robot is not taken into recordings.
+            Robot.from_document(document)
     if table.gravity_m_s2 is not None:
         document |= {"gravity_m_s2": table.gravity_m_s2}
     return document

@@ -6,6 +6,7 @@ from typing import Any
 
 from visioncal.errors import DataError
 from visioncal.session.document import Declaration
+from visioncal.session.outside import without_content
 from visioncal.targets import load_target, target_from_document
 from visioncal.types import Target
 
@@ -37,14 +38,14 @@ def read_targets(
     if len(places) == 1:
         (place,) = places.values()
         if document is None:
-            target, document = load_target(place, folder)
+            target, document = _load(place, folder)
         else:
             target = target_from_document(document, Path(place).stem)
         return {"": target}, document
     targets, contents = {}, {}
     for name, place in places.items():
         if document is None:
-            targets[name], contents[name] = load_target(place, folder)
+            targets[name], contents[name] = _load(place, folder)
         elif name in document:
             targets[name] = target_from_document(document[name], Path(place).stem)
             contents[name] = document[name]
@@ -54,6 +55,11 @@ def read_targets(
                 culprits=[f"session.toml: targets.{name}"],
             )
     return targets, contents
+
+
+def _load(place: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
+    with without_content(place, "target", folder):
+        return load_target(place, folder)
 
 
 def declared_targets(declaration: Declaration) -> dict[str, str]:

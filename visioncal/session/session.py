@@ -21,6 +21,7 @@ from visioncal.session.frames import check_frames, frame_name, resolve_frames, r
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import check_kinds_named, kind_warnings
 from visioncal.session.observations import Observation, observations_of, stop_warnings
+from visioncal.session.outside import outside_warnings
 from visioncal.session.saving import placed_files, write_folder
 from visioncal.session.streams import (
     FOLDER,
@@ -381,7 +382,7 @@ def _build(
     if declaration.is_network:
         warnings += stop_warnings(declaration, views)
     robot_document, unknown = read_robots(declaration, folder, robot_document)
-    warnings += unknown
+    warnings += [*unknown, *outside_warnings(declaration, folder)]
     return Session(
         document,
         columns,

@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.files import Table, did_you_mean, parse_toml, read_text
+from visioncal.files import Table, did_you_mean, read_toml
 from visioncal.session import Session
 
 State: TypeAlias = Literal["fired", "quiet", "unknown"]
@@ -85,7 +85,7 @@ def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
         DataError: It is missing, or a trigger has an unknown quantity or no limit.
     """
     file = _FILE if path is None else path
-    rows = parse_toml(read_text(file), str(file)).get("trigger")
+    rows = read_toml(file, str(file)).get("trigger")
     if not isinstance(rows, list) or not all(isinstance(it, dict) for it in rows):
         raise DataError(
             f"{file}: it holds no [[trigger]].",
