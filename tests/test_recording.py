@@ -84,7 +84,7 @@ def test_odd_facts_survive(tmp_path: Path) -> None:
     pose = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
     columns = ["note", "view", "stamp_s", "tau1_nm", *(f"cft_{name}" for name in pose)]
     cells = [
-        ['a,"b"\n', "7", "5e-324", "1.7976931348623157e+308", "-0.0", "0", "1", "0", "0", "0", "1"],
+        ['a,"b"\n', "7", "5e-324", "999999.9999999999", "-0.0", "0", "1", "0", "0", "0", "1"],
         ["", "-3", "", "0.1", "0.30000000000000004", "0", "1", "0", "0", "0", "1"],
     ]
     session = Session.assemble(document, columns, cells, MemoryImages({}))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DataError
 from visioncal.session import FolderImages, MemoryImages, Session
+from visioncal.session.table import parse_csv
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "sessions"
 
@@ -517,7 +518,7 @@ def test_touches_and_readings_need_no_image(folder: Path, extra: str) -> None:
 
 
 cells = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
-finite = st.floats(allow_nan=False, allow_infinity=False)
+finite = st.floats(-1e10, 1e10)
 
 
 @settings(deadline=None, max_examples=60)  # a busy disk takes its time to flush
@@ -535,3 +536,16 @@ def test_any_text_and_any_number_survive(
     for view, (note, stamp) in zip(again.views, rows, strict=True):
         assert (view.cell("note"), view.stamp_s) == (note, stamp)
     assert again.digest() == session.digest()
+
+
+def test_a_table_of_samples_is_no_table_of_views() -> None:
+    rows = "view,image\n" + "".join(f"{it},a.png\n" for it in range(100_001))
+    with pytest.raises(DataError, match=r"more than 100,000 rows.*streams/NAME\.csv"):
+        parse_csv(rows, "views.csv")
+    with pytest.raises(DataError, match="1,000 columns"):
+        parse_csv("a," * 1000 + "a\n1\n", "views.csv")
+
+
+def test_a_stamp_beyond_all_time_is_refused(folder: Path) -> None:
+    edit(folder, "views.csv", ",0.10,", ",1e308,")
+    assert "1e+308 s is no time of a recording" in str(refusal(folder))

@@ -12,7 +12,7 @@ from visioncal.errors import DataError
 from visioncal.formats import convert
 from visioncal.recording import codec, read_session, write_recording
 from visioncal.session import Session, Stream
-from visioncal.session.streams import check_stream, parse_stream, write_stream
+from visioncal.session.streams import check_stream, parse_stream, read_streams, write_stream
 from visioncal.types import FloatArray
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -95,7 +95,20 @@ def test_gaps_are_told() -> None:
 
 def test_folder_recording_and_copies_hold_the_same(tmp_path: Path) -> None:
     # A file of a robot's orders its keys anew.
-    session = replace(kept_session(), robot_document=None).with_streams(kept_streams())
+    session = replace(kept_session(), robot_document=None)
+    cells = [[view.cell(it) for it in session.columns] for view in session.views]
+    # The kept one has a time and an angle that no folder of today may hold.
+    cells = [["1e10" if it == "1e+308" else it for it in row] for row in cells]
+    plain = Session.assemble(
+        session.document,
+        session.columns,
+        cells,
+        session.images,
+        target_document=session.target_document,
+    )
+    (robot,) = kept_streams().values()
+    values = np.where(robot.values == 1e300, 1e4, robot.values)
+    session = plain.with_streams({"robot": replace(robot, values=values)})
     session.save(tmp_path / "folder")
     write_recording(tmp_path / "session.rrd", session, None, (), None)
     assert_same(session, Session.load(tmp_path / "folder"))
@@ -152,3 +165,29 @@ def test_a_long_stream_is_read_quickly() -> None:
     # It takes 0.15 s of the processor's own time; a slow machine may take ten times as long.
     assert time.process_time() - began < 1.5
     np.testing.assert_array_equal(again.values, values)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("stamp_s", "1e308", "no time of a recording; write seconds"),
+        ("stamp_s", "1.7e12", "no time of a recording"),
+        ("x_m", "-1e308", "no place in a robot cell"),
+        ("q1_rad", "1e300", "no angle of a joint"),
+        ("dq1_rad_s", "1e308", "no speed of a joint"),
+        ("tau1_nm", "1e308", "no torque"),
+        ("qx", "1e308", "no number that a cell has"),
+        ("note", "1e308", "no number that a cell has"),
+    ],
+)
+def test_a_number_that_no_cell_has_is_named_by_its_column(
+    column: str, value: str, words: str, tmp_path: Path
+) -> None:
+    names = ("stamp_s", *POSE, "q1_rad", "dq1_rad_s", "tau1_nm", "note")
+    cells = dict.fromkeys(names, "0") | {"qw": "1"}
+    first, second = cells, cells | {"stamp_s": "1"} | {column: value}
+    lines = [",".join(names), *(",".join(it.values()) for it in (first, second))]
+    (tmp_path / "streams").mkdir()
+    (tmp_path / "streams" / "robot.csv").write_text("\n".join(lines))
+    with pytest.raises(DataError, match=rf"column {column}: .*{words}"):
+        read_streams(tmp_path)

@@ -32,6 +32,19 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
             )
 
 
+def check_times(views: Sequence[View]) -> None:
+    """No time of a recording is beyond what its stamps can resolve.
+
+    Raises:
+        DataError: One is; it names the view.
+    """
+    for view in views:
+        wrong = "" if view.stamp_s is None else known.no_size("stamp_s", np.array([view.stamp_s]))
+        if wrong:
+            place = f"views.csv, view {view.number}, column stamp_s"
+            raise DataError(f"{place}: {wrong}.", culprits=[place])
+
+
 def view_warnings(views: Sequence[View]) -> Iterator[str]:
     """Words what looks like another unit, or like a row that was copied."""
     for names in (known.POSITION, known.MEASURED_CAM_POSE[:3]):

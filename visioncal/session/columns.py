@@ -1,7 +1,7 @@
 """The columns of views.csv: which are known, and which belong together."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -42,6 +42,21 @@ _TEXTS = frozenset(
 # No robot works below the one, and motors are switched off below the other [deg C]; every
 # temperature of a robot in kelvin is above them.
 _COLDEST_C, _HOTTEST_C, _ZERO_K = -60.0, 200.0, 273.15
+# The largest numbers by their column or its unit, with what a larger one is called. Poses in
+# micrometres stay under so many metres, and turns in degrees under so many radians. Beyond the year
+# 2286 a stamp resolves no microsecond, and is in milliseconds or less. What drives do is far below.
+_SIZES: Mapping[str, tuple[float, str]] = {
+    "m": (1e7, "{0:g} m is no place in a robot cell; write metres ({0:g} mm?)"),
+    "rad": (1e4, "{0:g} rad is no angle of a joint; write radians"),
+    "s": (1e10, "{0:g} s is no time of a recording; write seconds"),
+    "rad_s": (1e5, "{0:g} rad/s is no speed of a joint"),
+    "rad_s2": (1e8, "{0:g} rad/s^2 is no acceleration of a joint"),
+    "nm": (1e6, "{0:g} Nm is no torque of a joint"),
+    "a": (1e6, "{0:g} A is no current of a motor"),
+}
+_RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
+# Squares and products of larger numbers in other columns leave what floats hold.
+_LARGEST = 1e60
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -63,6 +78,20 @@ def no_celsius(values: FloatArray) -> str:
         f"{worst:g} deg C is no temperature of a robot or its air{kelvin}; write degrees Celsius "
         f"from {_COLDEST_C:g} to {_HOTTEST_C:g}"
     )
+
+
+def no_size(column: str, values: FloatArray) -> str:
+    """Says which number of a column no cell has; empty where all may be, and in other columns.
+
+    Args:
+        column: Its name, which ends in its unit.
+        values: (n,) its numbers; NaN where a cell is empty.
+    """
+    rate = _RATE.fullmatch(column)
+    unit = rate[1] if rate else column.rpartition("_")[2] if is_number(column) else ""
+    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
+    beyond = values[np.abs(values) > most]
+    return words.format(float(beyond[0])) if len(beyond) else ""
 
 
 def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from visioncal.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
 from visioncal.session.boards import COLUMN, read_targets
-from visioncal.session.checks import check_images_can_be_used, view_warnings
+from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
 from visioncal.session.digest import digest_facts
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
@@ -114,6 +114,7 @@ class Session:
             folder=path,
             target_document=target_document,
         )
+        check_times(session.views)
         return session.with_streams(streams)
 
     @classmethod

@@ -103,7 +103,15 @@ def read_streams(folder: Path) -> dict[str, Stream]:
         text = read_text_inside(folder, f"{FOLDER}/{path.name}", left)
         left -= len(text)
         found[path.stem] = parse_stream(text, f"{FOLDER}/{path.name}")
+        _check_sizes(found[path.stem], f"{FOLDER}/{path.name}")
     return found
+
+
+def _check_sizes(stream: Stream, label: str) -> None:
+    for column in dict.fromkeys(stream.columns):
+        wrong = known.no_size(column, stream[column])
+        if wrong:
+            raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
 
 
 def parse_stream(text: str, label: str) -> Stream:

@@ -17,9 +17,8 @@ from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
 from visioncal.types import FloatArray
 
-# Poses in micrometres stay under this many metres, and turns in degrees under this many radians; a
-# number beyond is a slip.
-_FARTHEST_M, _WIDEST_RAD = 1e7, 1e4
+# Half a year of a stop every three minutes; and more columns than any log has.
+_MOST_VIEWS, _MOST_COLUMNS = 100_000, 1_000
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
 _SHOWN_PROBLEMS = 10
@@ -135,6 +134,7 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
         for cells in reader:
             if any(cell.strip() for cell in cells):
                 rows.append(Row(f"{label}, line {line}", tuple(cells)))
+                _check_count(rows, label)
             line = reader.line_num + 1
     except csv.Error as error:
         raise DataError(
@@ -154,6 +154,17 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
             next_step="Add one row for each view.",
         )
     return tuple(name.strip() for name in rows[0].cells), tuple(rows[1:])
+
+
+def _check_count(rows: Sequence[Row], label: str) -> None:
+    if len(rows) > _MOST_VIEWS + 1 or len(rows[0].cells) > _MOST_COLUMNS:
+        raise DataError(
+            f"{label} has more than {_MOST_VIEWS:,} rows or {_MOST_COLUMNS:,} columns; a row is "
+            "one observation at a stop.",
+            culprits=[label],
+            next_step="Samples of a running motion belong into streams/NAME.csv; write the stops "
+            "alone here.",
+        )
 
 
 def write_csv(columns: Sequence[str], views: Sequence[View]) -> str:
@@ -278,12 +289,10 @@ class _RowReader:
 
     def _check_sizes(self, numbers: Mapping[str, float]) -> None:
         for column, value in numbers.items():
-            if column.endswith("_m") and abs(value) > _FARTHEST_M:
-                self.report(
-                    column, f"{value:g} m is no place in a robot cell; write metres ({value:g} mm?)"
-                )
-            if column.endswith("_rad") and abs(value) > _WIDEST_RAD:
-                self.report(column, f"{value:g} rad is no angle of a joint; write radians")
+            # Recordings of earlier versions hold any time; see `check_times`.
+            wrong = known.no_size(column, np.array([value])) if column != "stamp_s" else ""
+            if wrong:
+                self.report(column, wrong)
             wrong = known.no_celsius(np.array([value])) if column.endswith("_c") else ""
             if wrong:
                 self.report(column, wrong)

@@ -6,11 +6,15 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from visioncal.types import CameraKind
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
+# Squares and products of larger numbers leave what floats hold; no field of a cell has such.
+_LARGEST = 1e15
+Number = Annotated[FiniteFloat, Field(ge=-_LARGEST, le=_LARGEST)]
+Positive = Annotated[FiniteFloat, Field(gt=0, le=_LARGEST)]
 # Nobody knows a focal length better than the least of these, or worse than the largest [px].
 PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
-NotNegative = Annotated[FiniteFloat, Field(ge=0)]
-PositiveInt = Annotated[int, Field(gt=0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
+# Four times the side of the largest sensors [px].
+Side = Annotated[int, Field(gt=0, le=65_535)]
 
 
 class TableModel(BaseModel):
@@ -24,10 +28,10 @@ class CameraTable(TableModel):
     """`[camera]`. matrix: fx, fy, cx, cy [px]; resolution: width, height [px]."""
 
     name: str = "camera"
-    resolution: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)] | None = None
+    resolution: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
     model: CameraKind = "brown"
-    matrix: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
-    distortion: list[FiniteFloat] | None = None
+    matrix: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = None
+    distortion: list[Number] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
     matrix_sigma_px: PixelSigma | None = None
 
@@ -41,7 +45,7 @@ class RobotTable(TableModel):
 
     model: str | None = None
     tip: str | None = None
-    gravity_m_s2: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None
+    gravity_m_s2: Annotated[list[Number], Field(min_length=3, max_length=3)] | None = None
 
 
 class InstrumentTable(TableModel):
@@ -56,7 +60,7 @@ class InstrumentTable(TableModel):
 class ClockTable(TableModel):
     """`[clock]`. What the camera's stamps are ahead of the robot's [s]."""
 
-    camera_minus_robot_s: FiniteFloat = 0.0
+    camera_minus_robot_s: Number = 0.0
 
 
 class PriorTable(TableModel):
@@ -65,9 +69,9 @@ class PriorTable(TableModel):
     quaternion_xyzw: its rotation, to sigma_rad about each axis [rad]; in whole cells alone.
     """
 
-    x_m: FiniteFloat | None = None
-    y_m: FiniteFloat | None = None
-    z_m: FiniteFloat | None = None
+    x_m: Number | None = None
+    y_m: Number | None = None
+    z_m: Number | None = None
     sigma_m: Positive
     quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
     sigma_rad: Positive | None = None
