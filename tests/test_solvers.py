@@ -28,12 +28,19 @@ from worlds import (
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.solvers import SOLVERS, HandEye, Solver
+from visioncal.solvers.pairs import rotation_pairs
 from visioncal.solvers.translation import complete
 from visioncal.types import FloatArray
 
 MOVEIT = Path(__file__).parents[2] / "shared/data/pose_pairs_small/moveit_eye_to_hand_50.json"
 
 Build = Callable[[np.random.Generator], Problem]
+
+
+def test_more_views_than_have_room_for_their_pairs_are_refused() -> None:
+    with pytest.raises(DataError, match="2001 views have poses; up to 2000"):
+        rotation_pairs(*np.tile(np.eye(4), (2, 2001, 1, 1)))
+
 
 all_solvers = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS.keys())
 

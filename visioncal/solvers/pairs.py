@@ -14,9 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.errors import DataError
 from visioncal.solvers import quaternions
 from visioncal.types import FloatArray
 
+# Their pairs take 1.6 GB.
+MOST_VIEWS = 2000
 FADES_FROM_RAD = np.radians(165.0)
 _FULL_WEIGHT = float(np.cos(0.5 * FADES_FROM_RAD) ** 2)
 
@@ -44,7 +47,18 @@ def rotation_pairs(robot: FloatArray, camera: FloatArray) -> Pairs:
 
 
 def pair_up(robot: FloatArray, camera: FloatArray) -> Pairs:
-    """Forms the relative rotations of all pairs of (m, 4) quaternions."""
+    """Forms the relative rotations of all pairs of (m, 4) quaternions.
+
+    Raises:
+        DataError: They are too many for all their pairs to be held in memory.
+    """
+    if len(robot) > MOST_VIEWS:
+        raise DataError(
+            f"{len(robot)} views have poses; up to {MOST_VIEWS} are solved together, since all "
+            "pairs of them are compared.",
+            next_step="Take every second or third row: dozens of stops that differ say more than "
+            "thousands alike.",
+        )
     a = quaternions.all_products(robot * quaternions.CONJUGATE, robot)
     b = quaternions.all_products(camera, camera * quaternions.CONJUGATE)
     agreement = a[0] * b[0] / _FULL_WEIGHT
