@@ -17,8 +17,8 @@ from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
 from visioncal.types import FloatArray
 
-# Two days of a stop every ten seconds, with which a calibration is refused within 2 GB of memory; and
-# more columns than any log has.
+# Two days of a stop every ten seconds, which a calibration refuses within 2 GB of memory; and more
+# columns than any log has.
 _MOST_VIEWS, _MOST_COLUMNS = 20_000, 1_000
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
