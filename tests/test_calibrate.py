@@ -132,6 +132,26 @@ def test_a_pose_whose_forms_contradict_each_other_is_refused(result, place, form
     assert form == "matrix" or any(form in it for it in no.value.culprits)
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("rms", "mm"), [[1]]),
+        (("noise", "robot_translation_mm"), {}),
+        (("views", 0, "rms_px"), [1.0]),
+        (("validation", "held_out", "px"), []),
+        (("transforms",), {}),
+    ],
+)
+def test_a_field_of_another_kind_is_refused_by_name(result, path, value):
+    document = json.loads(json.dumps(to_document(result)))
+    table = document
+    for key in path[:-1]:
+        table = table[key]
+    table[path[-1]] = value
+    with pytest.raises(DataError, match=rf"^cal\.json: .*{path[-1]} is"):
+        Calibration.from_json(json.dumps(document), "cal.json")
+
+
 def test_a_pose_that_was_rounded_to_six_places_is_the_same(result):
     document = to_document(result)
     pose = document["transforms"]["flange_from_cam"]

@@ -237,3 +237,9 @@ def test_error_leaves_an_open_recording_and_never_replaces_one(tmp_path: Path) -
     assert "2 of 3 views are lost" in read_session(path).warnings[-1]
     with pytest.raises(DataError, match=r"small\.rrd cannot be written: File exists"):
         RecordingWriter(path, small())
+
+
+def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.rrd")
+    with pytest.raises(DataError, match="is no regular file"):
+        read_session(tmp_path / "pipe.rrd")

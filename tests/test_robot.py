@@ -170,6 +170,9 @@ def test_what_is_no_urdf_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture
     with pytest.raises(DataError, match="cannot be parsed"):
         load_robot("a.urdf", "x", tmp_path)
     capfd.readouterr()  # the parser speaks on its own
+    (tmp_path / "long.urdf").write_text(f"<robot name='x'>{'<joint/>' * 2001}</robot>")
+    with pytest.raises(DataError, match="has 2001 joints; up to 2000"):
+        load_robot("long.urdf", "x", tmp_path)
     (tmp_path / "b.urdf").write_bytes(b" " * 10_000_001)
     with pytest.raises(DataError, match="has more than 10 MB"):
         read_robot_document("b.urdf", folder=tmp_path)

@@ -23,7 +23,7 @@ from visioncal.calibration.parts import (
     VerdictStatus,
     ViewResult,
 )
-from visioncal.documents import Kinds
+from visioncal.documents import Kinds, shown
 from visioncal.robot import Robot
 from visioncal.types import Camera, FloatArray, Mount
 from visioncal.version import __version__
@@ -129,6 +129,8 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"mount is {document['mount']!r}")
     if document["verdict"]["status"] not in get_args(VerdictStatus):
         raise ValueError(f"verdict.status is {document['verdict']['status']!r}")
+    if not document["transforms"]:
+        raise ValueError("transforms is empty")
     camera = document.get("camera")
     robot = document.get("robot")
     verdict = document["verdict"]
@@ -140,9 +142,9 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
         "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
         "solvers": {name: _solver(it) for name, it in document["solvers"].items()},
-        "noise": dict(document["noise"]),
-        "views": tuple(ViewResult(**view) for view in document["views"]),
-        "rms": Rms(**document["rms"]),
+        "noise": _figures(document["noise"]),
+        "views": tuple(_view(it) for it in document["views"]),
+        "rms": Rms(**_figures(document["rms"])),
         "validation": _validation(document["validation"]),
         "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
         "camera": None if camera is None else read_camera(camera),
@@ -150,6 +152,19 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "frames": read_frames(document.get("frames", {})),
         "stages": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
+
+
+def _view(document: Mapping[str, Any]) -> ViewResult:
+    _figures({name: it for name, it in document.items() if name not in ("used", "reason")})
+    return ViewResult(**document)
+
+
+def _figures(document: Mapping[str, Any]) -> dict[str, float]:
+    """Checks that the fields of a table are single numbers."""
+    for name, value in document.items():
+        if not isinstance(value, int | float):
+            raise TypeError(f"{name} is {shown(value)}, and one number is needed")
+    return dict(document)
 
 
 def _solver(document: Mapping[str, Any]) -> SolverResult:
@@ -181,8 +196,8 @@ def _validation(document: Mapping[str, Any]) -> Validation:
     holdout = document.get("holdout")
     return Validation(
         document["method"],
-        Rms(**document["held_out"]),
-        None if holdout is None else Rms(**holdout),
+        Rms(**_figures(document["held_out"])),
+        None if holdout is None else Rms(**_figures(holdout)),
     )
 
 

@@ -9,7 +9,7 @@ from visioncal.documents.jsons import read_json
 from visioncal.documents.opencv import read_opencv
 from visioncal.documents.stored import Kinds, parse_stored
 from visioncal.documents.tables import TextTable, is_number, read_table
-from visioncal.documents.values import as_numbers, mapping, number
+from visioncal.documents.values import as_numbers, mapping, number, shown
 from visioncal.documents.xmls import Element, read_xml
 from visioncal.documents.yamls import read_yaml
 
@@ -29,4 +29,5 @@ __all__ = [
     "read_table",
     "read_xml",
     "read_yaml",
+    "shown",
 ]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from visioncal.errors import DataError
+from visioncal.files import absence
 
 LAST, STORE_INFO, CHUNK, ACTIVATION = range(4)
 
@@ -70,6 +71,11 @@ def scan(path: Path) -> Scan:
         DataError: The file is missing or no `.rrd`; or it is finished and yet the head of a message
             does not lead to the next one.
     """
+    why_not = absence(path)
+    if why_not:
+        raise DataError(
+            f"{path} {why_not}.", culprits=[str(path)], next_step="Check the path and its spelling."
+        )
     try:
         size = path.stat().st_size
         with path.open("rb") as file:

@@ -171,6 +171,11 @@ def regressors(
         yield found
 
 
+# A hall with its conveyors has hundreds; the parser, which calls itself for each, ends the process
+# on some ten thousand.
+_MOST_JOINTS = 2000
+
+
 class UrdfArm(NamedTuple):
     """What a URDF says of the arm from its root to the tip; None where it tells no mass."""
 
@@ -190,8 +195,16 @@ def arm_of_urdf(table: Table) -> UrdfArm:
     """
     import pinocchio as pin
 
+    text = table.text("urdf")
+    joints = text.count("<joint")
+    if joints > _MOST_JOINTS:
+        raise DataError(
+            f"{table.label}: the URDF has {joints} joints; up to {_MOST_JOINTS} are read.",
+            culprits=[table.label],
+            next_step="Leave the robot alone in it.",
+        )
     try:
-        model = pin.buildModelFromXML(table.text("urdf"))
+        model = pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
         raise DataError(
             f"{table.label}: the URDF cannot be parsed: {error}.",
