@@ -100,7 +100,7 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
         (session, f"visioncal calibrate {session} -o OUT"),
         (empty, "holds no recording.rrd"),
         (other, "first bytes"),
-        (tmp_path / "nowhere.rrd", "No such file"),
+        (tmp_path / "nowhere.rrd", "does not exist"),
     ):
         done = review(path)
         assert done.returncode == 2

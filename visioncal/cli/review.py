@@ -8,6 +8,7 @@ import typer
 
 from visioncal.cli.console import messages
 from visioncal.errors import DataError
+from visioncal.files import absence
 from visioncal.outputs import PREVIEW, RECORDING
 
 # The first bytes of every recording that rerun writes.
@@ -75,6 +76,9 @@ def find_recording(path: Path) -> Path:
             next_step=f"Calibrate first: visioncal calibrate {path if is_session else 'SESSION'} "
             "-o OUT; then visioncal review OUT.",
         )
+    why_not = absence(file)
+    if why_not:
+        raise DataError(f"{file} {why_not}.", culprits=[str(file)])
     try:
         with file.open("rb") as stream:
             magic = stream.read(len(_MAGIC))
