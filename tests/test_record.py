@@ -94,7 +94,7 @@ def test_what_is_no_plan_is_named(tmp_path):
     with pytest.raises(DataError, match="does not exist"):
         read_plan(tmp_path)
     for text, words in (
-        ("{", "is not valid JSON"),
+        ("{", "is no JSON"),
         ("{}", "is no plan: it has no stops and cell"),
         ('{"stops": [], "cell": {}, "schema": 1}', "is damaged"),
         ('{"stops": [], "cell": {}, "schema": 7}', "schema is 7"),
