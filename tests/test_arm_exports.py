@@ -271,7 +271,7 @@ def test_a_session_takes_a_calibrated_arm_for_its_own(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("{", "not valid JSON"), ("[]", "kind chain"), ('{"a": 1}', "--to robot-json")],
+    [("{", "is no JSON"), ("[]", "kind chain"), ('{"a": 1}', "--to robot-json")],
 )
 def test_a_json_that_is_no_arm_is_refused(tmp_path, text, words):
     with pytest.raises(DataError, match=words):
