@@ -1,0 +1,285 @@
+"""Small sound inputs of every kind that a command reads, made when they are asked for."""
+
+import json
+import shlex
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import foreign_samples as foreign
+import numpy as np
+import rerun as rr
+from commands import turned_poses, visioncal, write_poses, write_table
+from placed import FLANGE_FROM_TOOL, alone, fixture, tool
+from samples import HOME_RAD
+from touched import Job, touched
+from tracked import Tracked, session_of, tracked
+
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    CellOptions,
+    NetworkOptions,
+    RobotAt,
+    charuco_target,
+    checkerboard_target,
+    simulate,
+    simulate_network,
+    wide_camera,
+    write_network,
+    write_session,
+)
+from visioncal.simulation.dynamics import Body, real_dynamics
+from visioncal.simulation.exercise import exercise_session, multi_sine, record
+
+CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
+VIEWS = 7
+PLAN = (
+    "--stops 4 --target charuco_9x6_30mm --camera 1000,1000,640,400 --resolution 1280,800 --cam "
+    "'0 -60 60 0 0 0' --board '500 0 5 180 0 0' --guess-deg 2 --candidates 30"
+)
+DRAWING_MM = np.array([[0, 0, 0], [300, 0, 0], [300, 200, 0], [0, 200, 0], [150, 60, 40]])
+LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
+
+
+class Inputs:
+    """The folder that the sound inputs are in; each is made once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, name: str) -> Path:
+        path = self.folder / name
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            MAKERS[name](self, path)
+        return path
+
+
+def _done(*words: object) -> None:
+    done = visioncal(*words)
+    if done.status not in (0, 3):
+        raise RuntimeError(f"{words}: {done.err}")
+
+
+def _command(*words: str) -> Callable[[Inputs, Path], None]:
+    """A maker: a command with names of inputs in brackets, and what it writes last."""
+
+    def make(inputs: Inputs, path: Path) -> None:
+        _done(*(inputs[it[1:-1]] if it.startswith("[") else it for it in words), path)
+
+    return make
+
+
+def _board(_: Inputs, path: Path) -> None:
+    write_session(simulate(CellOptions(views=VIEWS, camera=CAMERA, state_intrinsics=False)), path)
+
+
+def _pairs(_: Inputs, path: Path) -> None:
+    _done("simulate", path, "--no-images", "--views", 12)
+    # The text of a truth beside it would be nobody's input.
+    path.with_name(path.name + ".truth.json").unlink()
+
+
+def _seen(_: Inputs, path: Path) -> None:
+    """Corners that were found elsewhere, and no image."""
+    cell = simulate(CellOptions(views=10, camera=CAMERA))
+    write_session(cell, path)
+    session = Session.load(path)
+    shutil.rmtree(path)
+    replace(session, views=tuple(replace(it, image="") for it in session.views)).save(path)
+    rows = [
+        [it.view, point, *map(repr, px)]
+        for it in cell.corners
+        for point, px in zip(it.ids.tolist(), it.px.tolist(), strict=True)
+    ]
+    write_table(path / "corners.csv", ("view", "point", "u_px", "v_px"), rows)
+
+
+def _arm(_: Inputs, path: Path) -> None:
+    _done(
+        "simulate", path, "--no-images", "--views", 30, "--arm-sigma-mm", 0.5, "--arm-sigma-mrad", 1
+    )
+    path.with_name(path.name + ".truth.json").unlink()
+
+
+def _sweep(_: Inputs, path: Path) -> None:
+    _done("simulate", path, "--sweep")
+    path.with_name(path.name + ".truth.json").unlink()
+
+
+def _warm(_: Inputs, path: Path) -> None:
+    _done("simulate", path, "--warm-up")
+    path.with_name(path.name + ".truth.json").unlink()
+
+
+def _tracked(_: Inputs, path: Path) -> None:
+    session_of(tracked(Tracked(stops=20))).save(path)
+
+
+def _network(_: Inputs, path: Path) -> None:
+    plain = replace(checkerboard_target(), name="6x5", columns=6, rows=5)
+    cameras = (
+        CameraAt("left", place_m=(0.0, -0.5, 0.9), camera=CAMERA),
+        CameraAt("right", place_m=(0.1, 0.45, 0.95), camera=CAMERA),
+    )
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
+        cameras=cameras,
+        boards=(
+            BoardAt("plate_a", "a", target=plain),
+            BoardAt("plate_b", "b", target=replace(charuco_target(), name="5x4", columns=5, rows=4)),
+        ),
+        stops=6,
+    )
+    write_network(simulate_network(options), path)
+    path.with_name(path.name + ".truth.json").unlink()
+
+
+def _motions(_: Inputs, path: Path) -> None:
+    rng = np.random.default_rng(0)
+    built, seconds = real_dynamics("ur10e", rng), {"excite": 5.0, "check": 4.0}
+    done = {name: multi_sine(6, rng, seconds=it) for name, it in seconds.items()}
+    exercise_session(
+        "ur10e", {name: record(built, it, rng, None) for name, it in done.items()}
+    ).save(path)
+
+
+def _loaded(_: Inputs, path: Path) -> None:
+    rng = np.random.default_rng(0)
+    built = real_dynamics("ur10e", rng).carrying(LOAD)
+    run = record(built, multi_sine(6, rng, seconds=5.0), rng, None)
+    exercise_session("ur10e", {"loaded": run}).save(path)
+
+
+def _touches(_: Inputs, path: Path) -> None:
+    made = touched(Job(axes=3), 1).touches
+    write_poses(path, made.base_from_flange, {"kind": list(made.kinds)})
+
+
+def _features(_: Inputs, path: Path) -> None:
+    places = 1e-3 * np.array([[0, 0, 0], [250, 0, 0], [300, 0, 0], [100, 200, 0], [200, 150, 0]])
+    rng = np.random.default_rng(2)
+    poses = turned_poses(rng, places + [0.5, 0.1, 0.0], FLANGE_FROM_TOOL[:3, 3], np.eye(3))
+    write_poses(path, poses, {"kind": ["origin", "x", "x", "xy", "xy"]})
+
+
+def _points(_: Inputs, path: Path) -> None:
+    places = 1e-3 * DRAWING_MM + [0.5, 0.1, 0.0]
+    poses = turned_poses(
+        np.random.default_rng(3), places, FLANGE_FROM_TOOL[:3, 3], np.eye(3)
+    )
+    write_poses(path, poses, {"point": [f"P{it}" for it in range(len(poses))]})
+
+
+def _drawing(_: Inputs, path: Path) -> None:
+    names = [f"P{it}" for it in range(len(DRAWING_MM))]
+    write_table(path, ("x_mm", "y_mm", "z_mm"), DRAWING_MM.tolist(), {"point": names})
+
+
+def _targets(_: Inputs, path: Path) -> None:
+    q = HOME_RAD + np.random.default_rng(1).uniform(-0.3, 0.3, (6, 6))
+    columns = {f"q{at + 1}_rad": q[:, at].tolist() for at in range(6)}
+    write_poses(path, load_robot("ur10e").base_from_flange(q), columns)
+
+
+def _frames(_: Inputs, path: Path) -> None:
+    alone(tool(), fixture()).save(path)
+
+
+def _packaged(name: str) -> Callable[[Inputs, Path], None]:
+    return lambda _, path: path.write_bytes((files("visioncal") / name).read_bytes()) and None
+
+
+def _target(_: Inputs, path: Path) -> None:
+    path.write_text(
+        'kind = "charuco"\ncolumns = 9\nrows = 6\nsquare_m = 0.03\nsquare_sigma_m = 1e-05\n'
+        'marker_m = 0.022\ndictionary = "DICT_5X5_100"\nlegacy = false\n'
+    )
+
+
+def _photo(inputs: Inputs, path: Path) -> None:
+    shutil.copyfile(inputs["board"] / "images" / "000.png", path)
+
+
+def _pictures(inputs: Inputs, path: Path) -> None:
+    shutil.copytree(inputs["board"] / "images", path)
+
+
+def _others_rrd(_: Inputs, path: Path) -> None:
+    """A recording of another program."""
+    stream = rr.RecordingStream("another", recording_id="another")
+    stream.save(path)
+    stream.log("world/points", rr.Points3D([[0, 0, 0], [1, 1, 1]]))
+    stream.flush()
+    stream.disconnect()
+
+
+def _format_of_old(_: Inputs, path: Path) -> None:
+    shutil.copyfile(Path(__file__).parent / "data" / "recording_format_1.rrd", path)
+
+
+def _foreign(name: str) -> Callable[[Inputs, Path], None]:
+    """A recording in the form of others; a file of a folder of its own."""
+
+    def make(_: Inputs, path: Path) -> None:
+        (foreign.RECORDINGS | foreign.MORE_RECORDINGS)[name](path)
+
+    return make
+
+
+def _oak(inputs: Inputs, path: Path) -> None:
+    _done("export", inputs["board_out"], "--to", "oak", "-o", path)
+
+
+def _lens(inputs: Inputs, path: Path) -> None:
+    _done("export", inputs["board_out"], "--to", "camera-info", "-o", path)
+
+
+def _dh_json(inputs: Inputs, path: Path) -> None:
+    path.write_text(json.dumps(load_robot("ur10e").document))
+    del inputs
+
+
+MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
+    "board": _board,
+    "board.rrd": _command("convert", "[board]"),
+    "board_out": _command("calibrate", "[board]", "-o"),
+    "pairs": _pairs,
+    "pairs.rrd": _command("convert", "[pairs]"),
+    "out": _command("calibrate", "[pairs]", "-o"),
+    "seen": _seen,
+    "arm": _arm,
+    "arm_out": _command("calibrate", "[arm]", "-o"),
+    "sweep": _sweep,
+    "warm": _warm,
+    "warm_out": _command("calibrate", "[warm]", "-o"),
+    "tracked": _tracked,
+    "network": _network,
+    "network_out": _command("align", "[network]", "-o"),
+    "motions": _motions,
+    "loaded": _loaded,
+    "dynamics_out": _command("dynamics", "identify", "[motions]", "-o"),
+    "plan": _command("plan", "ur5e", *shlex.split(PLAN), "-o"),
+    "touches.csv": _touches,
+    "features.csv": _features,
+    "points.csv": _points,
+    "drawing.csv": _drawing,
+    "targets.csv": _targets,
+    "frames.json": _frames,
+    "policy.toml": _packaged("verification/policy.toml"),
+    "arm.toml": _packaged("robots/ur10e.toml"),
+    "arm.json": _dh_json,
+    "arm.urdf": _command("export", "[arm_out]", "--to", "robot-urdf", "-o"),
+    "target.toml": _target,
+    "photo.png": _photo,
+    "pictures": _pictures,
+    "another.rrd": _others_rrd,
+    "old.rrd": _format_of_old,
+    "oak.json": _oak,
+    "lens.yaml": _lens,
+} | {f"foreign/{it}": _foreign(it) for it in (*foreign.RECORDINGS, *foreign.MORE_RECORDINGS)}
