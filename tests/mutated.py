@@ -15,7 +15,7 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -27,7 +27,7 @@ from unittest.mock import patch
 
 import typer
 from mutators import mutate
-from sound_inputs import MAKERS, Inputs
+from sound_inputs import MAKERS, TYPED, Inputs
 
 from visioncal import viewer
 from visioncal.cli import app as application
@@ -39,6 +39,7 @@ MOST_BYTES = 2 * 1024**3
 _MOST_LETTERS = 4000
 # A process is replaced after so many mutants, so that what one leaves behind is not another's.
 _MUTANTS_EACH = 150
+_NAMED = re.compile(r"\[(.+?)\]")
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Reading:
             where nothing is, and [name] another sound input.
         typed: What is typed into it.
         is_kept: Whether what it had written before it failed stays, on purpose.
+        sound: The exit status while nothing is broken.
     """
 
     command: str
@@ -59,42 +61,42 @@ class Reading:
     words: str
     typed: str = ""
     is_kept: bool = False
+    sound: int = 0
 
 
 def _each(command: str, words: str, *inputs: str) -> tuple[Reading, ...]:
     return tuple(Reading(command, it, words) for it in inputs)
 
 
-# What reads no file of the user's: it makes its own session, or takes it from a robot.
-READS_NOTHING = ("demo", "rehearse", "simulate")
-_PLAN = (
-    "-o OUT --stops 3 --candidates 20 --guess-deg 2 --cam '0 -60 60 0 0 0' --board '500 0 5 180 0 "
-    "0' --resolution 1280,800"
-)
-_LENS = "--camera 1000,1000,640,400 --target charuco_9x6_30mm"
+# What reads no file of the user's, or only once a robot has answered.
+READS_NOTHING = ("demo", "rehearse", "simulate", "dynamics record")
+_FEW = "-o OUT --candidates 20"
+_PLAN = f"{_FEW} --stops 3 --guess-deg 2 --cam '0 -60 60 0 0 0' --board '500 0 5 180 0 0'"
+_LENS = "--camera 1000,1000,640,400 --resolution 1280,800"
 _ROBOT_COLUMNS = "--mount eye-in-hand --robot-key X,Y,Z,A,B,C --robot-form kuka --camera-key " \
     "cam_x,cam_y,cam_z,cam_qx,cam_qy,cam_qz,cam_qw"  # fmt: skip
 _HAND = "IT NEW --mount eye-in-hand"
 _SHOTS = f"IT NEW --mount eye-in-hand --target {'charuco_5x7_36.195mm_18.256mm_DICT_6X6_250'} " \
     "--robot-key x,y,z,qw,qx,qy,qz"  # fmt: skip
-_TYPED = "".join(f"\np[0.{it}, -0.3, 0.5, 3.1, 0.{it}, 0.0]\n\n" for it in range(1, 8)) + "q\n"
+_STOOD = "--pose 0.5,0.1,0.4,0,1,0,0"
 _BODY = "--mass-kg 2.8 --com-mm 20,-30,80"
 
 READINGS: tuple[Reading, ...] = (
-    *_each("calibrate", "IT -o OUT", "board", "board", "pairs", "pairs", "seen", "arm", "sweep"),
-    *_each("calibrate", "IT -o OUT", "warm", "tracked", "network", "board.rrd", "pairs.rrd"),
+    *_each("calibrate", "IT -o OUT", "board", "board", "held", "pairs", "pairs", "arm", "sweep"),
+    *_each("calibrate", "IT -o OUT", "warm", "tracked", "board.rrd", "pairs.rrd"),
     Reading("calibrate", "pairs", "IT -o OUT --json"),
     *_each("align", "IT -o OUT", "network", "network", "pairs"),
     *_each("report", "IT -o OUT/report.html", "out", "board_out", "network_out", "warm_out"),
     Reading("report", "arm_out", "IT/calibration.json -o OUT/report.html"),
     Reading("verify", "pairs", "IT --against [out] -o NEW"),
     Reading("verify", "board", "IT --against [board_out]"),
-    *_each("verify", "[pairs] --against IT -o NEW", "out", "arm_out"),
+    Reading("verify", "out", "[pairs] --against IT -o NEW"),
+    Reading("verify", "arm_out", "[pairs] --against IT -o NEW", sound=3),
     Reading("verify", "policy.toml", "[pairs] --against [out] --policy IT"),
     *_each("diff", "IT [out]", "out", "arm_out"),
     Reading("diff", "board_out", "[board_out] IT --json"),
-    *_each("convert", "IT NEW", "board", "pairs", "seen", "sweep", "network", "motions"),
-    *_each("convert", "IT NEW.rrd", "board", "pairs", "tracked", "network", "plan"),
+    *_each("convert", "IT NEW", "board", "pairs", "sweep", "network", "motions"),
+    *_each("convert", "IT NEW.rrd", "board", "pairs", "tracked", "network", "held"),
     *_each("convert", "IT NEW", "board.rrd", "pairs.rrd", "foreign/industrial"),
     Reading("convert", "foreign/kinematics", "IT/measurements.yaml NEW"),
     *_each("convert", _HAND, "foreign/visp", "foreign/views_json"),
@@ -112,10 +114,14 @@ READINGS: tuple[Reading, ...] = (
     ),
     Reading("convert", "lens.yaml", f"[foreign/images_and_table] {_SHOTS[3:]} --intrinsics IT"),
     Reading("convert", "target.toml", "[foreign/zivid] NEW --mount eye-in-hand --target IT"),
-    Reading("convert", "arm.toml", "[foreign/easy_handeye]/cell.samples NEW --mount eye-in-hand "
-            "--robot-model IT"),  # fmt: skip
-    *_each("export", "IT --to ros -o OUT/pose.yaml", "out", "network_out"),
-    Reading("export", "board_out", "IT --to kalibr"),
+    Reading(
+        "convert",
+        "arm.toml",
+        "[foreign/easy_handeye]/cell.samples NEW --mount eye-in-hand --robot-model IT",
+    ),
+    Reading("export", "out", "IT --to ros -o OUT/pose.yaml"),
+    Reading("export", "network_out", "IT --to ros --edge all -o OUT/poses.yaml"),
+    Reading("export", "board_out", "IT --to camera-info"),
     Reading("export", "board_out", "IT --to opencv"),
     *_each("export", "IT --to robot-urdf", "arm_out", "dynamics_out"),
     Reading("export", "arm_out", "IT --to robot-dh --convention standard"),
@@ -126,54 +132,81 @@ READINGS: tuple[Reading, ...] = (
     Reading("tcp", "touches.csv", "IT -o OUT/frames.json --json"),
     *_each("tcp", "[touches.csv] -c IT", "out", "board_out"),
     Reading("tcp", "frames.json", "[touches.csv] -o IT --name gripper"),
-    *_each("tcp", "[targets.csv] --joint-key q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad "
-           "--robot-model IT -o NEW.json", "arm.toml", "arm.urdf", "arm.json"),  # fmt: skip
-    Reading("tcp", "board", "IT -c [board_out] -o OUT/frames.json"),
+    *_each("tcp", "[joints.csv] --robot-model IT -o NEW.json", "arm.toml", "arm.urdf", "arm.json"),
+    Reading("tcp", "joints.csv", "IT --robot-model ur10e -c OUT"),
+    Reading("tcp", "held", "IT -c [held_out] -o OUT/frames.json"),
     *_each("fixture", "IT --tool [frames.json] -c OUT", "features.csv"),
     Reading("fixture", "points.csv", "IT --cad [drawing.csv] --tool [frames.json] -o OUT/f.json"),
-    Reading("fixture", "drawing.csv", "[points.csv] --cad IT --tool none -o OUT/f.json"),
+    Reading("fixture", "drawing.csv", "[points.csv] --cad IT --tool [frames.json] -o OUT/f.json"),
     Reading("fixture", "frames.json", "[features.csv] --tool IT -c OUT"),
     Reading("fixture", "out", "[features.csv] --tool [frames.json] -c IT"),
     Reading("fixture", "board", "IT -c [board_out] -o OUT/f.json"),
     *_each("locate", "IT -c [board_out]", "board"),
     Reading("locate", "board_out", "[board] -c IT --json"),
-    Reading("locate", "photo.png", "IT -c [board_out] --pose 0.5,0.1,0.4,0,1,0,0"),
-    Reading("locate", "board_out", "--pixel 300,200 --plane z=20 -c IT --pose 0.5,0,0.4,0,1,0,0"),
+    Reading("locate", "photo.png", f"IT -c [board_out] {_STOOD} --target charuco_9x6_30mm"),
+    Reading("locate", "board_out", f"--pixel 300,200 --plane z=20 -c IT {_STOOD}"),
     Reading("locate", "target.toml", "[board] -c [board_out] --target IT"),
     *_each("correct", "IT -c [arm_out] -o OUT/corrected.csv --force", "targets.csv"),
-    *_each("correct", "[targets.csv] -c IT -o NEW.csv", "arm_out", "warm_out", "out"),
-    *_each("plan", f"IT --add 2 {_PLAN}", "board", "pairs"),
-    *_each("plan", f"IT {_PLAN} {_LENS}", "arm.toml", "arm.urdf", "arm.json"),
-    *_each("plan", f"IT {_PLAN}", "board_out", "out"),
-    Reading("plan", "target.toml", f"ur5e {_PLAN} --camera 1000,1000,640,400 --target IT"),
+    *_each("correct", "[targets.csv] -c IT -o NEW.csv", "arm_out"),
+    Reading("correct", "arm_out", "[targets.csv] -c IT -o - --json"),
+    *_each("plan", f"IT --add 2 {_FEW}", "board", "board.rrd"),
+    *_each(
+        "plan", f"IT {_PLAN} {_LENS} --target charuco_9x6_30mm", "arm.toml", "arm.urdf", "arm.json"
+    ),
+    Reading("plan", "board_out", f"IT {_PLAN}"),
+    Reading("plan", "target.toml", f"ur5e {_PLAN} {_LENS} --target IT"),
     *_each("plan", f"ur5e {_PLAN} --target charuco_9x6_30mm --camera IT", "lens.yaml", "board_out"),
-    Reading("record", "pictures", "-o NEW --arm manual --camera folder:IT --target "
-            "charuco_9x6_30mm", _TYPED, is_kept=True),  # fmt: skip
-    Reading("record", "plan", "-o NEW --arm manual --camera folder:[pictures] --plan IT --dry-run"),
-    Reading("record", "plan", "-o NEW --arm manual --camera folder:[pictures] --plan IT", _TYPED,
-            is_kept=True),  # fmt: skip
-    Reading("record", "target.toml", "-o NEW --arm manual --camera folder:[pictures] --target IT",
-            _TYPED, is_kept=True),  # fmt: skip
-    Reading("record", "pairs", "-o IT --resume --arm manual --camera folder:[pictures] --target "
-            "charuco_9x6_30mm", _TYPED, is_kept=True),  # fmt: skip
+    Reading(
+        "record",
+        "pictures",
+        "-o NEW --arm manual --camera folder:IT --target charuco_9x6_30mm",
+        TYPED,
+        is_kept=True,
+    ),
+    Reading(
+        "record",
+        "plan",
+        "-o NEW --arm manual --camera folder:[pictures] --plan IT",
+        TYPED,
+        is_kept=True,
+    ),
+    Reading(
+        "record",
+        "target.toml",
+        "-o NEW --arm manual --camera folder:[pictures] --target IT",
+        TYPED,
+        is_kept=True,
+    ),
+    Reading(
+        "record",
+        "recorded",
+        "-o IT --resume --arm manual --camera folder:[pictures] --target charuco_9x6_30mm",
+        TYPED,
+        is_kept=True,
+        sound=2,
+    ),
     *_each("review", "IT", "out", "plan", "board.rrd"),
     Reading("target make", "target.toml", "IT -o OUT"),
     Reading("target check", "photo.png", "IT"),
-    Reading("target check", "photo.png", "IT -o OUT/seen.toml --json"),
-    *_each("dynamics plan", "IT -o OUT --seconds 0 --duration 4", "arm.toml", "arm.urdf"),
-    Reading("dynamics record", "arm.toml", "NEW --arm ur:127.0.0.1 --robot IT", is_kept=True),
+    Reading("target check", "photo.png", "IT --square-mm 30 -o OUT/seen.toml --json"),
+    *_each(
+        "dynamics plan",
+        "IT -o OUT --seconds 0 --duration 10 --acceleration-deg 400",
+        "arm.toml",
+        "arm.urdf",
+    ),
     *_each("dynamics identify", "IT -o OUT", "motions", "motions"),
     Reading("dynamics validate", "motions", "IT --against [dynamics_out]"),
     Reading("dynamics validate", "dynamics_out", "[motions] --against IT"),
     Reading("dynamics payload", "loaded", "IT --against [dynamics_out]"),
     Reading("dynamics payload", "dynamics_out", "[loaded] --against IT --json"),
-    Reading("dynamics gains", "motions", f"IT --loaded [loaded] {_BODY}"),
-    Reading("dynamics gains", "loaded", f"[motions] --loaded IT {_BODY}"),
+    Reading("dynamics gains", "currents/empty", f"IT --loaded [currents/loaded] {_BODY}"),
+    Reading("dynamics gains", "currents/loaded", f"[currents/empty] --loaded IT {_BODY}"),
 )
 # What a sound input may be exchanged with.
-EXCHANGED = ("board", "pairs", "out", "board.rrd", "another.rrd", "old.rrd", "touches.csv",
-             "frames.json", "target.toml", "photo.png", "arm.toml", "plan", "policy.toml",
-             "dynamics_out", "network_out", "arm.json")  # fmt: skip
+EXCHANGED = ("pairs", "out", "board.rrd", "another.rrd", "old.rrd", "touches.csv", "frames.json",
+             "target.toml", "photo.png", "arm.toml", "plan", "policy.toml", "dynamics_out",
+             "network_out", "arm.json")  # fmt: skip
 
 
 def commands(app: typer.Typer = application.app, before: str = "") -> Iterator[str]:
@@ -199,6 +232,7 @@ class Ended:
         faults: What must not be.
         seconds: How long it took.
         peak_bytes: Most memory, of the whole process.
+        notes: What libraries wrote past the command.
     """
 
     number: int
@@ -210,6 +244,7 @@ class Ended:
     faults: tuple[str, ...]
     seconds: float
     peak_bytes: int
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         words = f"{self.number}: {self.reading.command} {self.reading.words} [{self.reading.input}]"
@@ -218,20 +253,38 @@ class Ended:
 
 def mutant(number: int, seed: int, readings: Sequence[Reading]) -> tuple[Reading, random.Random]:
     """Which reading a mutant is of, and the chance that breaks its input."""
-    return readings[number % len(readings)], random.Random(f"{seed}/{number}")  # noqa: S311
+    return readings[number % len(readings)], random.Random(f"{seed}/{number}")
 
 
 def run_mutant(
-    number: int, seed: int, readings: Sequence[Reading], inputs: Inputs, folder: Path
+    number: int,
+    seed: int,
+    readings: Sequence[Reading],
+    inputs: Inputs,
+    folder: Path,
+    *,
+    told: Callable[[tuple[str, str]], None] = lambda _: None,
 ) -> Ended:
-    """Breaks an input, calls the command on it, and looks at what came of it."""
+    """Breaks an input, calls the command on it, and looks at what came of it.
+
+    Args:
+        number: The mutant's; a negative one has its input left sound.
+        seed: Of all mutants.
+        readings: What is called in turn.
+        inputs: The sound ones.
+        folder: Where the broken one, and what is written, are for a while.
+        told: Takes the kind of what is broken, and what was done to it, before the call.
+    """
     reading, chance = mutant(number, seed, readings)
-    place = folder / f"{number:05d}"
+    place = folder / f"{os.getpid()}-{number}"
     place.mkdir(parents=True)
     it, out = place / Path(reading.input).name, place / "earlier"
     _copy(inputs[reading.input], it)
     _copy(inputs["out"], out)
-    kind, change = mutate(it, chance, [inputs[name] for name in EXCHANGED])
+    broken = ("none", "sound")
+    if number >= 0:
+        broken = mutate(it, chance, [inputs[name] for name in exchanged(readings)])
+    told(broken)
     words = [*reading.command.split(), *_words(reading, it, out, place / "new", inputs)]
     before = digests(place)
     done, seconds, peak = _timed(words, reading.typed)
@@ -244,9 +297,13 @@ def run_mutant(
         faults += [f"status 2 changed {', '.join(changed[:5])}"] if changed else []
     faults += _not_json(place, before) if done.status in (0, 3) else []
     shutil.rmtree(place)
-    return Ended(
-        number, reading, kind, change, done.status, done.message, tuple(faults), seconds, peak
-    )
+    return Ended(number, reading, *broken, done.status, done.message, tuple(faults), seconds, peak)
+
+
+def exchanged(readings: Sequence[Reading]) -> list[str]:
+    """Names what a broken input may be exchanged with, of what is there anyhow."""
+    there = {it.input for it in readings} | {"another.rrd", "old.rrd"}
+    return [it for it in EXCHANGED if it in there]
 
 
 def _copy(source: Path, dest: Path) -> None:
@@ -262,7 +319,7 @@ def _words(reading: Reading, it: Path, out: Path, new: Path, inputs: Inputs) -> 
     for word in shlex.split(reading.words):
         for name, path in places.items():
             word = re.sub(rf"\b{name}\b", str(path), word)  # noqa: PLW2901 - one after the other
-        words.append(re.sub(r"\[(.+?)\]", lambda found: str(inputs[found[1]]), word))
+        words.append(_NAMED.sub(lambda found: str(inputs[found[1]]), word))
     return words
 
 
@@ -382,7 +439,8 @@ def _unclear(
 class _Worker:
     process: BaseProcess
     pipe: Connection
-    number: int = -1
+    number: int | None = None
+    broken: tuple[str, str] = ("?", "?")
     begun: float = 0.0
     done: int = 0
     most: int = 0
@@ -398,11 +456,11 @@ def _work(
         os.dup2(file.fileno(), 2)
     said = 0
     while (number := pipe.recv()) is not None:
-        ended = run_mutant(number, seed, readings, Inputs(inputs), folder)
+        ended = run_mutant(number, seed, readings, Inputs(inputs), folder, told=pipe.send)
         new = words.read_bytes()[said:].decode("utf-8", errors="replace")
         said += len(new.encode())
         if new.strip():
-            ended = replace(ended, faults=(*ended.faults, f"a library said: {new[:300]}"))
+            ended = replace(ended, notes=(new[:300],))
         pipe.send(ended)
 
 
@@ -427,9 +485,10 @@ def walk(
         How they ended, as they do.
     """
     inputs, places = Inputs(folder / "sound"), folder / "places"
-    for name in {it.input for it in readings} | {*EXCHANGED, "out"}:
-        inputs[name]
-    for name in {it for reading in readings for it in re.findall(r"\[(.+?)\]", reading.words)}:
+    for reading in readings:
+        for name in ("out", reading.input, *_NAMED.findall(reading.words)):
+            inputs[name]
+    for name in exchanged(readings):
         inputs[name]
     places.mkdir(parents=True, exist_ok=True)
     waiting = list(reversed(numbers))
@@ -443,7 +502,7 @@ def walk(
         return _Worker(process, here)
 
     with _ended([start() for _ in range(min(processes, len(numbers)))]) as workers:
-        while waiting or any(it.number >= 0 for it in workers):
+        while waiting or any(it.number is not None for it in workers):
             for at, worker in enumerate(workers):
                 ended = _looked_at(worker, seed, readings)
                 if ended is not None:
@@ -451,7 +510,7 @@ def walk(
                 if not worker.process.is_alive() or worker.done >= _MUTANTS_EACH:
                     worker.process.kill()
                     workers[at] = worker = start()  # noqa: PLW2901 - replaced
-                if worker.number < 0 and waiting:
+                if worker.number is None and waiting:
                     worker.number, worker.begun, worker.most = waiting.pop(), time.monotonic(), 0
                     worker.pipe.send(worker.number)
             time.sleep(0.005)
@@ -469,21 +528,23 @@ def _ended(workers: list[_Worker]) -> Iterator[list[_Worker]]:
 
 def _looked_at(worker: _Worker, seed: int, readings: Sequence[Reading]) -> Ended | None:
     """How a worker's mutant ended, if it did; it is killed where it goes beyond its limits."""
-    if worker.number < 0:
+    if worker.number is None:
         return None
     if worker.pipe.poll():
         try:
-            ended: Ended = worker.pipe.recv()
+            ended = worker.pipe.recv()
         except EOFError:
             return _killed(worker, seed, readings, "the process died")
-        worker.number, worker.done = -1, worker.done + 1
+        if not isinstance(ended, Ended):
+            worker.broken, worker.begun = ended, time.monotonic()
+            return None
+        worker.number, worker.done = None, worker.done + 1
         over = ended.seconds > LONGEST_S or ended.peak_bytes > MOST_BYTES
         return replace(ended, faults=(*ended.faults, "beyond its limits")) if over else ended
     worker.most = max(worker.most, _memory(worker.process.pid or 0, "VmHWM"))
     if worker.most > MOST_BYTES:
         return _killed(worker, seed, readings, f"{worker.most / 1e9:.1f} GB")
-    # The first mutant waits for the libraries.
-    if time.monotonic() - worker.begun > LONGEST_S + (30.0 if worker.done == 0 else 0.0):
+    if time.monotonic() - worker.begun > LONGEST_S:
         return _killed(worker, seed, readings, f"longer than {LONGEST_S:.0f} s")
     return None
 
@@ -491,10 +552,11 @@ def _looked_at(worker: _Worker, seed: int, readings: Sequence[Reading]) -> Ended
 def _killed(worker: _Worker, seed: int, readings: Sequence[Reading], why: str) -> Ended:
     worker.process.kill()
     worker.process.join()
-    number, worker.number = worker.number, -1
+    number, worker.number = worker.number or 0, None
     reading, _ = mutant(number, seed, readings)
     seconds = time.monotonic() - worker.begun
-    return Ended(number, reading, "?", "?", -1, "", (f"killed: {why}",), seconds, worker.most)
+    faults = (f"killed: {why}",)
+    return Ended(number, reading, *worker.broken, -1, "", faults, seconds, worker.most)
 
 
 def missing_commands() -> tuple[str, ...]:
@@ -506,6 +568,6 @@ def missing_commands() -> tuple[str, ...]:
 def unknown_inputs() -> set[str]:
     """Inputs that nobody makes."""
     named = {it.input for it in READINGS}.union(
-        *(re.findall(r"\[(.+?)\]", it.words) for it in READINGS), EXCHANGED
+        *(_NAMED.findall(it.words) for it in READINGS), EXCHANGED
     )
     return named - set(MAKERS)

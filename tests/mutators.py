@@ -106,7 +106,9 @@ def row_doubled(data: bytes, chance: Chance) -> bytes:
 def rows_lost(data: bytes, chance: Chance) -> bytes:
     rows = _rows(data)
     kept = chance.choice([0, 1, 2, 3, 4, len(rows) - 1])
-    return _joined([rows[it] for it in sorted(chance.sample(range(len(rows)), min(kept, len(rows))))])
+    return _joined(
+        [rows[it] for it in sorted(chance.sample(range(len(rows)), min(kept, len(rows))))]
+    )
 
 
 def columns_swapped(data: bytes, chance: Chance) -> bytes:
@@ -170,7 +172,14 @@ def toml_table(data: bytes, chance: Chance) -> bytes:
     heads = re.findall(rb"^\[+([^\]]+)\]+", data, re.MULTILINE) or [b"camera"]
     head = chance.choice([*heads, b"camera", b"robot", b"need", b"prior.flange_from_cam", b"clock"])
     new = chance.choice(
-        [b"[%s]\n", b"[%s.x]\n", b"[[%s]]\n", b"%s = 1\n", b"[%s]\nname = 1\n", b"[%s]\nz_m = nan\n"]
+        [
+            b"[%s]\n",
+            b"[%s.x]\n",
+            b"[[%s]]\n",
+            b"%s = 1\n",
+            b"[%s]\nname = 1\n",
+            b"[%s]\nz_m = nan\n",
+        ]
     )
     line = new % head
     return line + data if chance.random() < 0.5 else data + b"\n" + line
@@ -240,7 +249,11 @@ def json_value(data: bytes, chance: Chance) -> bytes:
 
 def json_number(data: bytes, chance: Chance) -> bytes:
     """A number of more digits than a float has, or of none."""
-    return damage.odd_number(data, chance) if chance.random() < 0.5 else damage.huge_number(data, chance)
+    return (
+        damage.odd_number(data, chance)
+        if chance.random() < 0.5
+        else damage.huge_number(data, chance)
+    )
 
 
 def json_doubled_key(data: bytes, chance: Chance) -> bytes:
@@ -400,7 +413,7 @@ _SUFFIXES = {
     ".png": "image",
     ".jpg": "image",
 }
-# Shares of what is broken: a file's place in its folder, and what it holds by the rules of its kind.
+# How often a file itself is broken, and else how often by the rules of what it is.
 _AS_FILE, _BY_KIND = 0.15, 0.7
 
 

@@ -1,12 +1,14 @@
 """Small sound inputs of every kind that a command reads, made when they are asked for."""
 
-import json
+import io
 import shlex
 import shutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from unittest.mock import patch
 
 import foreign_samples as foreign
 import numpy as np
@@ -14,11 +16,11 @@ import rerun as rr
 from commands import turned_poses, visioncal, write_poses, write_table
 from placed import FLANGE_FROM_TOOL, alone, fixture, tool
 from samples import HOME_RAD
-from touched import Job, touched
+from scipy.optimize import least_squares
+from touched import TIP, Job, touched
 from tracked import Tracked, session_of, tracked
 
 from visioncal.robot import load_robot
-from visioncal.session import Session
 from visioncal.simulation import (
     BoardAt,
     CameraAt,
@@ -34,7 +36,8 @@ from visioncal.simulation import (
     write_session,
 )
 from visioncal.simulation.dynamics import Body, real_dynamics
-from visioncal.simulation.exercise import exercise_session, multi_sine, record
+from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record
+from visioncal.types import FloatArray
 
 CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
 VIEWS = 7
@@ -43,6 +46,9 @@ PLAN = (
     "'0 -60 60 0 0 0' --board '500 0 5 180 0 0' --guess-deg 2 --candidates 30"
 )
 DRAWING_MM = np.array([[0, 0, 0], [300, 0, 0], [300, 200, 0], [0, 200, 0], [150, 60, 40]])
+PLACE_M = np.array([0.5, 0.1, 0.0])
+# What is typed to `record`: take it, its pose, and yes, that is what it means.
+TYPED = "".join(f"\np[0.{it}, -0.3, 0.5, 3.1, 0.{it}, 0.0]\n\n" for it in range(1, 8)) + "q\n"
 LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
 
 
@@ -85,19 +91,10 @@ def _pairs(_: Inputs, path: Path) -> None:
     path.with_name(path.name + ".truth.json").unlink()
 
 
-def _seen(_: Inputs, path: Path) -> None:
-    """Corners that were found elsewhere, and no image."""
-    cell = simulate(CellOptions(views=10, camera=CAMERA))
-    write_session(cell, path)
-    session = Session.load(path)
-    shutil.rmtree(path)
-    replace(session, views=tuple(replace(it, image="") for it in session.views)).save(path)
-    rows = [
-        [it.view, point, *map(repr, px)]
-        for it in cell.corners
-        for point, px in zip(it.ids.tolist(), it.px.tolist(), strict=True)
-    ]
-    write_table(path / "corners.csv", ("view", "point", "u_px", "v_px"), rows)
+def _held(_: Inputs, path: Path) -> None:
+    """A board on the flange, before a camera that stands."""
+    options = CellOptions(mount="eye-to-hand", views=VIEWS)
+    write_session(simulate(options), path)
 
 
 def _arm(_: Inputs, path: Path) -> None:
@@ -132,7 +129,9 @@ def _network(_: Inputs, path: Path) -> None:
         cameras=cameras,
         boards=(
             BoardAt("plate_a", "a", target=plain),
-            BoardAt("plate_b", "b", target=replace(charuco_target(), name="5x4", columns=5, rows=4)),
+            BoardAt(
+                "plate_b", "b", target=replace(charuco_target(), name="5x4", columns=5, rows=4)
+            ),
         ),
         stops=6,
     )
@@ -141,19 +140,28 @@ def _network(_: Inputs, path: Path) -> None:
 
 
 def _motions(_: Inputs, path: Path) -> None:
-    rng = np.random.default_rng(0)
-    built, seconds = real_dynamics("ur10e", rng), {"excite": 5.0, "check": 4.0}
-    done = {name: multi_sine(6, rng, seconds=it) for name, it in seconds.items()}
-    exercise_session(
-        "ur10e", {name: record(built, it, rng, None) for name, it in done.items()}
-    ).save(path)
+    _exercised(path, {"excite": 5.0, "check": 4.0})
 
 
 def _loaded(_: Inputs, path: Path) -> None:
+    _exercised(path, {"loaded": 5.0}, LOAD)
+
+
+def _currents(load: Body | None) -> Callable[[Inputs, Path], None]:
+    senses = Senses(gains_nm_a=(20.0, 21.0, 16.0, 9.0, 9.5, 8.7))
+    return lambda _, path: _exercised(path, {"excite": 5.0}, load, senses)
+
+
+def _exercised(
+    path: Path, motions: dict[str, float], load: Body | None = None, senses: Senses | None = None
+) -> None:
+    """Motions of so many seconds, by name."""
     rng = np.random.default_rng(0)
-    built = real_dynamics("ur10e", rng).carrying(LOAD)
-    run = record(built, multi_sine(6, rng, seconds=5.0), rng, None)
-    exercise_session("ur10e", {"loaded": run}).save(path)
+    built = real_dynamics("ur10e", rng)
+    built = built if load is None else built.carrying(load)
+    done = {name: multi_sine(6, rng, seconds=it) for name, it in motions.items()}
+    runs = {name: record(built, it, rng, senses) for name, it in done.items()}
+    exercise_session("ur10e", runs).save(path)
 
 
 def _touches(_: Inputs, path: Path) -> None:
@@ -161,18 +169,28 @@ def _touches(_: Inputs, path: Path) -> None:
     write_poses(path, made.base_from_flange, {"kind": list(made.kinds)})
 
 
+def _joints(_: Inputs, path: Path) -> None:
+    """Joint angles at which the tip is at one point, each another way."""
+    robot, rng = load_robot("ur10e"), np.random.default_rng(4)
+
+    def tip(joints: FloatArray) -> FloatArray:
+        return np.asarray(robot.base_from_flange(joints[None])[0, :3] @ np.append(TIP, 1.0))
+
+    starts = HOME_RAD + rng.uniform(-0.4, 0.4, (8, 6))
+    rows = [least_squares(lambda it: tip(it) - tip(HOME_RAD), start).x.tolist() for start in starts]
+    write_table(path, [f"q{it}_rad" for it in range(1, 7)], rows)
+
+
 def _features(_: Inputs, path: Path) -> None:
     places = 1e-3 * np.array([[0, 0, 0], [250, 0, 0], [300, 0, 0], [100, 200, 0], [200, 150, 0]])
     rng = np.random.default_rng(2)
-    poses = turned_poses(rng, places + [0.5, 0.1, 0.0], FLANGE_FROM_TOOL[:3, 3], np.eye(3))
+    poses = turned_poses(rng, places + PLACE_M, FLANGE_FROM_TOOL[:3, 3], np.eye(3))
     write_poses(path, poses, {"kind": ["origin", "x", "x", "xy", "xy"]})
 
 
 def _points(_: Inputs, path: Path) -> None:
-    places = 1e-3 * DRAWING_MM + [0.5, 0.1, 0.0]
-    poses = turned_poses(
-        np.random.default_rng(3), places, FLANGE_FROM_TOOL[:3, 3], np.eye(3)
-    )
+    places = 1e-3 * DRAWING_MM + PLACE_M
+    poses = turned_poses(np.random.default_rng(3), places, FLANGE_FROM_TOOL[:3, 3], np.eye(3))
     write_poses(path, poses, {"point": [f"P{it}" for it in range(len(poses))]})
 
 
@@ -210,6 +228,13 @@ def _pictures(inputs: Inputs, path: Path) -> None:
     shutil.copytree(inputs["board"] / "images", path)
 
 
+def _recorded(inputs: Inputs, path: Path) -> None:
+    """A session that was recorded from typed poses."""
+    words = ["--arm", "manual", "--camera", f"folder:{inputs['pictures']}"]
+    with patch.object(sys, "stdin", io.StringIO(TYPED)):
+        _done("record", "-o", path, *words, "--target", "charuco_9x6_30mm")
+
+
 def _others_rrd(_: Inputs, path: Path) -> None:
     """A recording of another program."""
     stream = rr.RecordingStream("another", recording_id="another")
@@ -240,11 +265,6 @@ def _lens(inputs: Inputs, path: Path) -> None:
     _done("export", inputs["board_out"], "--to", "camera-info", "-o", path)
 
 
-def _dh_json(inputs: Inputs, path: Path) -> None:
-    path.write_text(json.dumps(load_robot("ur10e").document))
-    del inputs
-
-
 MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "board": _board,
     "board.rrd": _command("convert", "[board]"),
@@ -252,7 +272,8 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "pairs": _pairs,
     "pairs.rrd": _command("convert", "[pairs]"),
     "out": _command("calibrate", "[pairs]", "-o"),
-    "seen": _seen,
+    "held": _held,
+    "held_out": _command("calibrate", "[held]", "-o"),
     "arm": _arm,
     "arm_out": _command("calibrate", "[arm]", "-o"),
     "sweep": _sweep,
@@ -263,9 +284,12 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "network_out": _command("align", "[network]", "-o"),
     "motions": _motions,
     "loaded": _loaded,
+    "currents/empty": _currents(None),
+    "currents/loaded": _currents(LOAD),
     "dynamics_out": _command("dynamics", "identify", "[motions]", "-o"),
     "plan": _command("plan", "ur5e", *shlex.split(PLAN), "-o"),
     "touches.csv": _touches,
+    "joints.csv": _joints,
     "features.csv": _features,
     "points.csv": _points,
     "drawing.csv": _drawing,
@@ -273,11 +297,12 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "frames.json": _frames,
     "policy.toml": _packaged("verification/policy.toml"),
     "arm.toml": _packaged("robots/ur10e.toml"),
-    "arm.json": _dh_json,
+    "arm.json": _command("export", "[arm_out]", "--to", "robot-json", "-o"),
     "arm.urdf": _command("export", "[arm_out]", "--to", "robot-urdf", "-o"),
     "target.toml": _target,
     "photo.png": _photo,
     "pictures": _pictures,
+    "recorded": _recorded,
     "another.rrd": _others_rrd,
     "old.rrd": _format_of_old,
     "oak.json": _oak,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from visioncal.errors import DataError
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
 
@@ -74,6 +75,16 @@ def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor
     assert "Traceback" not in done.stderr
     assert [path.name for path in out.iterdir()] == ["calibration.json"]
     assert (out / "calibration.json").read_text() == "an earlier result"
+
+
+def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
+    error = DataError(
+        f"model is {'x' * 100_000}; a name is needed.\nLine 2.", culprits=["y" * 9000]
+    )
+    assert len(error.message) < 2100
+    assert error.message.startswith("model is xxx")
+    assert error.message.endswith("xxx; a name is needed.\nLine 2.")
+    assert len(error.culprits[0]) < 2100
 
 
 def test_an_error_as_json_has_its_parts(poor, tmp_path):

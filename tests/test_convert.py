@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from visioncal.cli.app import app
 from visioncal.errors import DataError
 from visioncal.formats import convert
 from visioncal.pipeline import calibrate
+from visioncal.recording import RecordingWriter
 from visioncal.session import Session
 
 
@@ -35,6 +37,16 @@ def test_there_and_back_again(folder: Path, tmp_path: Path) -> None:
     convert(recording, again)
     assert Session.load(recording).digest() == Session.load(folder).digest()
     assert content(again) == content(folder)
+
+
+def test_a_recording_without_a_whole_view_leaves_no_folder(folder: Path, tmp_path: Path) -> None:
+    cut, again = tmp_path / "cut.rrd", tmp_path / "again"
+    empty = replace(Session.load(folder), views=())
+    with RecordingWriter(cut, empty):
+        pass
+    with pytest.raises(DataError, match="no view and no stream"):
+        convert(cut, again)
+    assert not again.exists()
 
 
 def test_a_recording_of_a_recording_and_a_folder_of_a_folder(folder: Path, tmp_path: Path) -> None:

@@ -303,6 +303,13 @@ def test_a_covariance_is_found_where_the_eigenvalues_do_not_converge(monkeypatch
         covariance(np.full((2, 6, 6), np.nan))
 
 
+def test_no_information_at_all_gives_a_finite_covariance():
+    found = covariance(np.stack([np.zeros((6, 6)), np.eye(6)]))
+    assert np.isfinite(found).all()
+    assert found[0].diagonal().min() > 1e12
+    assert found[1] == pytest.approx(np.eye(6))
+
+
 def test_linear_algebra_says_what_it_sees():
     rng = np.random.default_rng(0)
     tall = rng.normal(size=(30, 4)) * [1.0, 1e3, 1e-3, 1.0]

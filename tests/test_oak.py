@@ -388,8 +388,9 @@ def test_the_export_names_the_socket_and_warns_without_the_devices_own():
     assert not any("--onto" in it for it in onto.warnings)
     with pytest.raises(DataError, match="CAM_A to CAM_J"):
         document(source, "oak", Selection(child="cam"))
-    with pytest.raises(DataError, match="no calibration of an OAK"):
+    with pytest.raises(DataError, match="no calibration of an OAK") as error:
         document(source, "oak", Selection(onto="{}"))
+    assert error.value.culprits == ("--onto",)
 
 
 def test_a_rehearsals_camera_goes_through_the_pipeline():

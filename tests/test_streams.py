@@ -66,6 +66,9 @@ def test_a_file_of_windows_is_read_alike() -> None:
         (["stamp_s,q1_rad", "0,1", ",2"], "stamp_s is empty in sample 2"),
         (["stamp_s,q1_rad", "0,1", "1,2,3"], "line 3: it has 3 fields, but the header has 2"),
         (["stamp_s,q1_rad", "0,1", "1,nan"], "line 3, column q1_rad: 'nan' is no finite number"),
+        (["stamp_s,q1_rad", "0,a\rb"], "line 2, column q1_rad: 'a' is no finite number"),
+        (["stamp_s,q1_rad", f"0,{'1' * 200_000}.x"], "line 2: field larger than field limit"),
+        ([f"stamp_s,{'q' * 200_000}", "0,1"], "line 1: field larger than field limit"),
         (["stamp_s,mode", "0,auto"], "line 2, column mode: 'auto'.*numbers alone"),
         (["stamp_s,q2_rad", "0,1"], "lack q1_rad"),
         (["stamp_s,q1_rad,q1_rad", "0,1,1"], "q1_rad is there twice"),
@@ -77,6 +80,12 @@ def test_a_file_of_windows_is_read_alike() -> None:
 def test_what_is_wrong_is_named(lines: list[str], words: str) -> None:
     with pytest.raises(DataError, match=words):
         parsed(*lines)
+
+
+def test_rows_that_are_wrong_are_named_up_to_some() -> None:
+    with pytest.raises(DataError, match="line 11: it has 1 fields") as error:
+        parsed("stamp_s,q1_rad", *["1"] * 1000)
+    assert len(error.value.culprits) == 10
 
 
 def test_a_name_that_leaves_the_folder_is_refused() -> None:

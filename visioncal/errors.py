@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from typing import Self
 
+# What a file says stands in messages as it is, which may be all of a file.
+_MOST_LETTERS = 2000
+
 
 class VisioncalError(Exception):
     """Base of all errors that visioncal raises on purpose.
@@ -14,9 +17,10 @@ class VisioncalError(Exception):
     """
 
     def __init__(self, message: str, *, culprits: Sequence[str] = (), next_step: str = "") -> None:
+        message = "\n".join(map(_shortened, message.split("\n")))
         super().__init__(message)
         self.message = message
-        self.culprits = tuple(culprits)
+        self.culprits = tuple(map(_shortened, culprits))
         self.next_step = next_step
 
     def with_culprits(self, more: Sequence[str]) -> Self:
@@ -33,6 +37,12 @@ class VisioncalError(Exception):
 
     def __str__(self) -> str:
         return f"{self.message} {self.next_step}".strip()
+
+
+def _shortened(line: str) -> str:
+    """A line without the middle of what is longer than anybody reads."""
+    half = _MOST_LETTERS // 2
+    return line if len(line) <= _MOST_LETTERS else f"{line[:half]} ... {line[-half:]}"
 
 
 class DataError(VisioncalError):

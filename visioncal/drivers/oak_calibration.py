@@ -114,10 +114,11 @@ def _read(dai: ModuleType, text: str) -> Handle:
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise DataError(
             f"This is no calibration of an OAK: {error}.",
+            culprits=["--onto"],
             next_step="Save the device's own with CalibrationHandler.eepromToJsonFile.",
         ) from error
     if not cameras:
-        raise DataError("This calibration of an OAK has no cameras.")
+        raise DataError("This calibration of an OAK has no cameras.", culprits=["--onto"])
     return handler
 
 

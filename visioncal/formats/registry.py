@@ -120,8 +120,14 @@ def write_session(session: Session, dest: Path) -> None:
     """Writes a session in the form that the suffix of `dest` tells, and reads it again.
 
     Raises:
-        DataError: `dest` cannot be written, or does not hold the session.
+        DataError: There is nothing in the session, `dest` cannot be written, or does not hold it.
     """
+    if not session.views and not session.streams:
+        raise DataError(
+            " ".join([f"Session {session.name!r} has no view and no stream.", *session.warnings]),
+            culprits=[session.name],
+            next_step="Nothing was written; record it again.",
+        )
     form = _format_for(dest)
     form.write(session, dest)
     if form.read(dest).digest() != session.digest():

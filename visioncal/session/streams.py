@@ -125,7 +125,8 @@ def parse_stream(text: str, label: str) -> Stream:
         DataError: A cell is no number; it is named.
     """
     head, _, body = text.partition("\n")
-    columns = tuple(name.strip() for name in next(csv.reader([head]), []))
+    _, names = next(_rows(head, label, 1), (1, []))
+    columns = tuple(name.strip() for name in names)
     values = _plain_numbers(body, len(columns))
     if values is None:
         values = _numbers(body, columns, label)
@@ -148,11 +149,12 @@ def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
     """Reads rows cell by cell, and names those that are wrong."""
     rows: list[list[float]] = []
     problems: list[str] = []
-    reader = csv.reader(io.StringIO(body))
-    for cells in reader:
-        place = f"{label}, line {reader.line_num + 1}"
+    for line, cells in _rows(body, label, 2):
+        place = f"{label}, line {line}"
         if not any(cell.strip() for cell in cells):
             continue
+        if len(problems) >= _SHOWN_PROBLEMS:
+            break
         if len(cells) != len(columns):
             problems.append(
                 f"{place}: it has {len(cells)} fields, but the header has {len(columns)} columns"
@@ -164,8 +166,6 @@ def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
             for name, cell, value in zip(columns, cells, rows[-1], strict=True)
             if cell.strip() and not np.isfinite(value)
         ]
-        if len(problems) >= _SHOWN_PROBLEMS:
-            break
     if problems:
         raise DataError(
             ".\n".join(problems) + ".",
@@ -173,6 +173,17 @@ def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
             next_step="A stream holds numbers alone; leave other columns out.",
         )
     return np.array(rows, dtype=float).reshape(len(rows), len(columns))
+
+
+def _rows(text: str, label: str, first: int) -> Iterator[tuple[int, list[str]]]:
+    """Yields rows with the number of the line in which they end, the text's first being `first`."""
+    reader = csv.reader(io.StringIO(text, newline=""))
+    try:
+        for cells in reader:
+            yield reader.line_num + first - 1, cells
+    except csv.Error as error:
+        place = f"{label}, line {reader.line_num + first - 1}"
+        raise DataError(f"{place}: {error}.", culprits=[place]) from error
 
 
 def _number(cell: str) -> float:
