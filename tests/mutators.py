@@ -45,6 +45,7 @@ VALUES = (
     [1], [1, 2, 3], [None], ["a"], [[1, 2], [3]], {"a": 1}, {"": None}, [0] * 100_000,
 )  # fmt: skip
 DEEP = 3000
+_NUMBER = re.compile(rb"(?<![\w.-])-?\d+(\.\d+)?(e[+-]?\d+)?(?![\w.])")
 
 
 # --- Tables.
@@ -358,6 +359,22 @@ def text_replaced(data: bytes, chance: Chance) -> bytes:
     return data[: it.start()] + text + data[it.end() :]
 
 
+def number_changed(data: bytes, chance: Chance) -> bytes:
+    """A number of any text by another one of its kind, which passes for one longer."""
+    numbers = list(_NUMBER.finditer(data[:200_000]))
+    if not numbers:
+        return data
+    it = chance.choice(numbers)
+    if b"." in it[0] or b"e" in it[0]:
+        factor = chance.choice([-1.0, 0.0, 1e3, 1e-3, 1e12, 1e-12, 1e150, 1e300, 1e-300])
+        number = repr(float(it[0]) * factor)
+    else:
+        number = str(
+            int(it[0][:300]) * chance.choice([-1, 0, 2, 1000, 10**9]) + chance.choice([0, 1])
+        )
+    return data[: it.start()] + number.encode() + data[it.end() :]
+
+
 ANY: tuple[Bytes, ...] = (
     damage.truncated,
     damage.flipped,
@@ -374,6 +391,8 @@ TEXT: tuple[Bytes, ...] = (
     damage.deep,
     damage.other_encoding,
     text_replaced,
+    number_changed,
+    number_changed,
     marked,
 )
 TABLE: tuple[Bytes, ...] = (
@@ -391,8 +410,23 @@ TABLE: tuple[Bytes, ...] = (
     other_separator,
     other_line_ends,
 )
-TOML: tuple[Bytes, ...] = (toml_value, toml_value, toml_value, toml_table, toml_deep)
-JSON: tuple[Bytes, ...] = (json_value, json_value, json_value, json_number, json_doubled_key)
+TOML: tuple[Bytes, ...] = (
+    toml_value,
+    toml_value,
+    toml_value,
+    number_changed,
+    number_changed,
+    toml_table,
+    toml_deep,
+)
+JSON: tuple[Bytes, ...] = (
+    json_value,
+    json_value,
+    json_value,
+    number_changed,
+    json_number,
+    json_doubled_key,
+)
 IMAGE: tuple[Bytes, ...] = (png_header, other_picture, other_picture, no_picture, png_of_zeros)
 # By what a file is: what is its own, and what befits others as well.
 KINDS: Mapping[str, tuple[tuple[Bytes, ...], tuple[Bytes, ...]]] = {
@@ -437,13 +471,13 @@ def mutate(input_: Path, chance: Chance, others: Sequence[Path]) -> tuple[str, s
     kinds = sorted({kind_of(it) for it in files})
     if chance.random() < _AS_FILE:
         path = chance.choice([input_, chance.choice(files), chance.choice(files)])
-        return "file system", f"{place(path, chance, others)}: {path.name}"
+        return "file system", f"{place(path, chance, others)}: {path.relative_to(input_.parent)}"
     kind = chance.choice(kinds)
     path = chance.choice([it for it in files if kind_of(it) == kind])
     own, common = KINDS[kind]
     mutator = chance.choice(own if chance.random() < _BY_KIND else common)
     path.write_bytes(mutator(path.read_bytes() or b"0", chance))
-    return kind, f"{mutator.__name__}: {path.name}"
+    return kind, f"{mutator.__name__}: {path.relative_to(input_.parent)}"
 
 
 def place(path: Path, chance: Chance, others: Sequence[Path]) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Self
 
 # What a file says stands in messages as it is, which may be all of a file.
-_MOST_LETTERS = 2000
+_MOST_LETTERS, _LEAST_LETTERS = 2000, 300
 
 
 class VisioncalError(Exception):
@@ -17,10 +17,12 @@ class VisioncalError(Exception):
     """
 
     def __init__(self, message: str, *, culprits: Sequence[str] = (), next_step: str = "") -> None:
-        message = "\n".join(map(_shortened, message.split("\n")))
+        lines = message.split("\n")
+        most = max(_MOST_LETTERS // len(lines), _LEAST_LETTERS)
+        message = "\n".join(_shortened(line, most) for line in lines)
         super().__init__(message)
         self.message = message
-        self.culprits = tuple(map(_shortened, culprits))
+        self.culprits = tuple(_shortened(it, _LEAST_LETTERS) for it in culprits)
         self.next_step = next_step
 
     def with_culprits(self, more: Sequence[str]) -> Self:
@@ -39,10 +41,10 @@ class VisioncalError(Exception):
         return f"{self.message} {self.next_step}".strip()
 
 
-def _shortened(line: str) -> str:
-    """A line without the middle of what is longer than anybody reads."""
-    half = _MOST_LETTERS // 2
-    return line if len(line) <= _MOST_LETTERS else f"{line[:half]} ... {line[-half:]}"
+def _shortened(line: str, most: int) -> str:
+    """A line without its middle, where it is longer than anybody reads."""
+    half = most // 2
+    return line if len(line) <= most else f"{line[:half]} ... {line[-half:]}"
 
 
 class DataError(VisioncalError):

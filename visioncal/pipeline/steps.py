@@ -71,9 +71,10 @@ def _read_robot(known: Known) -> Known:
     check_one_of_each(known.session)
     session, document = known.session, known.session.robot_document
     if not session.views:
+        what = "streams and no views" if session.streams else "no views"
         raise DataError(
-            f"session {session.name!r} has streams and no views.",
-            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams],
+            " ".join([f"session {session.name!r} has {what}.", *session.warnings]),
+            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams] or [session.name],
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )

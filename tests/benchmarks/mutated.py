@@ -1,0 +1,107 @@
+"""Broken inputs: how every command that reads files ends on them, in what time and memory.
+
+Small sound inputs of every kind are made, one thing of each is broken by chance (a byte, a row, a
+value, a picture, a file itself), and a command reads it. Each ends within its limits, with a result
+or with one clear refusal that names a culprit, and a refusal leaves what was there as it was.
+
+    PYTHONPATH=tests python tests/benchmarks/mutated.py [--quick] [--seed N] [--processes N]
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from mutated import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
+from mutators import KINDS
+from results import write_section
+
+MUTANTS, QUICK = 2000, 60
+# Reasons that are given less often than once in so many mutants share a row.
+RARE = 250
+_COLUMNS = (*KINDS, "file system")
+_COMMAND = "PYTHONPATH=tests python tests/benchmarks/mutated.py"
+
+
+def reason(message: str) -> str:
+    """A refusal without what is of one input alone."""
+    words = re.sub(r"\S*/[\w./ -]*\w", "FILE", message.strip().partition("\n")[0])
+    words = re.sub(r"'[^']*'|\"[^\"]*\"", "'...'", words)
+    words = re.sub(r"\b[\w-]+\.(csv|toml|json|rrd|urdf|png|ya?ml)\b", "FILE", words)
+    words = re.sub(r"-?\d[\w.]*", "N", words)
+    return re.split(r"[:;.(] ", f"{words} ", maxsplit=2)[0][:90].strip(" .:").replace("|", "/")
+
+
+def by_command(ended: Sequence[Ended]) -> list[str]:
+    """The rows of a table: how often each command ended with 0, 2 and 3, by what was broken."""
+    rows = [
+        f"| command | {' | '.join(_COLUMNS)} | slowest [s] | most memory [MB] |",
+        "| --- |" + " --- |" * len(_COLUMNS) + " ---: | ---: |",
+    ]
+    for command in sorted({it.reading.command for it in ended}):
+        mine = [it for it in ended if it.reading.command == command]
+        cells = []
+        for kind in _COLUMNS:
+            counts = Counter(it.status for it in mine if it.kind == kind)
+            cells.append(", ".join(f"{counts[it]} x {it}" for it in sorted(counts)))
+        slowest = max(it.seconds for it in mine)
+        most = max(it.peak_bytes for it in mine) / 1e6
+        rows.append(f"| {command} | {' | '.join(cells)} | {slowest:.1f} | {most:.0f} |")
+    return rows
+
+
+def reasons(ended: Sequence[Ended]) -> list[str]:
+    """The rows of a table: why inputs were refused."""
+    found = Counter(reason(it.message) for it in ended if it.status == 2)
+    often = [(words, it) for words, it in found.most_common() if it * RARE > len(ended)]
+    rows = ["| refused because | times |", "| --- | ---: |"]
+    rows += [f"| {words} | {it} |" for words, it in often]
+    rest = found.total() - sum(it for _, it in often)
+    return [*rows, f"| {len(found) - len(often)} other reasons | {rest} |"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} mutants, nothing kept.")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    count = QUICK if asked.quick else MUTANTS
+    sound = 0 if asked.quick else len(READINGS)
+    ended: list[Ended] = []
+    with tempfile.TemporaryDirectory() as folder:
+        numbers = range(-sound, count)
+        for it in walk(numbers, Path(folder), seed=asked.seed, processes=asked.processes):
+            ended.append(it)
+            if it.faults or (it.number < 0 and it.status != it.reading.sound):
+                print(it, flush=True)
+    mutants = [it for it in ended if it.number >= 0]
+    wrong = [it for it in ended if it.faults]
+    statuses = Counter(it.status for it in mutants)
+    slowest, largest = max(it.seconds for it in ended), max(it.peak_bytes for it in ended)
+    text = "\n".join(
+        [
+            f"{len(mutants)} mutants of {len(READINGS)} readings, seed {asked.seed}: "
+            + ", ".join(f"{statuses[it]} with exit status {it}" for it in sorted(statuses))
+            + f"; {len(wrong)} with a traceback, another status, an earlier output that changed, "
+            "an unclear refusal, JSON that is none, or beyond the limits of "
+            f"{LONGEST_S:.0f} s and {MOST_BYTES / 1024**3:.0f} GiB. The slowest took "
+            f"{slowest:.1f} s, the largest process had {largest / 1e6:.0f} MB, all libraries "
+            "included. A cell has how often a command ended with a status, by what was broken.",
+            "",
+            *by_command(mutants),
+            "",
+            *reasons(mutants),
+        ]
+    )
+    print(text)
+    if not asked.quick:
+        write_section("Broken inputs", _COMMAND, text)
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()
