@@ -212,7 +212,7 @@ def _broken(value: object, chance: Chance) -> object:
 
 def _replaced(value: object, chance: Chance) -> object:
     if isinstance(value, float) and chance.random() < 0.5:
-        return chance.choice([-value, 1e3 * value, 1e12 * value, str(value), [value], round(value)])
+        return chance.choice([-value, 1e3 * value, 1e12 * value, str(value), [value], value // 1])
     if chance.random() < 0.1:
         deep: object = value
         for _ in range(chance.choice([1, 100, 900])):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.document import camera_document, read_camera
 from visioncal.calibration.edge import Edge, edge_document, read_array, read_edge
+from visioncal.calibration.forms import CAMERA, VERDICT, Form, check
 from visioncal.calibration.frame import present
 from visioncal.calibration.parts import CameraResult, Verdict, VerdictStatus
 from visioncal.documents import parse_stored
@@ -23,6 +24,33 @@ from visioncal.version import __version__
 
 SCHEMA = 1
 FILE = "alignment.json"
+_FORM: Form = {
+    "created": str,
+    "session": {"name": str, "sha256": str},
+    "reference": str,
+    "frames": {"": str},
+    "robots": {"": str},
+    "transforms": {"": {}},
+    "cameras": {"": CAMERA},
+    "noise": {"": {"": float}},
+    "observations": [
+        {
+            "view": int,
+            "stop": int,
+            "seer": str,
+            "seen": str,
+            "used": bool,
+            "reason?": str,
+            "residual_mm?": float,
+            "residual_deg?": float,
+        }
+    ],
+    "moved": [{"frame": str, "before": str, "shift_mm": float, "turn_deg": float, "rivals": [str]}],
+    "untied": [{"frame": str, "remedy": str}],
+    "weakest": str,
+    "verdict": VERDICT,
+    "details": {},
+}
 
 
 @dataclass(frozen=True)
@@ -245,7 +273,7 @@ class Alignment:
             return cls(**_fields(parse_stored(text, label)))
         except DataError as error:
             raise error.within(label) from error
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(
                 f"{label}: not an alignment that this version can read: {error!r}.",
                 culprits=[label],
@@ -256,6 +284,7 @@ class Alignment:
 def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
     if document.get("schema") != SCHEMA:
         raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
+    check(document, _FORM)
     verdict = document["verdict"]
     if verdict["status"] not in get_args(VerdictStatus):
         raise ValueError(f"verdict.status is {verdict['status']!r}")

@@ -13,6 +13,7 @@ from visioncal.calibration.edge import (
     read_edge,
     read_pose,
 )
+from visioncal.calibration.forms import CALIBRATION, check
 from visioncal.calibration.frame import frames_document, present, read_frames
 from visioncal.calibration.parts import (
     CameraResult,
@@ -125,6 +126,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     """
     if document.get("schema") != SCHEMA:
         raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
+    check(document, CALIBRATION)
     if document["mount"] not in get_args(Mount):
         raise ValueError(f"mount is {document['mount']!r}")
     if document["verdict"]["status"] not in get_args(VerdictStatus):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self, get_args
 
 from visioncal.calibration.edge import Edge, edge_document, read_edge
+from visioncal.calibration.forms import FRAME, check
 from visioncal.calibration.parts import Verdict, VerdictStatus
 from visioncal.documents import parse_stored
 from visioncal.errors import DataError
@@ -96,7 +97,7 @@ class FrameFile:
             return cls(_read_file(parse_stored(content, str(path))))
         except DataError as error:
             raise error.within(str(path)) from error
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(
                 f"{path}: no frames that this version can read: {error!r}.",
                 culprits=[str(path)],
@@ -146,6 +147,7 @@ def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
 
 
 def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
+    check(document, FRAME)
     verdict = document["verdict"]
     if verdict["status"] not in get_args(VerdictStatus):
         raise ValueError(f"verdict.status is {verdict['status']!r}")
@@ -155,8 +157,8 @@ def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
         document["method"],
         document["source"],
         document["created"],
-        float(document["rms_mm"]),
-        float(document["noise_mm"]),
+        document["rms_mm"],
+        document["noise_mm"],
         tuple(Observation(**it) for it in document["observations"]),
         Verdict(verdict["status"], tuple(verdict["reasons"])),
         dict(document["details"]),

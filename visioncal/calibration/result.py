@@ -234,11 +234,15 @@ class Calibration:
             DataError: It is not a calibration of a known schema.
         """
         try:
-            return cls(**fields_from_document(parse_stored(text, label, KINDS)))
+            read = cls(**fields_from_document(parse_stored(text, label, KINDS)))
+            # What is read of further stages when it is asked for: here, errors are the file's.
+            _ = read.calibrated_robot, read.compliance, read.weight_moments
         except DataError as error:
             raise error.within(label) from error
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(
                 f"{label}: not a calibration that this version can read: {error!r}.",
+                culprits=[label],
                 next_step="Calibrate the session again.",
             ) from error
+        return read

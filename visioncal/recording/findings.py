@@ -147,9 +147,10 @@ def read_stage(calibration: Calibration, name: str, read: Callable[[Any], _T]) -
         return None
     try:
         return read(document)
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(
             f"calibration of {calibration.session_name!r}: {name} cannot be read: {error!r}.",
+            culprits=[name],
             next_step="Calibrate the session again.",
         ) from error
 

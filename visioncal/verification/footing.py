@@ -75,9 +75,10 @@ class Footing:
             )
         try:
             return _read(calibration, document)
-        except (LookupError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(
                 f"calibration {calibration.session_name!r}: joint_fit cannot be read: {error!r}.",
+                culprits=["joint_fit"],
                 next_step="Calibrate its session again.",
             ) from error
 

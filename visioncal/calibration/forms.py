@@ -1,0 +1,115 @@
+"""Checks what JSON that was read holds, before anything is computed or drawn from it."""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+# What a value has to be: a type (float stands for any finite number); a list of a form, however
+# long; or a mapping of keys to forms, of which those that end in ? may be absent. The key "" is any
+# key, and keys that are not named are free.
+Form: TypeAlias = "type | list[Any] | Mapping[str, Any]"
+
+_WORDS = {float: "a finite number", int: "a whole number", str: "text", bool: "true or false"}
+_RMS: Form = {"mm": float, "deg?": float, "px?": float}
+VERDICT: Form = {"status": str, "reasons": [str]}
+FRAME: Form = {
+    "oriented": bool,
+    "method": str,
+    "source": str,
+    "created": str,
+    "rms_mm": float,
+    "noise_mm": float,
+    "observations": [
+        {"name": str, "used": bool, "reason?": str, "kind?": str, "residual_mm?": float}
+    ],
+    "verdict": VERDICT,
+    "details": {},
+}
+CAMERA: Form = {"resolution": [int], "model": str, "estimated": bool}
+_BOARD: Form = {"shape": {"": float}, "sigma": {"": float}, "estimated": [str], "bend_mm": float}
+# Of the further stages, what is read without more ado.
+CALIBRATION: Form = MappingProxyType(
+    {
+        "created": str,
+        "session": {"name": str, "sha256": str},
+        "transforms": {"": {}},
+        "solvers": {"": {"rms_mm": float, "rms_deg?": float}},
+        "camera?": CAMERA,
+        "noise": {"": float},
+        "views": [
+            {
+                "view": int,
+                "used": bool,
+                "reason?": str,
+                "corners?": int,
+                "rms_px?": float,
+                "residual_mm?": float,
+                "residual_deg?": float,
+            }
+        ],
+        "rms": _RMS,
+        "validation": {"method": str, "held_out": _RMS, "holdout?": _RMS},
+        "verdict": VERDICT,
+        "frames?": {"": FRAME},
+        "board?": _BOARD,
+        "boards?": {"": _BOARD},
+        "arm_errors?": {"sigma_mm": float, "sigma_deg": float},
+        "uncertainty?": {"noise_95": {"": [float]}, "budget_mm": {"": float}},
+        "conditions?": {"": float},
+        "joint_fit?": {"targets": {"": {}}, "looks": [int], "boards": [str]},
+        "kinematics?": {
+            "level": str,
+            "robot?": {},
+            "workspace_map?": [{"x_m": float, "y_m": float, "z_m": float, "sigma_mm": float}],
+            "workspace_sigma_mm?": {"": float},
+        },
+        "elastic?": {"joints?": [{"compliance_rad_per_nm": float}], "weight_moments?": [[float]]},
+        "thermal?": {"joints": [{}]},
+    }
+)
+
+
+def check(document: object, form: Form, path: str = "") -> None:
+    """Checks a value of a JSON document.
+
+    Args:
+        document: The value.
+        form: What it has to be.
+        path: Where it stands, for the message.
+
+    Raises:
+        ValueError: It is something else; the message names the place, what is there and what is
+            needed.
+    """
+    if isinstance(form, type):
+        _check_plain(document, form, path)
+    elif isinstance(form, list):
+        if not isinstance(document, list):
+            raise _other(document, "a list", path)
+        for at, value in enumerate(document):
+            check(value, form[0], f"{path}[{at}]")
+    else:
+        if not isinstance(document, dict):
+            raise _other(document, "an object", path)
+        for name, inner in form.items():
+            key = name.removesuffix("?")
+            named = document if not key else {key: document[key]} if key in document else {}
+            if not named and key == name != "":
+                raise ValueError(f"{path}.{key} is missing".lstrip("."))
+            for it, value in named.items():
+                check(value, inner, f"{path}.{it}".lstrip("."))
+
+
+def _check_plain(value: object, kind: type, path: str) -> None:
+    kinds = (int, float) if kind is float else (kind,)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
+        raise _other(value, _WORDS[kind], path)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise _other(value, _WORDS[kind], path)
+    if isinstance(value, int) and value.bit_length() > 63:
+        raise ValueError(f"{path} has {value.bit_length()} bits; 63 at most are read")
+
+
+def _other(value: object, needed: str, path: str) -> ValueError:
+    return ValueError(f"{path or 'the document'} is {value!r:.60}; {needed} is needed")
