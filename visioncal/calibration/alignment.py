@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.document import camera_document, read_camera
-from visioncal.calibration.edge import Edge, edge_document, read_array, read_edge
+from visioncal.calibration.edge import Edge, edge_document, read_covariance, read_edge
 from visioncal.calibration.forms import CAMERA, VERDICT, Form, check
 from visioncal.calibration.frame import present
 from visioncal.calibration.parts import CameraResult, Verdict, VerdictStatus
@@ -296,7 +296,7 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
         "frames": dict(document["frames"]),
         "robots": dict(document["robots"]),
         "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
-        "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
+        "joint_covariance": read_covariance(document["joint_covariance"], "matrix", (-1, -1)),
         "cameras": {name: read_camera(it) for name, it in document["cameras"].items()},
         "noise": {name: dict(it) for name, it in document["noise"].items()},
         "sights": tuple(Sight(**it) for it in document["observations"]),

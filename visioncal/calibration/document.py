@@ -10,6 +10,7 @@ from visioncal.calibration.edge import (
     edge_document,
     pose_document,
     read_array,
+    read_covariance,
     read_edge,
     read_pose,
 )
@@ -142,7 +143,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "created": document["created"],
         "mount": document["mount"],
         "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
-        "joint_covariance": read_array(document["joint_covariance"], "matrix", (-1, -1)),
+        "joint_covariance": read_covariance(document["joint_covariance"], "matrix", (-1, -1)),
         "solvers": {name: _solver(it) for name, it in document["solvers"].items()},
         "noise": _figures(document["noise"]),
         "views": tuple(_view(it) for it in document["views"]),
@@ -189,7 +190,7 @@ def read_camera(document: Mapping[str, Any]) -> CameraResult:
             read_array(document, "distortion", (-1,)),
         ),
         document["estimated"],
-        read_array(document, "covariance", (-1, -1)) if "covariance" in document else None,
+        read_covariance(document, "covariance", (-1, -1)) if "covariance" in document else None,
         _edge_covariance(document),
     )
 

@@ -12,6 +12,8 @@ from visioncal.types import FloatArray
 
 # Forms of one pose that were rounded to six places agree to this [m, rad]; no cell is known better.
 _SAME = 5e-6
+# Correlations are written to 16 digits; millionths are no rounding.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +79,19 @@ def read_edge(document: Mapping[str, Any], name: str) -> Edge:
         LookupError, TypeError, ValueError: The document is another.
         DataError: Its forms are of different poses.
     """
-    return Edge(read_pose(document, name), read_array(document, "covariance", (6, 6)))
+    return Edge(read_pose(document, name), read_covariance(document, "covariance", (6, 6)))
 
 
 def read_pose(document: Mapping[str, Any], name: str) -> FloatArray:
     """Reads the (4, 4) matrix of a pose; its errors are those of `read_edge`."""
     matrix = read_array(document, "matrix", (4, 4))
     rotation = matrix[:3, :3]
-    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+    if (
+        matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]
+        or np.abs(rotation).max() > 2.0
+        or not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9)
+        or np.linalg.det(rotation) < 0
+    ):
         raise ValueError("a matrix is not a rigid transform")
     translation = read_array(document, "translation_m", (3,))
     quaternion = read_array(document, "quaternion_xyzw", (4,))
@@ -100,6 +107,27 @@ def read_pose(document: Mapping[str, Any], name: str) -> FloatArray:
                 culprits=[f"{name}: {form}", f"{name}: matrix"],
                 next_step="Somebody changed one of them: take the file as calibrate wrote it.",
             )
+    return matrix
+
+
+def read_covariance(document: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray:
+    """Reads a covariance as `read_array` does; its correlations are checked.
+
+    Raises:
+        LookupError, TypeError, ValueError: The document is another.
+    """
+    matrix = read_array(document, key, shape)
+    variance = np.diagonal(matrix)
+    scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    with np.errstate(over="ignore"):
+        scaled = matrix / scale[:, None] / scale
+    if (
+        (variance < 0.0).any()
+        or np.abs(scaled).max(initial=0.0) > 1.0 + _ROUNDING
+        or np.abs(scaled - scaled.T).max(initial=0.0) > _ROUNDING
+        or (len(scaled) and np.linalg.eigvalsh(scaled)[0] < -_ROUNDING)
+    ):
+        raise ValueError(f"{key} is no covariance")
     return matrix
 
 

@@ -259,9 +259,10 @@ def check_rigid(matrix: FloatArray, label: str) -> None:
         DataError: They are not.
     """
     rotation = matrix[:3, :3]
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if (
-        off > _ROTATION_TOLERANCE
+        # Squares of the largest numbers overflow.
+        np.abs(rotation).max() > 1.0 + _ROTATION_TOLERANCE
+        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
         or np.linalg.det(rotation) < 0
         or matrix[3].tolist() != [0, 0, 0, 1]
     ):

@@ -7,6 +7,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from visioncal.calibration import Calibration
+from visioncal.calibration.edge import read_covariance
 from visioncal.errors import DataError
 from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Free, boards_basis
 from visioncal.estimator.armmodel import ArmModel
@@ -142,14 +143,12 @@ def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
     targets = {
         name: target_from_document(it, name or "target") for name, it in document["targets"].items()
     }
-    spread, looks = np.array(document["covariance"], dtype=float), tuple(document["looks"])
+    spread, looks = read_covariance(document, "covariance", (-1, -1)), tuple(document["looks"])
     arm = document.get("arm", {"of": "none", "values": []})
     size = len(arm["values"])
     before = len(looks) + 6 * (len(names) - 1)
     if spread.shape != (12 + before + size,) * 2:
         raise ValueError(f"covariance has the shape {spread.shape}")
-    if not np.isfinite(spread).all():
-        raise ValueError("covariance has entries that are no finite numbers")
     values = np.concatenate([np.zeros(before), np.array(arm["values"], dtype=float)])
     return Footing(
         calibration,
