@@ -1,6 +1,6 @@
 """Broken inputs, a few of the thousands that `benchmarks/mutated.py` draws."""
 
-from mutated import READINGS, missing_commands, unknown_inputs, walk
+from mutants import READINGS, missing_commands, unknown_inputs, walk
 
 # Inputs that are made within a second, and commands that end soon on them.
 QUICK = {

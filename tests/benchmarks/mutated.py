@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from mutated import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
+from mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
 from mutators import KINDS
 from results import write_section
 
