@@ -19,7 +19,7 @@ from visioncal.estimator.closure import (
     solve_closure,
 )
 from visioncal.estimator.shared import Shared
-from visioncal.estimator.variance import _likelihood
+from visioncal.estimator.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
@@ -108,3 +108,20 @@ def test_the_likelihood_slopes_as_its_differences_say(given):
         slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
         # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
         assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+
+
+def test_a_noise_level_of_nothing_is_found_beside_a_large_one():
+    """Both coordinates err alike: what each has of its own is lost in the rounding."""
+    common = np.random.default_rng(2).normal(0.0, 1.0, (40, 1))
+    parts = np.tile([[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]], (40, 1, 1, 1))
+    sigmas, value = estimate_sigmas(
+        np.hstack([common, common]),
+        np.ones((40, 2, 1)),
+        Components(np.zeros((40, 2, 2)), parts.swapaxes(0, 1)),
+        Knowledge(np.zeros((1, 1)), np.zeros(1)),
+        np.array([3.0, 3.0]),
+    )
+    assert np.isfinite(value)
+    # Forty of them tell a level to a ninth.
+    assert sigmas[0] == pytest.approx(1.0, rel=0.4)
+    assert sigmas[1] < 1e-5

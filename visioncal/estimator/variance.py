@@ -1,6 +1,7 @@
 """Noise levels from residuals: restricted maximum likelihood of variance components."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,9 +107,12 @@ def estimate_sigmas(
             slope = np.where(free, slope, 0.0)
         step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST_STEP, _LONGEST_STEP)
         candidate = np.clip(logs + step, *limits)
-        then = _likelihood(residuals, jacobian, components, known, candidate, prior)
         moved = np.abs(candidate - logs).max()
-        if then.value <= now.value:
+        then = None
+        # Of levels too far apart, one is lost in the rounding of the other.
+        with suppress(np.linalg.LinAlgError):
+            then = _likelihood(residuals, jacobian, components, known, candidate, prior)
+        if then is not None and then.value <= now.value:
             logs, now, damping = candidate, then, max(damping / 10, 1e-6)
         else:
             damping *= 10
