@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from cells import calibrated
 
+from visioncal.errors import ConvergenceError
+from visioncal.estimator import joint
 from visioncal.estimator.closure import (
     RATIO_PRIOR,
     Closure,
@@ -108,6 +110,15 @@ def test_the_likelihood_slopes_as_its_differences_say(given):
         slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
         # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
         assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+
+
+def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
+    def runs_away(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(joint, "fit_closure", runs_away)
+    with pytest.raises(ConvergenceError, match="poses of other views than the images"):
+        calibrated(simulate(replace(FINE, views=6)))
 
 
 def test_a_noise_level_of_nothing_is_found_beside_a_large_one():

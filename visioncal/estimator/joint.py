@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.chance import chi2_limit
+from visioncal.errors import ConvergenceError
 from visioncal.estimator.appearance import (
     BOARD_NAMES,
     SCALE,
@@ -234,7 +235,26 @@ class State:
 
 
 def settle(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
-    """Linearises and fits in turn, until the values stay where they are."""
+    """Linearises and fits in turn, until the values stay where they are.
+
+    Raises:
+        ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
+    """
+    try:
+        # Numbers that run away overflow before they fail.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _settled(problem, arm, moving, start)
+    except np.linalg.LinAlgError as error:
+        raise ConvergenceError(
+            "hand-eye: no frames explain both the robot's poses and what the camera saw: the fit "
+            "runs away. The likeliest cause is poses of other views than the images.",
+            culprits=["poses", "images"],
+            next_step="Look at which image belongs to which pose; visioncal convert --guess tries "
+            "other readings of the poses.",
+        ) from error
+
+
+def _settled(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
     state = _fitted(problem, arm, moving, start)
     for _ in range(_ROUNDS):
         spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])

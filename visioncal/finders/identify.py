@@ -116,6 +116,7 @@ def identify(image: Image) -> Identity:
         + " Looked for were ChArUco boards and single markers of OpenCV's ArUco and AprilTag "
         "dictionaries, and checkerboards of 3 x 3 inner corners or more; "
         f"{len(decode_markers(image))} patterns looked like a marker.",
+        culprits=["image"],
         next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
         "nearer, and tilted by less than 60 degrees.",
     )

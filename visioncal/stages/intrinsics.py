@@ -93,6 +93,7 @@ def estimate_intrinsics(
         raise DataError(
             f"intrinsics: {len(corners)} views show the target, and at least {_FEWEST_VIEWS} are "
             "needed.",
+            culprits=["views"],
             next_step="Add views, or give matrix and distortion in [camera].",
         )
     stack = CornerStack.of(corners, numbered_positions(targets))
