@@ -56,7 +56,7 @@ class Tool:
             there = f"has {len(tools)} tools: {some_of(list(tools))}" if tools else "has no tool"
             raise DataError(
                 f"{source} {there}; the one that the points were touched with is needed.",
-                culprits=list(tools),
+                culprits=list(tools) or [source],
                 next_step=f"Say --tool {next(iter(tools))}, or the like." if tools else NO_TOOL,
             )
         full = name if name in tools else f"flange_from_{name}"
