@@ -357,3 +357,11 @@ def test_from_a_bad_guess_nine_of_ten_stops_see_the_whole_board(mount):
 def test_a_cell_that_cannot_be_is_refused(make):
     with pytest.raises(DataError):
         make()
+
+
+@pytest.mark.parametrize("factor", [1e6, 1e150])
+def test_a_lens_that_sees_nothing_is_refused(factor):
+    cell = cell_of(CellOptions())
+    camera = replace(cell.camera, matrix=cell.camera.matrix * [factor, factor, 1.0, 1.0])
+    with pytest.raises(DataError, match="camera: no ray of this lens"):
+        candidates(replace(cell, camera=camera), 5, 0)

@@ -12,7 +12,7 @@ from foreign_samples import BASE_FROM_FLANGE, CAM_FROM_TARGET, quaternions, stre
 from typer.testing import CliRunner
 
 from visioncal.cli.app import app
-from visioncal.conventions import PoseNumbers, Reading
+from visioncal.conventions import ROTATION_FORMS, PoseNumbers, Reading
 from visioncal.errors import DataError
 from visioncal.formats import PoseWishes, Wishes, assemble, read_foreign
 from visioncal.formats.intrinsics import read_intrinsics
@@ -259,3 +259,10 @@ def test_written_digits_are_enough_for_a_rotation(digits):
         )
         with pytest.raises(DataError, match="the numbers are not"):
             replace(rounded, rotations=1.005 * numbers).poses()
+
+
+def test_numbers_whose_squares_overflow_are_no_quaternion():
+    numbers = np.array([[0.0, 0.0, 0.0, 1.0], [1e300, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0]])
+    found = ROTATION_FORMS["quaternion-xyzw"].read(numbers)
+    assert found[0] == pytest.approx(np.eye(3))
+    assert np.isnan(found[1:]).all()

@@ -81,6 +81,7 @@ def test_an_unknown_name_lists_the_names_and_a_near_one() -> None:
         ({"square_sigma_m": -1e-5}, "square_sigma_m is -1e-05"),
         ({"square_sigma_m": 1e-300}, "is 1e-300; a standard deviation from 1e-08 m"),
         ({"square_sigma_m": 0.04}, r"is 0\.04; .* to the square's own 0\.03 m"),
+        ({"marker_m": 1e50}, r"marker_m is 1e\+50; less than square_m = 0\.03"),
         ({"marker_m": 0.03}, r"marker_m is 0\.03; less than square_m = 0\.03"),
         ({"dictionary": "DICT_5X5_10"}, "dictionary is 'DICT_5X5_10', which OpenCV does not"),
         ({"dictionary": "CharucoBoard"}, "which OpenCV does not have"),

@@ -48,7 +48,9 @@ def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
     to_xyzw = np.argsort(from_xyzw)
 
     def read(numbers: FloatArray) -> FloatArray:
-        off = np.abs(np.linalg.norm(numbers, axis=1) - 1.0) > _NORM_TOLERANCE
+        # No component of a unit is larger, and squares of the largest numbers overflow.
+        norms = np.linalg.norm(np.clip(numbers, -2.0, 2.0), axis=1)
+        off = np.abs(norms - 1.0) > _NORM_TOLERANCE
         unit = np.where(off[:, None] | ~np.isfinite(numbers), 0.5, numbers)
         rotations = Rotation.from_quat(unit[:, to_xyzw]).as_matrix()
         return _without(rotations, np.asarray(off) | ~_finite_rows(numbers))

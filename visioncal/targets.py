@@ -92,8 +92,8 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     if kind == "checkerboard":
         return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
     marker_m = table.number("marker_m", positive=True)
-    # OpenCV compares the sides in single precision.
-    if not 0.0 < np.float32(marker_m) < np.float32(square_m):
+    # OpenCV compares the sides in single precision, which does not hold all numbers.
+    if marker_m >= square_m or not 0.0 < np.float32(marker_m) < np.float32(square_m):
         raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
     dictionary = table.text("dictionary")
     markers, needed = _dictionary_size(table, dictionary), columns * rows // 2

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.camera import normalise
+from visioncal.errors import DataError
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.obstacles import board_size_m
 from visioncal.planning.window import Window, border_tangents
@@ -28,6 +29,8 @@ _SURELY, _NEVER_BEYOND = 2.2, 6.0
 _GUESSES, _LOOKED_AT, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
 # By so many rays through each side of the image the distance is found at which the board fills it.
 _BORDER_RAYS = 9
+# A lens that sees no more than this to its side, in a distance of one, is none.
+_NARROWEST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +163,21 @@ class Sight:
 
 
 def sight_of(cell: PlanCell, seed: int) -> Sight:
-    """Prepares the views of a cell, with draws of what its guesses may really be."""
+    """Prepares the views of a cell, with draws of what its guesses may really be.
+
+    Raises:
+        DataError: The lens sees nothing, or as good as nothing.
+    """
+    border = border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+    seen = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
+    if not len(seen) or seen.min() < _NARROWEST:
+        raise DataError(
+            "camera: no ray of this lens reaches the border of its image, or all are parallel: "
+            f"matrix is {cell.camera.matrix.tolist()}, distortion "
+            f"{cell.camera.distortion.tolist()}.",
+            culprits=["camera"],
+            next_step="Look at the intrinsics that were given.",
+        )
     drawn = cell.guesses(_GUESSES, seed)
     low, high = extent_m(cell.target)
     return Sight(
