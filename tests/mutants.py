@@ -27,7 +27,7 @@ from unittest.mock import patch
 
 import typer
 from mutators import mutate
-from sound_inputs import MAKERS, TYPED, Inputs
+from sound_inputs import MAKERS, Inputs, typed
 
 from visioncal import viewer
 from visioncal.cli import app as application
@@ -51,7 +51,7 @@ class Reading:
         input: The sound input that is broken: a name of `sound_inputs.MAKERS`.
         words: The arguments: IT is what is broken, OUT an earlier result's folder, NEW a path
             where nothing is, and [name] another sound input.
-        typed: What is typed into it.
+        typed: Whether `sound_inputs.typed` is typed into it.
         is_kept: Whether what it had written before it failed stays, on purpose.
         sound: The exit status while nothing is broken.
     """
@@ -59,7 +59,7 @@ class Reading:
     command: str
     input: str
     words: str
-    typed: str = ""
+    typed: bool = False
     is_kept: bool = False
     sound: int = 0
 
@@ -160,28 +160,28 @@ READINGS: tuple[Reading, ...] = (
         "record",
         "pictures",
         "-o NEW --arm manual --camera folder:IT --target charuco_9x6_30mm",
-        TYPED,
+        typed=True,
         is_kept=True,
     ),
     Reading(
         "record",
         "plan",
         "-o NEW --arm manual --camera folder:[pictures] --plan IT",
-        TYPED,
+        typed=True,
         is_kept=True,
     ),
     Reading(
         "record",
         "target.toml",
         "-o NEW --arm manual --camera folder:[pictures] --target IT",
-        TYPED,
+        typed=True,
         is_kept=True,
     ),
     Reading(
         "record",
         "recorded",
         "-o IT --resume --arm manual --camera folder:[pictures] --target charuco_9x6_30mm",
-        TYPED,
+        typed=True,
         is_kept=True,
         sound=2,
     ),
@@ -287,7 +287,7 @@ def run_mutant(
     told(broken)
     words = [*reading.command.split(), *_words(reading, it, out, place / "new", inputs)]
     before = digests(place)
-    done, seconds, peak = _timed(words, reading.typed)
+    done, seconds, peak = _timed(words, typed() if reading.typed else "")
     faults = [*done.faults]
     if done.status == 2:
         after = digests(place)
@@ -356,10 +356,10 @@ class _Done:
     faults: tuple[str, ...]
 
 
-def _timed(words: Sequence[str], typed: str) -> tuple[_Done, float, int]:
+def _timed(words: Sequence[str], answers: str) -> tuple[_Done, float, int]:
     Path("/proc/self/clear_refs").write_text("5")
     begun = time.perf_counter()
-    done = _called(words, typed)
+    done = _called(words, answers)
     return done, time.perf_counter() - begun, _memory(os.getpid(), "VmHWM")
 
 
@@ -373,7 +373,7 @@ def _memory(pid: int, field: str) -> int:
     return 1024 * int(found[1]) if found else 0
 
 
-def _called(words: Sequence[str], typed: str) -> _Done:
+def _called(words: Sequence[str], answers: str) -> _Done:
     """Calls the application as its entry point does."""
     out, err, errors = io.StringIO(), io.StringIO(), []
     report = application.report_error
@@ -386,7 +386,7 @@ def _called(words: Sequence[str], typed: str) -> _Done:
     status = 0
     with (
         patch.object(sys, "argv", ["visioncal", *words]),
-        patch.object(sys, "stdin", io.StringIO(typed)),
+        patch.object(sys, "stdin", io.StringIO(answers)),
         patch.object(application, "report_error", reported),
         patch.object(viewer, "review_native", lambda _: None),
         redirect_stdout(out),

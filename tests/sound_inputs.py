@@ -6,6 +6,7 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from unittest.mock import patch
@@ -17,6 +18,7 @@ from commands import turned_poses, visioncal, write_poses, write_table
 from placed import FLANGE_FROM_TOOL, alone, fixture, tool
 from samples import HOME_RAD
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 from touched import TIP, Job, touched
 from tracked import Tracked, session_of, tracked
 
@@ -41,14 +43,13 @@ from visioncal.types import FloatArray
 
 CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
 VIEWS = 7
+BOARD = CellOptions(views=VIEWS, camera=CAMERA, state_intrinsics=False)
 PLAN = (
     "--stops 4 --target charuco_9x6_30mm --camera 1000,1000,640,400 --resolution 1280,800 --cam "
     "'0 -60 60 0 0 0' --board '500 0 5 180 0 0' --guess-deg 2 --candidates 30"
 )
 DRAWING_MM = np.array([[0, 0, 0], [300, 0, 0], [300, 200, 0], [0, 200, 0], [150, 60, 40]])
 PLACE_M = np.array([0.5, 0.1, 0.0])
-# What is typed to `record`: take it, its pose, and yes, that is what it means.
-TYPED = "".join(f"\np[0.{it}, -0.3, 0.5, 3.1, 0.{it}, 0.0]\n\n" for it in range(1, 8)) + "q\n"
 LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
 
 
@@ -82,7 +83,17 @@ def _command(*words: str) -> Callable[[Inputs, Path], None]:
 
 
 def _board(_: Inputs, path: Path) -> None:
-    write_session(simulate(CellOptions(views=VIEWS, camera=CAMERA, state_intrinsics=False)), path)
+    write_session(simulate(BOARD), path)
+
+
+@cache
+def typed() -> str:
+    """What is typed to `record` at each picture of the board: take it, its pose, it is right."""
+    lines = []
+    for pose in simulate(BOARD).base_from_flange:
+        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        lines += ["", f"p[{', '.join(f'{it:.6f}' for it in [*pose[:3, 3], *turn])}]", ""]
+    return "\n".join([*lines, "q", ""])
 
 
 def _pairs(_: Inputs, path: Path) -> None:
@@ -231,7 +242,7 @@ def _pictures(inputs: Inputs, path: Path) -> None:
 def _recorded(inputs: Inputs, path: Path) -> None:
     """A session that was recorded from typed poses."""
     words = ["--arm", "manual", "--camera", f"folder:{inputs['pictures']}"]
-    with patch.object(sys, "stdin", io.StringIO(TYPED)):
+    with patch.object(sys, "stdin", io.StringIO(typed())):
         _done("record", "-o", path, *words, "--target", "charuco_9x6_30mm")
 
 

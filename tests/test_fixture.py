@@ -19,7 +19,7 @@ from visioncal.frames.fitted import Setting
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.measured import Tool, touched_points
 from visioncal.frames.nominal import NominalPoints
-from visioncal.frames.touches import TouchRows
+from visioncal.frames.touches import TouchRows, check_lengths
 from visioncal.transforms import compose, exp
 
 TIP = made.FLANGE_FROM_TOOL[:3, 3]
@@ -314,6 +314,13 @@ def _turning(point):
     x, y, z = point
     cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
     return np.hstack([cross, np.eye(3)])
+
+
+def test_a_position_whose_square_overflows_is_far_off():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, 0, 3] = 1e300
+    with pytest.raises(DataError, match=r"line 3: its position is 1e\+300 m from the base"):
+        check_lengths(rows_of(poses))
 
 
 # --- The command.

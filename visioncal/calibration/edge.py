@@ -12,8 +12,9 @@ from visioncal.types import FloatArray
 
 # Forms of one pose that were rounded to six places agree to this [m, rad]; no cell is known better.
 _SAME = 5e-6
-# Correlations are written to 16 digits; millionths are no rounding.
-_ROUNDING = 1e-6
+# What rounding leaves of a symmetric product: millionths of its correlations, where a rotation is
+# known a million times better than the levers that it is carried by [m].
+_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,5 +98,6 @@ def _known(stamps_s: FloatArray, numbers: PoseNumbers) -> tuple[FloatArray, Floa
     """Leaves out the samples without a pose: (times, (m, 4, 4) poses, their rows)."""
     rows = np.flatnonzero(numbers.there)
     if len(rows) < 3:
-        raise DataError(f"{numbers.places[0]}: {len(rows)} poses; 3 or more are needed.")
+        place = numbers.places[0]
+        raise DataError(f"{place}: {len(rows)} poses; 3 or more are needed.", culprits=[place])
     return stamps_s[rows], numbers.poses()[rows], rows

@@ -160,7 +160,8 @@ def check_lengths(rows: TouchRows) -> None:
     Raises:
         DataError: Naming the farthest row.
     """
-    away = np.linalg.norm(rows.base_from_flange[:, :3, 3], axis=1)
+    # Squares of the largest numbers overflow.
+    away = np.hypot.reduce(rows.base_from_flange[:, :3, 3], axis=1)
     far = np.flatnonzero(away > _FAR_M)
     if len(far):
         raise DataError(
