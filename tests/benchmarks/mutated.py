@@ -27,12 +27,17 @@ _COMMAND = "PYTHONPATH=tests python tests/benchmarks/mutated.py"
 
 
 def reason(message: str) -> str:
-    """A refusal without what is of one input alone."""
-    words = re.sub(r"\S*/[\w./ -]*\w", "FILE", message.strip().partition("\n")[0])
+    """A refusal without what is of one input alone: what is needed, or else what is wrong."""
+    words = re.sub(r"\S*/\S*\w|(\w\.){3,}\w*", "FILE", message.strip().partition("\n")[0])
     words = re.sub(r"'[^']*'|\"[^\"]*\"", "'...'", words)
     words = re.sub(r"\b[\w-]+\.(csv|toml|json|rrd|urdf|png|ya?ml)\b", "FILE", words)
-    words = re.sub(r"-?\d[\w.]*", "N", words)
-    return re.split(r"[:;.(] ", f"{words} ", maxsplit=2)[0][:90].strip(" .:").replace("|", "/")
+    words = re.sub(r"-?\d[\w.]*", "N", words).partition(". ")[0]
+    if "; " in words:
+        words = words.rpartition("; ")[2]
+    elif not re.search("TOML|JSON", words):
+        words = words.partition(": ")[2] or words
+    words = re.sub("^FILE(, line N)?(, column N)? ", "", words.partition(": ")[0])
+    return words[:90].strip(" .:").replace("|", "/")
 
 
 def by_command(ended: Sequence[Ended]) -> list[str]:
