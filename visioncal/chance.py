@@ -10,7 +10,7 @@ from scipy.special import chdtri, fdtri, stdtr
 from visioncal.types import FloatArray
 
 
-def chi2_limit(chance: float, freedom: npt.ArrayLike) -> FloatArray:
+def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:
     """What a sum of so many squared standard normal deviates exceeds with a given chance."""
     return np.asarray(chdtri(freedom, chance), dtype=float)
 

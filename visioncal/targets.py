@@ -1,8 +1,8 @@
-"""Printed targets: their files, their corners and their symmetries.
+"""Targets, printed ones and rigs of known points: their files, corners and symmetries.
 
 The target's frame: for a ChArUco board the origin is the outer corner of square 0, for a
 checkerboard inner corner 0, for a single marker its centre; x runs along columns, y along rows
-(down the printed page), and z into the board.
+(down the printed page), and z into the board. A rig of points has the frame that its table is in.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from visioncal import transforms
+from visioncal.documents.tables import TextTable, read_table
 from visioncal.errors import DataError
-from visioncal.files import Table, did_you_mean, find_described, read_toml
+from visioncal.files import Table, did_you_mean, find_described, is_inside, read_toml
 from visioncal.types import FloatArray, IntArray, Mask, Target
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
@@ -27,6 +28,11 @@ LEAST_SIGMA_M = 1e-8
 
 # No printed square is larger; a larger number is in millimetres.
 LARGEST_M = 1.0
+
+# The columns of a rig's table; sigma_m may be absent.
+RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m")
+# No rig of one cell is larger [m]: a larger number is in millimetres. A pose takes four points.
+_LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
 
 # Fewer do not determine a pose robustly; more do not fit a printable board.
 _MIN_SQUARES, _MAX_SQUARES = 3, 100
@@ -64,7 +70,53 @@ def load_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
         name_or_path, what="target", shipped=_shipped(), suffixes=(".toml",), folder=folder
     )
     document = read_toml(path, path.name)
+    rig = document.get("points")
+    if document.get("kind") == "points" and isinstance(rig, str):
+        document["points"] = _read_rig(path.parent, rig.replace("\\", "/"))
     return target_from_document(document, path.stem), document
+
+
+def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
+    """Reads the table of a rig's points, column by column; it lies beside the rig's description."""
+    path = folder / name
+    if not is_inside(path, folder):
+        raise DataError(
+            f"points = {name!r} leads out of the folder of the target's file.",
+            culprits=["points"],
+            next_step="Copy the table of points beside the target's file.",
+        )
+    table = read_table(path)
+    unknown = [it for it in table.columns if it not in RIG_COLUMNS]
+    missing = [it for it in RIG_COLUMNS[:4] if it not in table.columns]
+    if unknown or missing:
+        raise DataError(
+            f"{path}: its columns are {', '.join(table.columns)}; point, x_m, y_m, z_m and, where "
+            "it is known, sigma_m are needed.",
+            culprits=[f"{path.name}: {it}" for it in (*missing, *unknown)],
+        )
+    return {name: _column(table, at) for at, name in enumerate(table.columns)}
+
+
+def _column(table: TextTable, at: int) -> list[Any]:
+    read = int if table.columns[at] == "point" else float
+    values = []
+    for row, cells in enumerate(table.rows):
+        try:
+            values.append(read(cells[at]))
+        except ValueError:
+            what = "whole number" if read is int else "number"
+            raise DataError(
+                f"{table.place(row)}, column {table.columns[at]}: {cells[at]!r} is no {what}.",
+                culprits=[table.place(row)],
+            ) from None
+    return values
+
+
+def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
+    """Writes a rig's points, column by column, as the text of its table."""
+    columns = [it for it in RIG_COLUMNS if it in points]
+    rows = zip(*(points[it] for it in columns), strict=True)
+    return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
 
 
 def target_from_document(document: Mapping[str, Any], name: str) -> Target:
@@ -75,16 +127,19 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
 
     Args:
         document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for
-            a single marker kind, id, size_m, dictionary.
+            a single marker kind, id, size_m, dictionary; for a rig kind and points, the columns
+            of its table as lists.
         name: The name that the target gets.
 
     Raises:
         DataError: A field is missing, of another type, or out of range.
     """
     table = Table(document, f"target {name}")
-    kind = table.choice("kind", ("charuco", "checkerboard", "marker"))
+    kind = table.choice("kind", ("charuco", "checkerboard", "marker", "points"))
     if kind == "marker":
         return _marker(table, name)
+    if kind == "points":
+        return _rig(table, name)
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
     square_m = _size(table, "square_m")
@@ -130,6 +185,43 @@ def _marker(table: Table, name: str) -> Target:
     return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=marker_id)
 
 
+def _rig(table: Table, name: str) -> Target:
+    columns = table.content.get("points")
+    if not isinstance(columns, Mapping) or not all(it in columns for it in RIG_COLUMNS[:4]):
+        raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
+    lists = [columns[it] for it in RIG_COLUMNS if it in columns]
+    try:
+        values = np.array(lists, dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros((0, 0))
+    if values.ndim != 2 or not np.isfinite(values).all():
+        raise table.refuse("points", "a table with gaps", "a finite number in every cell")
+    numbers, places_m, sigmas_m = values[0], values[1:4].T, values[4:].ravel()
+    if len(numbers) < _FEWEST_POINTS:
+        raise table.refuse("points", f"a table of {len(numbers)}", "four points or more")
+    repeated = sorted({int(it) for it in numbers if np.sum(numbers == it) > 1})
+    if repeated or (numbers != np.round(numbers)).any():
+        given = f"a table with point {repeated[0]} twice" if repeated else "a table"
+        raise table.refuse("points", given, "a whole number of its own for each point")
+    extent_m = float(np.ptp(places_m, axis=0).max())
+    if not 0.0 < extent_m <= _LARGEST_RIG_M:
+        needed = f"a rig of up to {_LARGEST_RIG_M:g} m, in metres"
+        raise table.refuse("points", f"a table over {extent_m:g} m", needed)
+    if (sigmas_m <= 0).any():
+        raise table.refuse("points", f"sigma_m = {sigmas_m.min():g}", "sigmas above 0")
+    return Target(
+        name,
+        "points",
+        len(numbers),
+        1,
+        extent_m,
+        0.0,
+        points_m=tuple((x, y, z) for x, y, z in places_m.tolist()),
+        point_numbers=tuple(numbers.astype(int).tolist()),
+        point_sigmas_m=tuple(sigmas_m.tolist()),
+    )
+
+
 def _dictionary_size(table: Table, name: str) -> int:
     """Counts the markers of one of OpenCV's dictionaries."""
     known = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
@@ -163,6 +255,11 @@ def target_document(target: Target) -> dict[str, Any]:
             "square_sigma_m": target.square_sigma_m,
             "dictionary": target.dictionary,
         }
+    if target.kind == "points":
+        places = corner_positions(target).T.tolist()
+        columns = (list(target.point_numbers), *places, list(target.point_sigmas_m))
+        rig = dict(zip(RIG_COLUMNS, columns, strict=True))
+        return {"kind": "points", "points": {name: it for name, it in rig.items() if it}}
     document: dict[str, Any] = {
         "kind": target.kind,
         "columns": target.columns,
@@ -184,15 +281,23 @@ def corner_positions(target: Target) -> FloatArray:
 
     Returns:
         (n, 3) positions in the target's frame [m], in the order of the corners' numbers. A
-        marker's four corners come in OpenCV's order, clockwise from its top left.
+        marker's four corners come in OpenCV's order, clockwise from its top left; the points of
+        a rig in that of its table.
     """
     side = target.square_m
+    if target.kind == "points":
+        return np.array(target.points_m, dtype=float)
     if target.kind == "marker":
         return 0.5 * side * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     inset = 1 if target.kind == "charuco" else 0
     rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
     flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
     return np.asarray(side * flat, dtype=float)
+
+
+def point_numbers(target: Target) -> tuple[int, ...]:
+    """The numbers that people give a target's corners, in the order of `corner_positions`."""
+    return target.point_numbers or tuple(range(len(corner_positions(target))))
 
 
 def numbered_positions(targets: Sequence[Target]) -> FloatArray:
@@ -209,6 +314,9 @@ def first_corners(targets: Sequence[Target]) -> IntArray:
 def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
     """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
     side = target.square_m
+    if target.kind == "points":
+        places = corner_positions(target)[:, :2]
+        return places.min(axis=0), places.max(axis=0)
     if target.kind == "marker":
         return np.full(2, -0.5 * side), np.full(2, 0.5 * side)
     # A checkerboard's origin is its first inner corner, one square inside.

@@ -18,7 +18,7 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # stands still and reads a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
-TargetKind: TypeAlias = Literal["charuco", "checkerboard", "marker"]
+TargetKind: TypeAlias = Literal["charuco", "checkerboard", "marker", "points"]
 
 # The joint fit, or one of the closed forms.
 SolverName: TypeAlias = Literal[
@@ -31,19 +31,27 @@ Progress: TypeAlias = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Target:
-    """A printed target, as its `.toml` declares it. Its frame is defined in the README.
+    """A printed target or a rig of known points, as its `.toml` declares it.
+
+    Its frame is defined in the README; that of a rig is the one that its table is in.
 
     Attributes:
         name: The name under which a session asks for it.
-        kind: What is printed.
-        columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
-        rows: The same along y.
-        square_m: Side of a square; of the marker itself for a single marker [m].
-        square_sigma_m: How well that side is known, as a standard deviation [m].
+        kind: What is printed; `points` for a rig, of which detectors of others find the points.
+        columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker, and the
+            points for a rig.
+        rows: The same along y; 1 for a marker and for a rig.
+        square_m: Side of a square; of the marker itself for a single marker, and the greatest
+            extent of a rig [m].
+        square_sigma_m: How well that side is known, as a standard deviation [m]; 0 for a rig.
         marker_m: Side of the markers inside a ChArUco board [m]; 0 elsewhere.
         dictionary: ArUco dictionary by OpenCV's name, as `DICT_5X5_100`; empty without markers.
         legacy: Whether a ChArUco board has the layout that OpenCV printed before 4.6.
         marker_id: The id of a single marker; -1 elsewhere.
+        points_m: Places of a rig's points [m]; empty elsewhere.
+        point_numbers: The numbers that its table gives them.
+        point_sigmas_m: How well each place is known per axis, as a standard deviation [m]; empty
+            where they are exact.
     """
 
     name: str
@@ -56,6 +64,9 @@ class Target:
     dictionary: str = ""
     legacy: bool = False
     marker_id: int = -1
+    points_m: tuple[tuple[float, float, float], ...] = ()
+    point_numbers: tuple[int, ...] = ()
+    point_sigmas_m: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +95,20 @@ class Corners:
         ids: (n,) corner numbers, ascending, in the target's numbering; where a session has several
             targets, the calibration numbers their corners through.
         px: (n, 2) corner positions [px], pixel centres at integers.
-        blur_px: Width of the edges that were seen, as a Gaussian's sigma [px].
+        blur_px: Width of the edges that were seen, as a Gaussian's sigma [px]; 0 where others
+            found the corners.
+        weights: (n,) by how much more than `stated_px` each corner is known, as the ratio of
+            standard deviations; None for corners that are known alike.
+        stated_px: Standard deviation of a typical corner's coordinate, as it is stated; None where
+            it is to be estimated [px].
     """
 
     view: int
     ids: IntArray
     px: FloatArray
     blur_px: float
+    weights: FloatArray | None = None
+    stated_px: float | None = None
 
 
 @dataclass(frozen=True)

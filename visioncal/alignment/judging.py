@@ -240,7 +240,8 @@ def size_warnings(solved: Solved, spread: FloatArray) -> list[str]:
     if looks is None:
         return []
     found = []
-    for board, place in enumerate(looks.scales.tolist()):
+    for board in looks.printed:
+        place = int(looks.scales[board])
         (at,) = solved.columns_of(np.array([place]))
         scale, prior = float(looks.values[place]), float(looks.prior_sigma[place])
         sigma = float(np.hypot(np.sqrt(spread[at, at]), prior))

@@ -100,7 +100,7 @@ def with_seen(cell: Cell, problem: Problem, seen: Seen, others: Sequence[Effect]
 def _wider(cell: Cell, seen: Seen, agreed: Agreed, others: Sequence[Effect]) -> IntArray:
     """What more the corners ask to set free: boards' bends, and lenses that were stated."""
     looks = seen.looks
-    groups: list[IntArray] = [looks.shape_of(it) for it in range(len(looks.scales))]
+    groups: list[IntArray] = [looks.shape_of(it) for it in looks.printed]
     for name, corners in looks.problems.items():
         lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
         if corners.scene.mode == "auto" and not np.isin(lens, seen.free).all():

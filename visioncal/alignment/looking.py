@@ -77,7 +77,8 @@ def look_around(
 
 def _images_of(session: Session, frame: str) -> list[View]:
     seers = {it.view.number: it.seer for it in session.observations}
-    return [it for it in session.views if it.image and seers.get(it.number) == frame]
+    seen = (it for it in session.views if it.image or it.has_corners)
+    return [it for it in seen if seers.get(it.number) == frame]
 
 
 def _with_camera(

@@ -46,7 +46,7 @@ def image_session(source: Path, for_touches: Mapping[str, object]) -> Session | 
     if not source.is_dir() and source.suffix.lower() != ".rrd":
         return None
     session = Session.load(source)
-    shown = [it.number for it in session.views if it.image]
+    shown = [it.number for it in session.views if it.image or it.has_corners]
     if not shown:
         return None
     touched = [it.number for it in session.views if it.text.keys() & {"kind", "point"}]

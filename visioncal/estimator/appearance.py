@@ -63,7 +63,12 @@ def boards_basis(positions: Sequence[FloatArray]) -> FloatArray:
 
 
 def board_prior(target: Target, positions: FloatArray) -> FloatArray:
-    """Standard deviations (9,) of the board's shape, as they are known beforehand."""
+    """Standard deviations (9,) of the board's shape, as they are known beforehand.
+
+    The shape of a rig of points is none of the unknowns: its table is taken for what it is.
+    """
+    if target.kind == "points":
+        return np.full(len(BOARD_NAMES), np.inf)
     half = float(np.ptp(positions, axis=0).max()) / 2
     bows = np.full(len(_POWERS), _BOW_SIGMA_SHARE * half)
     return np.array([target.square_sigma_m / target.square_m, _ASPECT_SIGMA, *bows])

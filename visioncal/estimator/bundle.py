@@ -31,7 +31,7 @@ class BundleFit:
         camera: The intrinsics.
         cam_from_target: (v, 4, 4).
         residuals: (n, 2) [px].
-        sigma_px: Standard deviation of a corner's coordinate, by the residuals [px].
+        sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
         covariance: (4 + k, 4 + k) of the intrinsics, poses marginalised.
         settled: Whether the iteration came to rest.
     """
@@ -113,8 +113,7 @@ def _finished(
     stack: CornerStack, camera: Camera, poses: FloatArray, now: Reprojection, *, settled: bool
 ) -> BundleFit:
     information, _, _ = _blocks(stack, now).reduced(0.0)
-    freedom = 2 * len(stack.px) - 6 * len(poses) - len(information)
-    sigma_px = float(np.sqrt(np.sum(now.residuals**2) / max(freedom, 1)))
+    sigma_px = stack.sigma_px(now.residuals, 6 * len(poses) + len(information))
     spread = sigma_px**2 * covariance(information)
     return BundleFit(camera, poses, now.residuals, sigma_px, spread, settled)
 

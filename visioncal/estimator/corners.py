@@ -11,8 +11,12 @@ from typing import Self
 import numpy as np
 
 from visioncal.camera import project_with_jacobian
+from visioncal.chance import chi2_limit
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
+# Stated noise is contradicted by residuals that chance gives in one session of ten thousand, where
+# they are off by more than the rounding to the one digit that people state.
+_FALSE_ALARM, _ROUNDED = 1e-4, 1.3
 # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
 _LEAST_SIGMA_PX = 1e-6
 
@@ -34,6 +38,9 @@ class CornerStack:
         ids: (n,) each corner's number on the target.
         points: (n, 3) corners on the target [m].
         px: (n, 2) where they were seen [px].
+        weights: (n,) by how much more than others each corner is known, as a ratio of standard
+            deviations; None where all are known alike.
+        stated_px: Standard deviation of a corner of weight one, where it is stated [px].
     """
 
     views: tuple[int, ...]
@@ -43,11 +50,16 @@ class CornerStack:
     ids: IntArray
     points: FloatArray
     px: FloatArray
+    weights: FloatArray | None = None
+    stated_px: float | None = None
 
     @classmethod
     def of(cls, corners: Mapping[int, Corners], positions: FloatArray) -> Self:
         """Stacks the corners by view; `positions` are the target's (c, 3) corners [m]."""
-        counts = [len(it.ids) for it in corners.values()]
+        views = tuple(corners.values())
+        counts = [len(it.ids) for it in views]
+        weights = [np.ones(len(it.ids)) if it.weights is None else it.weights for it in views]
+        stated = {it.stated_px for it in views}
         return cls(
             tuple(corners),
             tuple(it.blur_px for it in corners.values()),
@@ -56,6 +68,8 @@ class CornerStack:
             np.concatenate([it.ids for it in corners.values()]),
             np.concatenate([positions[it.ids] for it in corners.values()]),
             np.concatenate([it.px for it in corners.values()]),
+            None if all(it.weights is None for it in views) else np.concatenate(weights),
+            stated.pop() if len(stated) == 1 else None,
         )
 
     def keep(self, mask: Mask) -> "CornerStack":
@@ -69,6 +83,8 @@ class CornerStack:
             self.ids[mask],
             self.points[mask],
             self.px[mask],
+            None if self.weights is None else self.weights[mask],
+            self.stated_px,
         )
 
     def with_points(self, points: FloatArray) -> "CornerStack":
@@ -79,6 +95,35 @@ class CornerStack:
     def counts(self) -> IntArray:
         """(v,) corners a view."""
         return np.diff(np.append(self.starts, len(self.px)))
+
+    def sigma_px(self, residuals: FloatArray, unknowns: int) -> float:
+        """Noise of a corner's coordinate: as it is stated, or else by the residuals [px].
+
+        Residuals that are larger than what is stated explains count, too.
+
+        Args:
+            residuals: (n, 2) of the stack [px].
+            unknowns: How many were fitted.
+        """
+        shown, off = self.shown_px(residuals, unknowns), self.contradicts(residuals, unknowns)
+        if self.stated_px is None or (off and shown > self.stated_px):
+            return shown
+        return self.stated_px
+
+    def shown_px(self, residuals: FloatArray, unknowns: int) -> float:
+        """Noise of a corner's coordinate by the residuals alone [px]; see `sigma_px`."""
+        freedom = max(residuals.size - unknowns, 1)
+        return float(np.sqrt(np.sum(residuals**2) / freedom))
+
+    def contradicts(self, residuals: FloatArray, unknowns: int) -> bool:
+        """Whether residuals show another noise than is stated; see `sigma_px`."""
+        freedom = residuals.size - unknowns
+        if self.stated_px is None or freedom < 1:
+            return False
+        ratio = self.shown_px(residuals, unknowns) / self.stated_px
+        low, high = chi2_limit(np.array([1.0 - _FALSE_ALARM, _FALSE_ALARM]), freedom) / freedom
+        above, below = ratio > max(np.sqrt(high), _ROUNDED), ratio < min(np.sqrt(low), 1 / _ROUNDED)
+        return bool(above or below)
 
     def sum_by_view(self, values: FloatArray) -> FloatArray:
         """Sums (n, ...) values over the corners of each view, to (v, ...)."""
@@ -101,7 +146,7 @@ class Reprojection:
     """Reprojection of a stack.
 
     Attributes:
-        residuals: (n, 2) predicted minus seen [px].
+        residuals: (n, 2) predicted minus seen, by the corners' weights [px].
         by_pose: (n, 2, 6) derivatives by each view's right perturbation of cam_from_target.
         by_intrinsics: (n, 2, k) derivatives by the intrinsics.
     """
@@ -152,6 +197,11 @@ def reproject(
         residuals[behind] = max(camera.resolution)
         by_pose[behind] = 0.0
         projection.by_intrinsics[behind] = 0.0
+    if stack.weights is not None:
+        # In place: each of the three belongs to this call alone.
+        residuals *= stack.weights[:, None]
+        by_pose *= stack.weights[:, None, None]
+        projection.by_intrinsics[:] *= stack.weights[:, None, None]
     return Reprojection(residuals, by_pose, projection.by_intrinsics)
 
 

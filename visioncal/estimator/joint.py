@@ -150,9 +150,15 @@ class Problem:
         return np.arange(len(self.lens) + SCALE, len(self.prior_sigma), len(BOARD_NAMES))
 
     @property
+    def printed(self) -> list[int]:
+        """Which boards are printed: a rig of points is what its table says."""
+        return [at for at, it in enumerate(self.scene.targets) if it.kind != "points"]
+
+    @property
     def shape(self) -> IntArray:
-        """Places of the boards' aspects and bends."""
-        return np.setdiff1d(np.arange(len(self.lens), len(self.prior_sigma)), self.scale)
+        """Places of the printed boards' aspects and bends."""
+        nothing = np.zeros(0, dtype=np.int64)
+        return np.concatenate([nothing, *(self.shape_of(board) for board in self.printed)])
 
     def shape_of(self, board: int) -> IntArray:
         """Places (8,) of one board's aspect and bend."""
@@ -167,7 +173,7 @@ class Problem:
     def has_spare_corners(self) -> bool:
         """Whether the views show more corners than it takes to free lens and board."""
         residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
-        return residuals >= _SPARE * len(self.prior_sigma)
+        return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
     @property
     def first(self) -> IntArray:
@@ -182,9 +188,9 @@ class Problem:
     def counted(self) -> IntArray:
         """What is open and counts in the covariance, whether it is free or not."""
         if self.scene.estimated or self.contested:
-            return np.union1d(self.lens, self.scale)
+            return np.union1d(self.lens, self.scale[self.printed])
         stated = self.scene.matrix_sigma_px is not None
-        return np.union1d(self.lens[:4] if stated else self.lens[:0], self.scale)
+        return np.union1d(self.lens[:4] if stated else self.lens[:0], self.scale[self.printed])
 
 
 def _lens_prior(scene: Scene) -> FloatArray:
@@ -303,8 +309,7 @@ def seen_at(problem: Problem, moving: IntArray, appearance: Appearance, poses: F
         poses: (m, 4, 4) `cam_from_target` to start from.
     """
     compressed = compress(problem.stack, problem.basis, appearance, poses)
-    freedom = compressed.residuals.size - 6 * len(poses) - len(moving)
-    sigma_px = float(np.sqrt(np.sum(compressed.residuals**2) / max(freedom, 1)))
+    sigma_px = problem.stack.sigma_px(compressed.residuals, 6 * len(poses) + len(moving))
     free = _known_beforehand(problem, moving, appearance, compressed, sigma_px)
     return Seen(compressed, free, sigma_px)
 

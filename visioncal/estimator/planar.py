@@ -1,4 +1,4 @@
-"""First guesses of a planar target's pose: both of the two that look almost alike."""
+"""First guesses of a target's pose: of a planar one both of the two that look almost alike."""
 
 from dataclasses import dataclass
 
@@ -11,6 +11,8 @@ from visioncal.types import Camera, FloatArray, Mask
 
 # A homography takes four points. Nearer to a line than this share of the target is on it.
 _FEWEST, _ON_LINE = 4, 1e-6
+# Points whose depth is under this share of their width are as good as in a plane.
+_FLAT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,10 @@ class PlanarPoses:
 
 
 def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
-    """Solves each view's pose in closed form (Collins and Bartoli 2014, IPPE; OpenCV).
+    """Solves each view's pose in closed form, by OpenCV.
+
+    Points of a plane by IPPE (Collins and Bartoli 2014), others by SQPnP (Terzakis and Lourakis
+    2020).
 
     Args:
         stack: The corners of v views.
@@ -48,8 +53,13 @@ def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
         points = stack.points[rows][usable]
         if not determines_pose(points):
             continue
+        flat = _flattened(points)
         _, rotations, translations, _ = cv2.solvePnPGeneric(
-            points, plane[rows][usable], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            points if flat is None else flat,
+            plane[rows][usable],
+            np.eye(3),
+            None,
+            flags=cv2.SOLVEPNP_SQPNP if flat is None else cv2.SOLVEPNP_IPPE,
         )
         found = [
             _pose(np.asarray(rotation, float), np.asarray(translation, float))
@@ -61,8 +71,19 @@ def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
     return PlanarPoses(poses[0], poses[1], solved)
 
 
+def _flattened(points: FloatArray) -> FloatArray | None:
+    """(n, 3) points in the plane that is nearest to them; None where that is not near."""
+    if not points[:, 2].any():
+        return points
+    middle = points.mean(axis=0)
+    _, spread, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if spread[2] > _FLAT * spread[1]:
+        return None
+    return np.asarray(points - np.outer((points - middle) @ axes[2], axes[2]))
+
+
 def determines_pose(points: FloatArray) -> bool:
-    """Whether (n, 3) points of a plane determine its pose: at least two lie off every line.
+    """Whether (n, 3) points determine a pose: at least two lie off every line.
 
     A line that all but one lie on passes through two of any three: three lines are enough to try.
     """

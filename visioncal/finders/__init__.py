@@ -26,3 +26,8 @@ def find_target(image: Image, target: Target) -> Seen | NotFound:
             return find_checkerboard(image, target)
         case "marker":
             return find_marker(image, target)
+        case "points":
+            return NotFound(
+                f"target {target.name} is a rig of points, which no image is searched for: "
+                "corners.csv has no rows of this view"
+            )

@@ -131,6 +131,7 @@ def reread_session(session: Session, candidate: Candidate) -> Session:
         session.images,
         target_document=target,
         robot_document=session.robot_document,
+        corners=session.corner_table,
     ).with_streams({name: _reread_stream(it, taken) for name, it in session.streams.items()})
     said = dict.fromkeys((*_note(candidate), *session.warnings, *reread.warnings))
     return replace(reread, warnings=tuple(said))

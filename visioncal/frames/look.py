@@ -1,6 +1,6 @@
 """A look through a calibrated camera: a target's pose in one image, and what moves it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from visioncal.frames.chain import Eye
 from visioncal.stages.pnp import ViewPoses, measure_poses
 from visioncal.targets import corner_positions, rotations
 from visioncal.threads import one_blas_thread
-from visioncal.types import Camera, Corners, FloatArray, Image, Target
+from visioncal.types import Camera, Corners, FloatArray, Image, IntArray, Target
 
 # Corners scatter more than this by chance in one look of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -159,7 +159,7 @@ def _fitted(
         if passed.is_open:
             break
         kept = passed.mask
-        corners = Corners(corners.view, corners.ids[kept], corners.px[kept], corners.blur_px)
+        corners = _chosen(corners, corners.ids[kept], np.flatnonzero(kept))
     return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
 
 
@@ -170,9 +170,15 @@ def _slopes(
     # Turned, corner i lies where corner p[i] was: what was seen as that one is i.
     ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
     order = np.argsort(ids)
-    turned = Corners(corners.view, ids[order], corners.px[order], corners.blur_px)
+    turned = _chosen(corners, ids[order], order)
     stack = CornerStack.of({turned.view: turned}, corner_positions(target))
     return _compressed(camera, stack, target, poses.cam_from_target[at : at + 1])
+
+
+def _chosen(corners: Corners, ids: IntArray, rows: IntArray) -> Corners:
+    """Some of the corners, in another order and by other numbers."""
+    weights = None if corners.weights is None else corners.weights[rows]
+    return replace(corners, ids=ids, px=corners.px[rows], weights=weights)
 
 
 def _compressed(

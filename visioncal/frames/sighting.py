@@ -213,7 +213,7 @@ def _poses(
     session: Session, calibration: Calibration, parent: Parent, asked: tuple[View, ...]
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
     """The robot's poses by view, and why views without one or without an image are of no use."""
-    lost = {it.number: "it has no image" for it in asked if not it.image}
+    lost = {it.number: "it has no image" for it in asked if not (it.image or it.has_corners)}
     if needs_robot(Eye.of(calibration), parent):
         reported = _flange(session, calibration, asked)
         lost = {it.view: it.reason for it in reported.rejections} | lost

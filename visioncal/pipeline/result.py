@@ -209,12 +209,15 @@ def _further(known: Known) -> dict[str, Any]:
         documents["clock"] = known.clock.document()
     if known.readings is not None:
         documents |= _instrument(known, known.readings)
-    if known.free is not None and not known.session.targets:
+    boards = known.session.boards
+    # A rig of points is what its table says.
+    printed = [it for it, (_, target) in enumerate(boards.items()) if target.kind != "points"]
+    if known.free is not None and printed and not known.session.targets:
         documents["board"] = _board(known, known.free, 0)
-    elif known.free is not None:
-        names = tuple(known.session.targets)
+    elif known.free is not None and printed:
+        names = tuple(boards)
         documents["boards"] = {
-            names[it]: _board(known, known.free, it) for it in sorted(known.boards)
+            names[it]: _board(known, known.free, it) for it in sorted(known.boards) if it in printed
         }
     documents |= _arm(known)
     if known.diagnosis is not None:

@@ -152,7 +152,7 @@ def _readings(known: Known) -> Known:
 
 
 def _detect(known: Known) -> Known:
-    if not any(view.image for view in known.session.views):
+    if not any(view.image or view.has_corners for view in known.session.views):
         return known
     found = detect(known.session, progress=known.progress)
     known = replace(known, corners=found.corners, resolution=found.resolution)
@@ -282,7 +282,7 @@ def _refine(known: Known) -> Known:
     scene, free, agreed = known.scene, known.free, known.agreed
     if agreed is None or known.solver != "joint":
         return known
-    if scene is None or free is None or not len(free.columns):
+    if scene is None or free is None or any(it is None for it in known.seen(known.used)):
         data = known.closure(known.used).merged(known.stops)
         edges = replace(agreed.edges, shared=data.unchanged)
         return replace(known, arm=arm_errors(_arm(known), data, edges))

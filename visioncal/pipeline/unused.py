@@ -43,10 +43,10 @@ def nothing_seen(known: Known) -> DataError:
     """What to raise where no view shows anything to calibrate by."""
     if known.corners and known.corners.keys() <= known.held_back:
         return all_held_back(known)
-    if not any(view.image for view in known.session.views):
+    if not any(view.image or view.has_corners for view in known.session.views):
         return DataError(
             f"session {known.session.name!r}: there are neither images nor measured poses.",
-            next_step="Give the views images, or cft_ or meas_ columns.",
+            next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
     return DataError(
         f"session {known.session.name!r}: no view shows the target.",

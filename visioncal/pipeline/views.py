@@ -14,7 +14,9 @@ from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import mean_transform
 from visioncal.types import Corners, FloatArray
 
-_NO_POSE = "no pose of the target: it has neither image nor cft_ nor meas_ columns"
+_NO_POSE = (
+    "no pose of the target: it has neither image nor rows in corners.csv nor cft_ nor meas_ columns"
+)
 
 
 def view_results(known: Known) -> tuple[ViewResult, ...]:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.errors import DataError
 from visioncal.targets import marked_squares, marker_cells
 from visioncal.types import FloatArray, Mask, Target
 
@@ -29,7 +30,11 @@ class Pattern:
 
 
 def draw_pattern(target: Target) -> Pattern:
-    """Draws a target: its corners are where `targets.corner_positions` has them."""
+    """Draws a target: its corners are where `targets.corner_positions` has them.
+
+    Raises:
+        DataError: It is a rig of points.
+    """
     side = target.square_m
     match target.kind:
         case "marker":
@@ -46,6 +51,8 @@ def draw_pattern(target: Target) -> Pattern:
         case "charuco":
             box = (0.0, 0.0, target.columns * side, target.rows * side)
             return Pattern(_charuco_loops(target), box, _QUIET_M)
+        case "points":
+            raise DataError(f"target {target.name} is a rig of points; a board can be printed.")
 
 
 def outlines(dark: Mask) -> tuple[FloatArray, ...]:

@@ -1,32 +1,61 @@
-"""The printed target as it is drawn: its pattern on a sheet, and its outline."""
+"""The target as it is drawn: its pattern on a sheet or its points, and its outline."""
 
 import cv2
 import numpy as np
 import rerun as rr
 
-from visioncal.targets import extent_m, marked_squares, marker_cells
+from visioncal.recording import colours
+from visioncal.targets import corner_positions, extent_m, marked_squares, marker_cells
 from visioncal.types import FloatArray, Image, Mask, Target
 
 # Enough to show the bits of the markers; the pattern of a large board still stays small.
 _SQUARE_PX, _LARGEST_PX = 48, 2000
+# A rig's points are drawn so large, as a share of its extent; and the edges of a unit box, in one.
+_DOT = 0.02
+_BOX = np.array(
+    [
+        *((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0)),
+        *((1, 0, 1), (1, 1, 1), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 1, 0), (0, 1, 1), (0, 0, 1)),
+    ]
+)
 
 
 def outline(target: Target) -> FloatArray:
-    """(4, 3) corners of the printed pattern in the target's frame [m], clockwise on the page."""
+    """(4, 3) corners of the printed pattern in the target's frame [m], clockwise on the page.
+
+    Those of a rig are of the middle of the box around its points.
+    """
     low, high = extent_m(target)
-    return np.array(
-        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
-    )
+    middle = float(np.mean([it[:, 2] for it in _ends(target)]))
+    corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
+    return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle)
+
+
+def _ends(target: Target) -> tuple[FloatArray, FloatArray]:
+    """The low and high ends (1, 3) of the box around a target's corners [m]."""
+    places = corner_positions(target)
+    return places.min(axis=0, keepdims=True), places.max(axis=0, keepdims=True)
 
 
 def closed_outline(target: Target) -> FloatArray:
-    """(5, 3) the outline with its first corner repeated, as a line strip needs it [m]."""
+    """(k, 3) the outline as a line strip [m]; of a rig, the edges of the box around it."""
+    if target.kind == "points":
+        low, high = _ends(target)
+        return np.asarray(low + _BOX * (high - low))
     corners = outline(target)
     return np.vstack([corners, corners[:1]])
 
 
-def sheet(target: Target) -> rr.Mesh3D:
-    """The pattern as a textured sheet in the target's frame."""
+def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
+    """The pattern as a textured sheet in the target's frame; of a rig, its points."""
+    if target.kind == "points":
+        return rr.Points3D(
+            corner_positions(target),
+            colors=colours.DETECTED,
+            radii=_DOT * target.square_m,
+            labels=list(map(str, target.point_numbers)),
+            show_labels=False,
+        )
     pattern = picture(target)
     return rr.Mesh3D(
         vertex_positions=outline(target),

@@ -23,16 +23,18 @@ from visioncal.files import sha256
 from visioncal.recording import paths
 from visioncal.session import Session, Stream, View
 from visioncal.session.columns import is_number
+from visioncal.session.corners import CornerTable
 from visioncal.version import __version__
 
-# 2: the writer's version, a mark behind the last view, and seals on the results; 3: streams.
-FORMAT = 3
+# 2: the writer's version, a mark behind the last view, and seals on the results; 3: streams;
+# 4: corners that another detector found.
+FORMAT = 4
 # In place of the number of views where that was not known from the start.
 UNKNOWN = -1
 
 _BLOB = "EncodedImage:blob"
 _HEADER, _ROW, _END = "visioncal.Session", "visioncal.Row", "visioncal.End"
-_STREAM = "visioncal.Stream"
+_STREAM, _CORNERS = "visioncal.Stream", "visioncal.Corners"
 _MEDIA_TYPES = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
@@ -54,6 +56,7 @@ class Header:
         target_json: The content of the target's file.
         robot_json: The robot's model.
         streams: The names of the streams, and as many seals of them behind.
+        corners: The seal of the corners that another detector found; empty where there are none.
     """
 
     rows: int
@@ -63,6 +66,7 @@ class Header:
     target_json: str
     robot_json: str
     streams: tuple[str, ...] = ()
+    corners: str = ""
 
     @classmethod
     def of(cls, session: Session, announced: int) -> "Header":
@@ -75,13 +79,16 @@ class Header:
             _to_json(session.target_document),
             _to_json(session.robot_document),
             (*session.streams, *map(stream_seal, session.streams.values())),
+            "" if session.corner_table is None else corner_seal(session.corner_table),
         )
 
     def seal(self) -> str:
         """SHA-256 of the content."""
         content = list(vars(self).values())
-        # Before the third format there were no streams.
-        return sha256(json.dumps(content if self.streams else content[:-1]).encode())
+        # Before the third format there were no streams, and before the fourth no corners.
+        while not content[-1] and len(content) > len(vars(self)) - 2:
+            content.pop()
+        return sha256(json.dumps(content).encode())
 
     @property
     def stream_seals(self) -> dict[str, str]:
@@ -143,6 +150,7 @@ def log_header(stream: rr.RecordingStream, header: Header) -> None:
         "target_json": pa.array([header.target_json], pa.string()),
         "robot_json": pa.array([header.robot_json], pa.string()),
         "streams": pa.array(header.streams, pa.string()),
+        "corners": pa.array([header.corners], pa.string()),
         "seal": pa.array([header.seal()], pa.string()),
     }
     stream.log(paths.SESSION, rr.DynamicArchetype(_HEADER, components=components), static=True)
@@ -184,6 +192,24 @@ def log_samples(recording: rr.RecordingStream, name: str, samples: Stream) -> No
     recording.log(paths.STREAMS, rr.DynamicArchetype(_STREAM, components=components))
 
 
+def corner_seal(corners: CornerTable) -> str:
+    """SHA-256 of the corners' rows."""
+    return sha256(json.dumps(corners.fact()).encode())
+
+
+def log_corners(recording: rr.RecordingStream, corners: CornerTable) -> None:
+    """Logs the corners that another detector found, of all views."""
+    sigmas = np.zeros(0) if corners.sigmas_px is None else corners.sigmas_px
+    components = {
+        "views": pa.array(corners.views, pa.int64()),
+        "points": pa.array(corners.points, pa.int64()),
+        "px": pa.array(corners.px.ravel(), pa.float64()),
+        "targets": pa.array(corners.targets, pa.string()),
+        "sigmas_px": pa.array(sigmas, pa.float64()),
+    }
+    recording.log(paths.CORNERS, rr.DynamicArchetype(_CORNERS, components=components), static=True)
+
+
 def log_end(stream: rr.RecordingStream, rows: int) -> None:
     """Logs that no row will follow."""
     components = {"rows": pa.array([rows], pa.int64())}
@@ -219,6 +245,7 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
         values["target_json"][0],
         values["robot_json"][0],
         tuple(values.get("streams") or ()),
+        (values.get("corners") or [""])[0],
     )
     if header.seal() != values["seal"][0]:
         raise ValueError("the session's declaration was changed or damaged after it was written")
@@ -251,6 +278,21 @@ def read_samples(batch: pa.RecordBatch) -> dict[str, Stream]:
         values.setflags(write=False)
         streams[name[0]] = Stream(tuple(columns), values)
     return streams
+
+
+def read_corners(batch: pa.RecordBatch) -> CornerTable:
+    """Reads the corners that another detector found."""
+    views, points, px, targets, sigmas_px = (
+        batch.column(f"{_CORNERS}:{it}")[0].as_py() or ()
+        for it in ("views", "points", "px", "targets", "sigmas_px")
+    )
+    return CornerTable(
+        np.array(views, dtype=np.int64),
+        np.array(points, dtype=np.int64),
+        np.array(px, dtype=float).reshape(-1, 2),
+        tuple(targets),
+        np.array(sigmas_px, dtype=float) if sigmas_px else None,
+    )
 
 
 def image_places(batch: pa.RecordBatch) -> dict[int, int]:

@@ -11,6 +11,7 @@ APPLICATION = "visioncal"
 SESSION = "/session"
 ROWS = "/session/rows"
 STREAMS = "/session/streams"
+CORNERS = "/session/corners"
 END = "/session/end"
 IMAGE = "/camera/image"
 

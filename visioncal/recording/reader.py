@@ -13,6 +13,7 @@ from visioncal.recording import codec, paths
 from visioncal.recording.frames import CHUNK, Frame, Scan, read_payload, scan
 from visioncal.recording.messages import record_batch
 from visioncal.session import Session, Stream
+from visioncal.session.corners import CornerTable
 
 _AGAIN = "Take the recording again from its origin, or calibrate the session's folder."
 _SHOWN_ROWS = 10
@@ -39,13 +40,15 @@ def read_session(path: Path) -> Session:
     scanned = scan(path)
     records = _read_records(scanned)
     complete = _complete_rows(path, records)
+    cells = [records.header.cells(records.rows[row]) for row in complete]
     session = Session.assemble(
         parse_toml(records.header.session_toml, "session.toml"),
         records.header.columns,
-        [records.header.cells(records.rows[row]) for row in complete],
+        cells,
         RecordedImages(path, records.images_by_name(complete)),
         target_document=codec.from_json(records.header.target_json),
         robot_document=codec.from_json(records.header.robot_json),
+        corners=_corners_of(path, records, cells),
     ).with_streams(_whole_streams(path, records))
     return replace(session, warnings=(*session.warnings, *_losses(scanned, records, len(complete))))
 
@@ -113,6 +116,7 @@ class _Records:
         rows: The rows, by their places in the session.
         images: The images, by the places of their rows.
         streams: What was read many times a second, by name.
+        corners: The corners that another detector found; None where they were not found.
         closed: How many rows there are by the mark behind the last one; None without the mark.
         damaged: How many chunks could not be read.
     """
@@ -121,6 +125,7 @@ class _Records:
     rows: Mapping[int, codec.Row]
     images: Mapping[int, _Image]
     streams: Mapping[str, Stream]
+    corners: CornerTable | None
     closed: int | None
     damaged: int
 
@@ -169,15 +174,25 @@ def _read_records(scanned: Scan) -> _Records:
     rows: dict[int, codec.Row] = {}
     images: dict[int, _Image] = {}
     streams: dict[str, Stream] = {}
+    corners: CornerTable | None = None
     damaged: list[Frame] = []
     closed: int | None = None
-    entities = (paths.SESSION, paths.STREAMS, paths.ROWS, paths.IMAGE, paths.END)
+    entities = (
+        paths.SESSION,
+        paths.STREAMS,
+        paths.CORNERS,
+        paths.ROWS,
+        paths.IMAGE,
+        paths.END,
+    )
     for frame, entity, batch in chunks(scanned, entities, damaged):
         try:
             if entity == paths.SESSION:
                 found = codec.read_header(batch, scanned.path)
             elif entity == paths.STREAMS:
                 streams |= codec.read_samples(batch)
+            elif entity == paths.CORNERS:
+                corners = codec.read_corners(batch)
             elif entity == paths.ROWS:
                 # Of two rows at one place, the later one was damaged into being there.
                 rows = codec.read_rows(batch) | rows
@@ -193,7 +208,7 @@ def _read_records(scanned: Scan) -> _Records:
     if version == 1 and scanned.finished:
         # The first format had no mark of its own.
         closed = header.rows
-    return _Records(header, rows, images, streams, closed, len(damaged))
+    return _Records(header, rows, images, streams, corners, closed, len(damaged))
 
 
 def _images(frame: Frame, batch: pa.RecordBatch) -> dict[int, _Image]:
@@ -234,6 +249,28 @@ def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
             next_step=_AGAIN,
         )
     return {name: found[name] for name in seals}
+
+
+def _corners_of(
+    path: Path, records: _Records, cells: Sequence[Sequence[str]]
+) -> CornerTable | None:
+    """The corners of the views that are complete; None where the session has none.
+
+    Raises:
+        DataError: They were damaged.
+    """
+    seal, found = records.header.corners, records.corners
+    if not seal:
+        return None
+    if found is None or codec.corner_seal(found) != seal:
+        raise DataError(
+            f"{path} is damaged: the corners of its views cannot be read or were changed after it "
+            "was written.",
+            culprits=["corners"],
+            next_step=_AGAIN,
+        )
+    at = records.header.columns.index("view")
+    return found.of_views([int(row[at]) for row in cells])
 
 
 def _complete_rows(path: Path, records: _Records) -> list[int]:

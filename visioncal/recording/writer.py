@@ -66,6 +66,8 @@ class RecordingWriter:
             for place, (name, samples) in enumerate(session.streams.items()):
                 self._recorder.at(place)
                 codec.log_samples(self._recorder.stream, name, samples)
+            if session.corner_table is not None:
+                codec.log_corners(self._recorder.stream, session.corner_table)
             self._recorder.keep()
             self._recorder.lay_out(blueprint)
 
@@ -147,7 +149,8 @@ class RecordingWriter:
     def _checked(self, cells: Sequence[str], image: bytes | None) -> View:
         """Refuses what could be written but not be read again."""
         where = f"row {len(self._numbers) + 1}"
-        (view,) = read_views(self._session.columns, [Row(where, tuple(cells))], "views.csv")
+        rows, corners = [Row(where, tuple(cells))], self._session.corner_table is not None
+        (view,) = read_views(self._session.columns, rows, "views.csv", with_corners=corners)
         check_images_can_be_used(self._session.declaration, [view])
         if view.number in self._numbers:
             raise DataError(

@@ -29,13 +29,15 @@ from visioncal.report import (
     uncertainty,
 )
 from visioncal.report.templating import template
-from visioncal.report.thumbnails import Thumbnail, thumbnail
+from visioncal.report.thumbnails import Thumbnail, drawn, thumbnail
 from visioncal.report.trends import residuals_over_joints
 from visioncal.session import Session
 from visioncal.types import Target
 from visioncal.version import __version__
 
 _MAX_REJECTED_PICTURES = 4
+# The grey of a picture whose image nobody has.
+_PAPER = 235
 
 
 def write_report(
@@ -262,12 +264,21 @@ class _Pictures:
     def _of(
         self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
     ) -> Thumbnail | None:
-        """A view's picture; None where it has no image, which the table of views says anyway."""
-        paths = [it.image for it in self.session.views if it.number == view.view and it.image]
-        if not paths or not self.session.images.exists(paths[0]):
+        """A view's picture; None where it has no image, which the table of views says anyway.
+
+        Corners that another detector found are drawn on nothing where there is no image of them.
+        """
+        shown = next((it for it in self.session.views if it.number == view.view), None)
+        if shown is None:
             return None
+        if not shown.image or not self.session.images.exists(shown.image):
+            resolution = self.session.resolution
+            if not shown.has_corners or resolution is None:
+                return None
+            nothing = np.full((resolution[1], resolution[0], 3), _PAPER, dtype=np.uint8)
+            return drawn(nothing, evidence, caption, view.view, magnify)
         try:
-            data = self.session.images.read(paths[0])
+            data = self.session.images.read(shown.image)
         except DataError:
             return None
         return thumbnail(data, evidence, caption, view.view, magnify)

@@ -74,8 +74,13 @@ def thumbnail(
         The picture, or None where the bytes are no image that can be shown.
     """
     pixels = decode_image(image_bytes, colour=True)
-    if isinstance(pixels, str):
-        return None
+    return None if isinstance(pixels, str) else drawn(pixels, evidence, caption, view, magnify)
+
+
+def drawn(
+    pixels: Image, evidence: ViewEvidence | None, caption: str, view: int, magnify: int
+) -> Thumbnail:
+    """Draws one view on its (h, w, 3) pixels; see `thumbnail`."""
     corners = None if evidence is None else evidence.corners
     if evidence is None or corners is None or len(corners.px) == 0:
         height, width = pixels.shape[:2]

@@ -14,8 +14,12 @@ _FAR_M, _WIDE_RAD = 20.0, 7.0
 
 
 def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) -> None:
-    """An image says nothing without the target that it shows and the camera that took it."""
-    with_image = [view.number for view in views if view.image]
+    """An image says nothing without the target that it shows and the camera that took it.
+
+    Raises:
+        DataError: One of these is not declared, and a view has an image, or corners of one.
+    """
+    with_image = [view for view in views if view.image or view.has_corners]
     for field, value, example in (
         (
             "target",
@@ -26,7 +30,8 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
     ):
         if with_image and value is None:
             raise DataError(
-                f"session.toml: {field} is missing, but view {with_image[0]} has an image.",
+                f"session.toml: {field} is missing, but view {with_image[0].number} has "
+                f"{'an image' if with_image[0].image else 'rows in corners.csv'}.",
                 culprits=[f"session.toml: {field}"],
                 next_step=f"Add {example}.",
             )

@@ -6,6 +6,7 @@ from datetime import date, time
 
 from visioncal.files import sha256
 from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES
+from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
@@ -19,6 +20,7 @@ def digest_facts(
     views: Sequence[View],
     images: ImageStore,
     streams: Mapping[str, Stream],
+    corners: CornerTable | None,
 ) -> str:
     """Computes the SHA-256 digest of a session's canonical content.
 
@@ -37,6 +39,8 @@ def digest_facts(
     }
     if streams:
         facts["streams"] = {name: stream.fact() for name, stream in streams.items()}
+    if corners is not None:
+        facts["corners"] = corners.fact()
     return sha256(json.dumps(_canonical(facts), sort_keys=True).encode())
 
 

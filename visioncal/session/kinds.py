@@ -13,8 +13,8 @@ _Test: TypeAlias = Callable[[View], bool]
 
 
 def is_seen(view: View) -> bool:
-    """Whether a camera saw what a row tells: it has an image, or a measured pose."""
-    return bool(view.image) or "cft_x_m" in view.numbers
+    """Whether a camera saw what a row tells: an image, corners of one, or a measured pose."""
+    return bool(view.image) or view.has_corners or "cft_x_m" in view.numbers
 
 
 def tells_robot(view: View) -> bool:

@@ -13,6 +13,7 @@ from visioncal.robot import robot_file
 from visioncal.session.digest import is_file
 from visioncal.session.document import Declaration
 from visioncal.session.images import ImageStore, inside_path
+from visioncal.targets import rig_csv
 
 
 def write_folder(
@@ -79,15 +80,28 @@ def _place_targets(
 ) -> dict[str, str]:
     if is_file(declaration.target):
         document["target"] = _place_inside(str(declaration.target), "target.toml")
-        return {document["target"]: tomli_w.dumps(contents)}
-    texts, several = {}, len(declaration.targets) > 1
+        return _target_texts(document["target"], contents)
+    texts: dict[str, str] = {}
+    several = len(declaration.targets) > 1
     for name, table in declaration.targets.items():
         if is_file(table.target):
             path = _place_inside(table.target, f"target_{name}.toml")
             kept = {**table.model_dump(), "target": path}
             document["targets"] = {**document["targets"], name: kept}
-            texts[path] = tomli_w.dumps(contents[name] if several else contents)
+            texts |= _target_texts(path, contents[name] if several else contents)
     return texts
+
+
+def _target_texts(path: str, content: Mapping[str, Any]) -> dict[str, str]:
+    """A target's file, and beside it the table of a rig's points."""
+    points = content.get("points")
+    if content.get("kind") != "points" or not isinstance(points, Mapping):
+        return {path: tomli_w.dumps(content)}
+    table = Path(path).with_suffix(".points.csv")
+    return {
+        path: tomli_w.dumps({**content, "points": table.name}),
+        table.as_posix(): rig_csv(points),
+    }
 
 
 def _place_robots(

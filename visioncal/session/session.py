@@ -15,11 +15,20 @@ from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
 from visioncal.session.boards import COLUMN, read_targets
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
+from visioncal.session.corners import (
+    FILE,
+    CornerTable,
+    check_points,
+    corners_by_view,
+    read_corners,
+    with_corners,
+    write_corners,
+)
 from visioncal.session.digest import digest_facts
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
-from visioncal.session.kinds import check_kinds_named, kind_warnings
+from visioncal.session.kinds import check_kinds_named, is_seen, kind_warnings
 from visioncal.session.observations import Observation, observations_of, stop_warnings
 from visioncal.session.outside import outside_warnings
 from visioncal.session.saving import placed_files, write_folder
@@ -33,7 +42,7 @@ from visioncal.session.streams import (
 )
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
-from visioncal.types import Camera, CameraKind, Mount, Target
+from visioncal.types import Camera, CameraKind, Corners, Mount, Target
 
 # The columns of a session without views.
 ALONE = ("view",)
@@ -56,6 +65,7 @@ class Session:
             name.
         targets: Several printed targets by name, in the session's order; empty for one or none.
         streams: What was read many times a second beside the views, by name.
+        corner_table: The corners that another detector found; None where there are none.
     """
 
     document: Mapping[str, Any]
@@ -68,6 +78,7 @@ class Session:
     robot_document: Mapping[str, Any] | None = None
     targets: Mapping[str, Target] = field(default_factory=dict)
     streams: Mapping[str, Stream] = field(default_factory=dict)
+    corner_table: CornerTable | None = None
 
     @classmethod
     def load(
@@ -113,6 +124,7 @@ class Session:
             FolderImages(path),
             folder=path,
             target_document=target_document,
+            corners=read_corners(path),
         )
         check_times(session.views)
         return session.with_streams(streams)
@@ -136,6 +148,7 @@ class Session:
         *,
         target_document: Mapping[str, Any] | None = None,
         robot_document: Mapping[str, Any] | None = None,
+        corners: CornerTable | None = None,
     ) -> "Session":
         """Builds a session from facts that were kept elsewhere, with the checks of `load`.
 
@@ -147,6 +160,7 @@ class Session:
             target_document: The content of the target's `.toml`, of several the contents by name;
                 needed where `document` names a file rather than a target that comes with visioncal.
             robot_document: The robot's model, of several the models by name; needed likewise.
+            corners: The corners that another detector found.
 
         Raises:
             DataError: A field, row or column is wrong.
@@ -159,6 +173,7 @@ class Session:
             images,
             target_document=target_document,
             robot_document=robot_document,
+            corners=corners,
         )
 
     def with_streams(self, streams: Mapping[str, Stream]) -> "Session":
@@ -187,6 +202,8 @@ class Session:
         texts["session.toml"] = tomli_w.dumps(document)
         if self.views or not self.streams:
             texts["views.csv"] = write_csv(self.columns, self.views)
+        if self.corner_table is not None:
+            texts[FILE] = write_corners(self.corner_table)
         texts |= {f"{FOLDER}/{name}.csv": write_stream(it) for name, it in self.streams.items()}
         paths = dict.fromkeys(view.image for view in self.views if view.image)
         write_folder(Path(folder), texts, self.images, tuple(paths))
@@ -205,7 +222,17 @@ class Session:
             self.views,
             self.images,
             self.streams,
+            self.corner_table,
         )
+
+    @cached_property
+    def corners(self) -> Mapping[int, Corners]:
+        """The corners that another detector found, by view, each numbered as its target's are."""
+        if self.corner_table is None:
+            return {}
+        shown = [view for view in self.views if view.has_corners]
+        board_of = {view.number: self.boards[self.board_of(view)] for view in shown}
+        return corners_by_view(self.corner_table, shown, self.declaration, board_of)
 
     @cached_property
     def declaration(self) -> Declaration:
@@ -289,7 +316,7 @@ class Session:
     @cached_property
     def is_read_by_instrument(self) -> bool:
         """Whether an instrument's readings are all that was observed: a camera comes before it."""
-        seen = any(view.image or view.cam_from_target() is not None for view in self.views)
+        seen = any(is_seen(view) for view in self.views)
         return not seen and any(view.reading_m is not None for view in self.views)
 
     @property
@@ -366,25 +393,29 @@ def _build(
     folder: Path | None = None,
     target_document: Mapping[str, Any] | None = None,
     robot_document: Mapping[str, Any] | None = None,
+    corners: CornerTable | None = None,
 ) -> Session:
     """Checks the facts of a session and puts them together."""
     declaration = read_declaration(document, "session.toml", observed=bool(rows))
-    views = read_views(columns, rows, "views.csv")
+    views = read_views(columns, rows, "views.csv", with_corners=corners is not None)
+    targets, target_document = read_targets(declaration, folder, target_document)
+    several = targets if len(targets) > 1 else {}
+    if corners is not None:
+        columns, views, corners = with_corners(columns, views, corners, tuple(several))
+    check_images_can_be_used(declaration, views)
     warnings = [
         *declaration_warnings(declaration, "session.toml"),
         *known.column_warnings(columns, "views.csv"),
         *view_warnings(views),
         *kind_warnings(declaration, views),
     ]
-    targets, target_document = read_targets(declaration, folder, target_document)
-    check_images_can_be_used(declaration, views)
     check_kinds_named(declaration, views)
     check_frames(declaration, views)
     if declaration.is_network:
         warnings += stop_warnings(declaration, views)
     robot_document, unknown = read_robots(declaration, folder, robot_document)
     warnings += [*unknown, *outside_warnings(declaration, folder)]
-    return Session(
+    session = Session(
         document,
         columns,
         views,
@@ -393,5 +424,11 @@ def _build(
         images,
         tuple(warnings),
         robot_document,
-        targets if len(targets) > 1 else {},
+        several,
+        corner_table=corners,
     )
+    if corners is not None:
+        seen = (view for view in views if view.has_corners)
+        shown = {view.number: session.boards[session.board_of(view)] for view in seen}
+        check_points(corners, [shown[it] for it in corners.views.tolist()])
+    return session

@@ -41,6 +41,7 @@ class View:
         stop: The robot stop that it shares with other rows, if it names one.
         numbers: The known numeric columns that are filled in this row, in their columns' units.
         text: The other columns that are filled in this row.
+        has_corners: Whether corners.csv has rows of it.
     """
 
     number: int
@@ -49,6 +50,7 @@ class View:
     stop: int | None = None
     numbers: Mapping[str, float] = field(default_factory=dict)
     text: Mapping[str, str] = field(default_factory=dict)
+    has_corners: bool = False
 
     @property
     def stamp_s(self) -> float | None:
@@ -117,7 +119,9 @@ class Row:
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
+    """What is wrong with a table, and where."""
+
     place: str
     words: str
 
@@ -180,13 +184,16 @@ def _quoted(cell: str) -> str:
     return '"' + cell.replace('"', '""') + '"' if needs_quotes else cell
 
 
-def read_views(columns: Sequence[str], rows: Sequence[Row], label: str) -> tuple[View, ...]:
+def read_views(
+    columns: Sequence[str], rows: Sequence[Row], label: str, *, with_corners: bool = False
+) -> tuple[View, ...]:
     """Reads and checks views.
 
     Args:
         columns: The column names.
         rows: The rows' cells, as text.
         label: The file's name, for messages.
+        with_corners: Whether what the views show may stand in corners.csv.
 
     Raises:
         DataError: Naming up to ten rows and columns that are wrong, the values that they hold and
@@ -194,10 +201,10 @@ def read_views(columns: Sequence[str], rows: Sequence[Row], label: str) -> tuple
     """
     known.check_header(columns, f"{label}, header")
     views: list[View] = []
-    problems: list[_Problem] = []
+    problems: list[Problem] = []
     first_seen: dict[int, str] = {}
     for row in rows:
-        reader = _RowReader(row, columns, [])
+        reader = _RowReader(row, columns, [], with_corners)
         view = reader.view()
         if view is not None:
             views.append(view)
@@ -206,11 +213,12 @@ def read_views(columns: Sequence[str], rows: Sequence[Row], label: str) -> tuple
                 reader.report("view", f"{view.number} is already the view of {earlier}")
         problems += reader.problems
     if problems:
-        raise _report(problems)
+        raise problems_error(problems)
     return tuple(views)
 
 
-def _report(problems: Sequence[_Problem]) -> DataError:
+def problems_error(problems: Sequence[Problem]) -> DataError:
+    """Words the first ten problems of a table."""
     shown = problems[:_SHOWN_PROBLEMS]
     more = len(problems) - len(shown)
     lines = [f"{problem.place}: {problem.words}." for problem in shown]
@@ -225,11 +233,12 @@ class _RowReader:
 
     row: Row
     columns: Sequence[str]
-    problems: list[_Problem]
+    problems: list[Problem]
+    with_corners: bool
 
     def report(self, column: str, words: str) -> None:
         place = f"{self.row.where}, column {column}" if column else self.row.where
-        self.problems.append(_Problem(place, words))
+        self.problems.append(Problem(place, words))
 
     def view(self) -> View | None:
         """Reads the row; None where it is so wrong that its problems are all there is."""
@@ -243,8 +252,8 @@ class _RowReader:
         cells = dict(zip(self.columns, self.row.cells, strict=True))
         if not cells["view"].strip():
             self.report("view", "it is empty; a whole number is needed")
-        number = self._take(cells, "view", _integer)
-        stop = self._take(cells, "stop", _integer)
+        number = self._take(cells, "view", read_integer)
+        stop = self._take(cells, "stop", read_integer)
         image = self._take(cells, "image", image_path)
         role = self._take(cells, "role", _role, keep=True)
         numbers = self._numbers(cells)
@@ -258,7 +267,7 @@ class _RowReader:
         # A row of a stop may tell no more than where one of several robots stood.
         stands = {"x_m", "q1_rad"} & numbers.keys() and stop is not None and "robot" in text
         observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text or stands
-        if not image and not observed and not self.problems:
+        if not image and not observed and not self.with_corners and not self.problems:
             self.report("image", "it is empty, and the row has neither cft_* nor meas_* nor point")
         if role == "intrinsics" and not self.problems:
             self._check_lens_alone(image or "", numbers)
@@ -283,7 +292,7 @@ class _RowReader:
         numbers = {}
         for column in self.columns:
             if known.is_number(column):
-                value = self._take(cells, column, _number)
+                value = self._take(cells, column, read_number)
                 if value is not None:
                     numbers[column] = value
         return numbers
@@ -303,7 +312,7 @@ class _RowReader:
 
     def _check_lens_alone(self, image: str, numbers: Mapping[str, float]) -> None:
         poses = [it for it in ("x_m", "q1_rad", "cft_x_m", "meas_x_m") if it in numbers]
-        if not image or poses:
+        if not (image or self.with_corners) or poses:
             self.report(
                 "role",
                 "intrinsics is for an image that tells of the camera's lens alone, but the row has "
@@ -337,7 +346,12 @@ class _RowReader:
                     )
 
 
-def _number(cell: str) -> float:
+def read_number(cell: str) -> float:
+    """Reads a finite number.
+
+    Raises:
+        DataError: It is none.
+    """
     value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
     if not math.isfinite(value):
         comma = " (the decimal sign is a point)" if "," in cell else ""
@@ -345,7 +359,12 @@ def _number(cell: str) -> float:
     return value
 
 
-def _integer(cell: str) -> int:
+def read_integer(cell: str) -> int:
+    """Reads a whole number.
+
+    Raises:
+        DataError: It is none.
+    """
     if not _INTEGER.fullmatch(cell) or len(cell) > 18:
         raise DataError(f"{cell!r} is no whole number")
     return int(cell)

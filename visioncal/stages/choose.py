@@ -13,7 +13,7 @@ from visioncal.solvers import SOLVERS
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import rotations
 from visioncal.transforms import invert, rotation_angle
-from visioncal.types import Corners, FloatArray, IntArray, Mask, Rejection, Target
+from visioncal.types import FloatArray, IntArray, Mask, Rejection, Target
 
 # A rival that closes the chain within this many times the chosen one's distance is as likely.
 CLEAR_RATIO = 3.0
@@ -205,7 +205,9 @@ def chosen(view: ViewPoses, pick: int, target: Target | None, first: int = 0) ->
         # Turned, corner i lies where corner rotations[i] was: what was seen as that one is i.
         renumbered = np.argsort(rotations(target)[turn])[corners.ids - first] + first
         order = np.argsort(renumbered)
-        corners = Corners(corners.view, renumbered[order], corners.px[order], corners.blur_px)
+        weights = None if corners.weights is None else corners.weights[order]
+        px = corners.px[order]
+        corners = replace(corners, ids=renumbered[order], px=px, weights=weights)
     return replace(
         view,
         corners=corners,

@@ -1,4 +1,7 @@
-"""Finds the target in every image, on threads, with a reason where it cannot be used."""
+"""Finds the target in every image, on threads, with a reason where it cannot be used.
+
+Where another detector has found the corners of a view (corners.csv), these are taken.
+"""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,6 +11,7 @@ from dataclasses import dataclass
 from threading import Condition
 
 import cv2
+import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.estimator.planar import determines_pose
@@ -16,10 +20,15 @@ from visioncal.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXE
 from visioncal.finders.headers import MOST_PIXELS, claimed_size
 from visioncal.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.session import Session, View
-from visioncal.targets import corner_positions
+from visioncal.session.kinds import name_of
+from visioncal.targets import corner_positions, point_numbers
 from visioncal.threads import Shared
 from visioncal.types import Corners, Image, IntArray, Progress, Rejection, Target
 
+# A homography takes four points.
+_FEWEST_GIVEN = 4
+# Corners that others have found may lie outside the image by this share of it.
+_OUTSIDE = 0.1
 # Images looked at to tell which layout was printed.
 _LAYOUT_SAMPLE = 3
 
@@ -91,7 +100,7 @@ def detect(
     """Finds in each image of a session the target that its row is said to show.
 
     Args:
-        session: A session with a target; its views without images are passed over.
+        session: A session with a target; its views without images or corners are passed over.
         options: What a view needs.
         progress: Told after each image.
         among: Those of its views to look at; all where None.
@@ -100,13 +109,15 @@ def detect(
         The corners and the rejected views.
 
     Raises:
-        DataError: No view shows the target, an image has another size than the camera, or the
-            board that was printed has another layout than the one declared.
+        DataError: No view shows the target, an image has another size than the camera, the size
+            of the images is not known, or the board that was printed has another layout than the
+            one declared.
     """
     options = options or DetectOptions()
     if not session.boards:
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
-    views = [view for view in (session.views if among is None else among) if view.image]
+    among = session.views if among is None else among
+    views = [view for view in among if view.image and not view.has_corners]
     looks: list[_Look] = []
     room = _Room()
     with (
@@ -117,10 +128,13 @@ def detect(
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
-    resolution = _common_resolution(session, views, looks)
+    given = [view for view in among if view.has_corners]
+    resolution = _common_resolution(session, views, looks, given)
     for name in session.boards:
         _check_layout(session, name, views, looks)
-    found = [look.found for look in looks]
+    own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
+    own |= {view.number: _given(session, view, resolution) for view in given}
+    found = [own[view.number] for view in among if view.number in own]
     return Detections(
         {it.view: it for it in found if isinstance(it, Corners)},
         tuple(it for it in found if isinstance(it, Rejection)),
@@ -210,6 +224,30 @@ def look_for(
     return Corners(view, seen.ids, seen.px, blur), False
 
 
+def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners | Rejection:
+    """The corners that another detector has found in a view, or why they do not serve."""
+    corners, target = session.corners[view.number], session.boards[session.board_of(view)]
+    positions = corner_positions(target)
+    size = np.array(resolution)
+    beyond = np.any((corners.px < -_OUTSIDE * size) | (corners.px > (1 + _OUTSIDE) * size), axis=1)
+    trouble = ""
+    if beyond.any():
+        at = int(np.argmax(beyond))
+        u_px, v_px = corners.px[at].tolist()
+        trouble = (
+            f"corners.csv: point {point_numbers(target)[corners.ids[at]]} at ({u_px:g}, "
+            f"{v_px:g}) px lies far outside the image of {size[0]} x {size[1]} px"
+        )
+    elif len(corners.ids) < _FEWEST_GIVEN:
+        trouble = (
+            f"too few corners: corners.csv has {len(corners.ids)} of {len(positions)}, needs "
+            f"{_FEWEST_GIVEN}"
+        )
+    elif not determines_pose(positions[corners.ids]):
+        trouble = f"corners on one line: all {len(corners.ids)} of corners.csv, or all but one"
+    return Rejection(view.number, trouble) if trouble else corners
+
+
 def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
     needed = 4 if target.kind == "marker" else options.min_corners
     if len(ids) < needed:
@@ -222,10 +260,21 @@ def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptio
 
 
 def _common_resolution(
-    session: Session, views: Sequence[View], looks: Sequence[_Look]
+    session: Session, views: Sequence[View], looks: Sequence[_Look], given: Sequence[View]
 ) -> tuple[int, int]:
     """Checks that all images have the camera's size, or at least one size between them."""
     sizes = [look.resolution for look in looks if look.resolution is not None]
+    stated = _stated_resolution(session, given)
+    if not sizes and given:
+        if stated is None:
+            raise DataError(
+                f"session {session.name!r}: the camera's resolution is missing, and no image that "
+                "is searched tells it.",
+                culprits=["session.toml: camera.resolution"],
+                next_step="Add resolution = [width, height] to [camera]: the size of the images "
+                "in which the corners were found.",
+            )
+        return stated
     if not sizes:
         reasons = [f"view {it.view}: {it.reason}" for it in _rejections(looks)]
         raise DataError(
@@ -250,6 +299,16 @@ def _common_resolution(
             next_step="Correct [camera] resolution in session.toml, or take out these views.",
         )
     return wanted
+
+
+def _stated_resolution(session: Session, given: Sequence[View]) -> tuple[int, int] | None:
+    """The size of the images of the camera that took some views, if it is stated."""
+    names = {name_of(session.declaration, "camera", view) for view in given}
+    for name in names & session.cameras.keys():
+        table = session.cameras[name]
+        if table.resolution is not None:
+            return table.resolution[0], table.resolution[1]
+    return session.resolution
 
 
 def _rejections(looks: Sequence[_Look]) -> list[Rejection]:

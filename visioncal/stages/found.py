@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.estimator.closure import held_shift
+from visioncal.estimator.corners import CornerStack
 from visioncal.estimator.joint import (
     Arm,
     MeasuredScale,
@@ -27,7 +28,10 @@ def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
         arm: The robot's side.
         state: The answer.
     """
-    for board in range(len(problem.scale)):
+    words, is_doubt = _noise_words(problem, state)
+    if is_doubt:
+        yield words
+    for board in problem.printed:
         yield from _scale_finding(problem, arm, state, board)
         yield from _bend_finding(problem, state, board)
     yield from _lens_finding(problem, state)
@@ -35,7 +39,10 @@ def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
 
 def remarks(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
     """Says what was found that is no reason for doubt; as `findings`."""
-    for board in range(len(problem.scale)):
+    words, is_doubt = _noise_words(problem, state)
+    if words and not is_doubt:
+        yield words
+    for board in problem.printed:
         measured = _measured(problem, arm, state, board)
         if measured is not None and not measured.contradicts:
             yield (
@@ -47,6 +54,39 @@ def remarks(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
             "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
             f"{_lens_steps(problem, state)} px."
         )
+
+
+def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tuple[str, bool]:
+    """Whether corners scatter otherwise than corners.csv states, in words; empty where not.
+
+    Args:
+        stack: The corners.
+        residuals: (n, 2) by their weights [px].
+        unknowns: How many were fitted to them.
+
+    Returns:
+        The words, and whether it is a reason for doubt: less scatter than is stated is none.
+    """
+    stated, shown = stack.stated_px, stack.shown_px(residuals, unknowns)
+    if stated is None or not stack.contradicts(residuals, unknowns):
+        return "", False
+    more = shown > stated
+    advice = (
+        "by the scatter. Look for errors of the detector, the lens or the target that sigma_px "
+        "leaves out."
+        if more
+        else "by what is stated. State what the detector errs by, or leave sigma_px out."
+    )
+    return (
+        f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
+        f"(sigma_px of a typical corner). The result goes {advice}",
+        more,
+    )
+
+
+def _noise_words(problem: Problem, state: State) -> tuple[str, bool]:
+    stack, residuals = problem.stack, state.seen.compressed.residuals
+    return noise_words(stack, residuals, 6 * len(stack.views) + len(state.moving))
 
 
 def _scale_finding(problem: Problem, arm: Arm, state: State, board: int) -> Iterator[str]:

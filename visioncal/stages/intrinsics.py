@@ -52,7 +52,7 @@ class Intrinsics:
     Attributes:
         camera: The intrinsics.
         covariance: (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
-        sigma_px: Standard deviation of a corner's coordinate, by the residuals [px].
+        sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
         rejections: Views whose residual is no noise.
         warnings: What the views do not determine, in words.
     """
@@ -71,7 +71,7 @@ def estimate_intrinsics(
     model: CameraKind,
     options: IntrinsicsOptions | None = None,
 ) -> Intrinsics:
-    """Estimates the intrinsics from views of a planar target (Zhang 2000).
+    """Estimates the intrinsics from views of targets (Zhang 2000 where these are planar).
 
     Args:
         corners: The corners by view.
@@ -152,12 +152,18 @@ def _first_fit(
 
 
 def _focal_starts(stack: CornerStack, resolution: tuple[int, int]) -> Iterator[float]:
-    points = np.split(stack.points.astype(np.float32), stack.starts[1:])
-    px = np.split(stack.px.astype(np.float32), stack.starts[1:])
-    zhang = cv2.initCameraMatrix2D(points, px, resolution)[0, 0]
-    if np.isfinite(zhang) and 0.1 * resolution[0] < zhang < 20 * resolution[0]:
-        yield float(zhang)
+    if _is_flat(stack):
+        points = np.split(stack.points.astype(np.float32), stack.starts[1:])
+        px = np.split(stack.px.astype(np.float32), stack.starts[1:])
+        zhang = cv2.initCameraMatrix2D(points, px, resolution)[0, 0]
+        if np.isfinite(zhang) and 0.1 * resolution[0] < zhang < 20 * resolution[0]:
+            yield float(zhang)
     yield from (share * resolution[0] for share in _FOCAL_WIDTHS)
+
+
+def _is_flat(stack: CornerStack) -> bool:
+    """Whether all targets are planes of constant z, as printed ones are."""
+    return not stack.points[:, 2].any()
 
 
 def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
@@ -208,7 +214,7 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[str]:
     """Says what the views do not determine, and what about the views is the cause."""
     sigma = np.sqrt(np.diag(fit.covariance))
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
-    causes = list(_causes(fit))
+    causes = list(_causes(fit)) if _is_flat(stack) else []
     advice = f" {' '.join(causes)}" if causes else " Add views, tilted and near the image's edges."
     if focal > _FOCAL_LIMIT:
         yield f"The corners alone tell the focal length to {100 * focal:.1f} % only.{advice}"

@@ -102,8 +102,7 @@ def estimate_poses(
             reasons |= passed.reasons
             stack, starts = _started(stack.keep(passed.mask), camera, reasons)
             fit = fit_poses(stack, camera, starts[0])
-        freedom = 2 * len(stack.px) - 6 * len(stack.views) - lens_unknowns
-        sigma_px = float(np.sqrt(np.sum(fit.residuals**2) / max(freedom, 1)))
+        sigma_px = stack.sigma_px(fit.residuals, 6 * len(stack.views) + lens_unknowns)
         views = _with_rivals(stack, camera, fit, starts[1], sigma_px, targets)
     return Poses(views, tuple(Rejection(*item) for item in reasons.items()), sigma_px)
 
@@ -247,4 +246,7 @@ def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
 def _surviving(stack: CornerStack, at: int) -> Corners:
     """The corners of a view that the gate let pass."""
     rows = slice(stack.starts[at], stack.starts[at] + stack.counts[at])
-    return Corners(stack.views[at], stack.ids[rows], stack.px[rows], stack.blurs[at])
+    weights = None if stack.weights is None else stack.weights[rows]
+    return Corners(
+        stack.views[at], stack.ids[rows], stack.px[rows], stack.blurs[at], weights, stack.stated_px
+    )

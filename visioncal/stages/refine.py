@@ -192,7 +192,7 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
 
     One after the other: a board that is off misleads about the others, too.
     """
-    for _ in answer.problem.scale:
+    for _ in answer.problem.printed:
         other = _wrongly_sized(answer, arm)
         if other is None:
             return answer
@@ -211,7 +211,7 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
 def _wrongly_sized(answer: _Answer, arm: Arm) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     problem, state = answer.problem, answer.state
-    held = np.flatnonzero(~np.isin(problem.scale, state.moving)).tolist()
+    held = [it for it in problem.printed if problem.scale[it] not in state.moving]
     measured = [measured_scale(problem, arm, state, board) for board in held]
     # An arm whose links may all be too long is hard to tell from a board that is too large.
     other = [it for it in measured if (it.is_another if arm.errors is None else it.contradicts)]

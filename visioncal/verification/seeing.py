@@ -189,8 +189,7 @@ def _noise_px(known: Known) -> float:
     stack = CornerStack.of(corners, shaped)
     poses = np.array([known.poses[view].cam_from_target[0] for view in corners])
     left = reproject(stack, free.appearance.camera, poses).residuals
-    freedom = left.size - 6 * len(corners)
-    return float(np.sqrt(np.sum(left**2) / max(freedom, 1)))
+    return stack.sigma_px(left, 6 * len(corners))
 
 
 def _with_its_targets(session: Session, footing: Footing) -> Session:
@@ -204,7 +203,7 @@ def _with_its_targets(session: Session, footing: Footing) -> Session:
     """
     known, shown = footing.targets, session.boards
     if len(known) < 2 and len(shown) < 2:
-        if any(view.image for view in session.views):
+        if any(view.image or view.has_corners for view in session.views):
             _check_targets(session, footing)
         return session
     name = ""

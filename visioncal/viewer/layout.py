@@ -48,7 +48,7 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
     results = () if calibration is None else calibration.views
     contents = _Contents(
-        any(view.image for view in session.views),
+        any(view.image or view.has_corners for view in session.views),
         min(joints, default=0),
         not all(view.used for view in results),
         calibration is not None and bool(calibration.frames),

@@ -72,6 +72,11 @@ class Looks:
         """Places (b,) of the boards' scales."""
         return np.arange(self.boards.start, self.boards.stop, len(BOARD_NAMES))
 
+    @property
+    def printed(self) -> list[int]:
+        """Which boards are printed; see `Problem.printed`."""
+        return next(iter(self.problems.values())).printed
+
     def shape_of(self, board: int) -> IntArray:
         """Places (8,) of one board's aspect and bend."""
         start = int(self.scales[board])
@@ -92,7 +97,7 @@ class Looks:
     @property
     def first(self) -> IntArray:
         """What is free from the start: sizes, lenses that were estimated or are to be refined."""
-        free = [self.scales]
+        free = [self.scales[self.printed]]
         for name, problem in self.problems.items():
             scene, lens = problem.scene, self.lenses[name]
             known = scene.matrix_sigma_px is not None and scene.mode != "hold"
@@ -125,8 +130,8 @@ class Looks:
             compressed = compress(problem.stack, problem.basis, appearance, self.poses[begin:end])
             places = self.places(name)
             open_values = int(np.isin(places, free).sum())
-            freedom = compressed.residuals.size - 6 * (end - begin) - open_values
-            sigma = float(np.sqrt(np.sum(compressed.residuals**2) / max(freedom, 1)))
+            unknowns = 6 * (end - begin) + open_values
+            sigma = problem.stack.sigma_px(compressed.residuals, unknowns)
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
             pull[places] += weight * compressed.shared_pull

@@ -1,0 +1,332 @@
+"""corners.csv: where images show known points of the targets, as another detector found them."""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean, read_text_inside, sha256
+from visioncal.session.boards import COLUMN
+from visioncal.session.document import Declaration
+from visioncal.session.kinds import name_of
+from visioncal.session.table import Problem, View, problems_error, read_integer, read_number
+from visioncal.targets import point_numbers
+from visioncal.types import Corners, FloatArray, IntArray, Target
+
+FILE = "corners.csv"
+_NEEDED = ("view", "point", "u_px", "v_px")
+_SIGMA = "sigma_px"
+
+
+@dataclass(frozen=True, eq=False)
+class CornerTable:
+    """The rows of corners.csv, n in all, with their numbers as they were read.
+
+    Attributes:
+        views: (n,) the view of each.
+        points: (n,) its number on the target.
+        px: (n, 2) where it was seen [px].
+        targets: (n,) the target's name; empty where the row does not say it.
+        sigmas_px: (n,) standard deviation per axis [px]; None where it is not stated.
+    """
+
+    views: IntArray
+    points: IntArray
+    px: FloatArray
+    targets: tuple[str, ...]
+    sigmas_px: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def of_views(self, views: Sequence[int]) -> "CornerTable":
+        """The corners of some views."""
+        rows = np.flatnonzero(np.isin(self.views, views))
+        return CornerTable(
+            self.views[rows],
+            self.points[rows],
+            self.px[rows],
+            tuple(self.targets[at] for at in rows),
+            None if self.sigmas_px is None else self.sigmas_px[rows],
+        )
+
+    def fact(self) -> dict[str, object]:
+        """What of it counts for the session's digest, free of how the numbers are spelt."""
+        sigmas = np.zeros(0) if self.sigmas_px is None else self.sigmas_px
+        # Adding zero turns -0.0 into 0.0.
+        numbers = np.concatenate([self.views, self.points, (self.px + 0.0).ravel(), sigmas])
+        data = np.ascontiguousarray(numbers, dtype="<f8").tobytes()
+        return {"rows": len(self), "targets": self.targets, "values": sha256(data)}
+
+
+def read_corners(folder: Path) -> CornerTable | None:
+    """Reads the corners of a session's folder; None where there are none.
+
+    Raises:
+        DataError: A column is missing or a cell is wrong; it is named.
+    """
+    return parse_corners(read_text_inside(folder, FILE)) if (folder / FILE).exists() else None
+
+
+def parse_corners(text: str) -> CornerTable:
+    """Reads the text of a corners.csv.
+
+    Raises:
+        DataError: A column is missing or a cell is wrong; it is named.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""))
+    columns = [name.strip() for name in next(reader, [])]
+    known = (*_NEEDED, COLUMN, _SIGMA)
+    missing = [name for name in _NEEDED if name not in columns]
+    other = [it for it in columns if it not in known or columns.count(it) > 1]
+    if missing or other:
+        hints = [it for it in (did_you_mean(name, known) for name in other) if it]
+        raise DataError(
+            f"{FILE}, header: its columns are {', '.join(columns)}; {', '.join(_NEEDED)} are "
+            f"needed, {COLUMN} and {_SIGMA} may be there, and others are not read.",
+            culprits=[f"{FILE}: {it}" for it in (*missing, *other)],
+            next_step=hints[0] if hints else "",
+        )
+    problems: list[Problem] = []
+    lines = [
+        _line(columns, cells, f"{FILE}, line {reader.line_num}", problems)
+        for cells in reader
+        if any(cell.strip() for cell in cells)
+    ]
+    stated = [it.sigma_px is not None for it in lines]
+    if any(stated) and not all(stated) and not problems:
+        place = f"{lines[stated.index(False)].place}, column {_SIGMA}"
+        problems.append(Problem(place, "it is empty; all rows state it, or none"))
+    if problems:
+        raise problems_error(problems)
+    sigmas = [it.sigma_px for it in lines if it.sigma_px is not None]
+    return CornerTable(
+        np.array([it.view for it in lines], dtype=np.int64),
+        np.array([it.point for it in lines], dtype=np.int64),
+        np.array([it.px for it in lines], dtype=float).reshape(-1, 2),
+        tuple(it.target for it in lines),
+        np.array(sigmas, dtype=float) if sigmas else None,
+    )
+
+
+@dataclass(frozen=True)
+class _Line:
+    place: str
+    view: int
+    point: int
+    px: tuple[float, float]
+    target: str
+    sigma_px: float | None
+
+
+def _line(
+    columns: Sequence[str], cells: Sequence[str], place: str, problems: list[Problem]
+) -> _Line:
+    """Reads one row; what is wrong with it is added to the problems."""
+    row = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
+    numbers: dict[str, float] = {}
+    if len(cells) != len(columns):
+        words = f"it has {len(cells)} fields, but the header has {len(columns)} columns"
+        problems.append(Problem(place, words))
+        row = {}
+    for name in (*_NEEDED, _SIGMA):
+        cell = row.get(name, "")
+        if not row or (name == _SIGMA and not cell):
+            continue
+        try:
+            numbers[name] = (read_integer if name in _NEEDED[:2] else read_number)(cell)
+        except DataError as error:
+            problems.append(Problem(f"{place}, column {name}", error.message.rstrip(".")))
+    sigma_px = numbers.get(_SIGMA)
+    if sigma_px is not None and sigma_px <= 0.0:
+        words = f"{sigma_px:g} px is no standard deviation; a number above 0 is needed"
+        problems.append(Problem(f"{place}, column {_SIGMA}", words))
+    view, point, u_px, v_px = (numbers.get(name, 0.0) for name in _NEEDED)
+    return _Line(place, int(view), int(point), (u_px, v_px), row.get(COLUMN, ""), sigma_px)
+
+
+def write_corners(table: CornerTable) -> str:
+    """Writes corners as the text of a corners.csv that reads as the same numbers."""
+    columns = [*_NEEDED, *([COLUMN] if any(table.targets) else [])]
+    rows = [
+        [str(view), str(point), repr(u_px), repr(v_px), *([target] if len(columns) > 4 else [])]
+        for view, point, (u_px, v_px), target in zip(
+            table.views.tolist(),
+            table.points.tolist(),
+            table.px.tolist(),
+            table.targets,
+            strict=True,
+        )
+    ]
+    if table.sigmas_px is not None:
+        columns.append(_SIGMA)
+        for row, sigma_px in zip(rows, table.sigmas_px.tolist(), strict=True):
+            row.append(repr(sigma_px))
+    return "".join(",".join(row) + "\n" for row in (columns, *rows))
+
+
+def with_corners(
+    columns: tuple[str, ...], views: Sequence[View], table: CornerTable, names: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[View, ...], CornerTable]:
+    """Marks the views that corners are of; one that shows several targets gets a row for each.
+
+    Args:
+        columns: The columns of views.csv.
+        views: Its rows.
+        table: The corners.
+        names: The session's several targets; empty where there is one.
+
+    Returns:
+        Columns and rows, with further rows behind the others, and the corners as they belong to
+        them. Rows that one was made into share its stop.
+
+    Raises:
+        DataError: A view is unknown, or the target of a row is unknown, not said, or another than
+            its view shows.
+    """
+    rows = {view.number: view for view in views}
+    own = [rows[it].text.get(COLUMN, "").strip() if it in rows else "" for it in table.views]
+    problems = list(_target_problems(table, rows, own, names))
+    if problems:
+        raise problems_error(problems)
+    if not names:
+        has = set(table.views.tolist())
+        return columns, tuple(replace(it, has_corners=it.number in has) for it in views), table
+    shown = [said or of_view for said, of_view in zip(table.targets, own, strict=True)]
+    numbers = table.views.copy()
+    made: list[View] = []
+    new, stop = (1 + max([0, *it]) for it in (rows, (view.stop or 0 for view in views)))
+    for number in list(rows):
+        mine = np.flatnonzero(table.views == number)
+        boards = list(dict.fromkeys(shown[at] for at in mine))
+        if not boards:
+            continue
+        if len(boards) > 1 and rows[number].stop is None:
+            rows[number], stop = replace(rows[number], stop=stop), stop + 1
+        rows[number] = _showing(rows[number], boards[0])
+        for board in boards[1:]:
+            made.append(replace(_showing(rows[number], board), number=new))
+            numbers[[at for at in mine if shown[at] == board]] = new
+            new += 1
+    more = [it for it in ("stop", COLUMN) if it not in columns]
+    told = {"stop": any(it.stop is not None for it in rows.values()), COLUMN: True}
+    return (
+        (*columns, *(it for it in more if told[it])),
+        (*rows.values(), *made),
+        replace(table, views=numbers, targets=tuple(shown)),
+    )
+
+
+def _showing(view: View, board: str) -> View:
+    return replace(view, has_corners=True, text={**view.text, COLUMN: board})
+
+
+def _target_problems(
+    table: CornerTable, rows: Mapping[int, View], own: Sequence[str], names: Sequence[str]
+) -> Iterator[Problem]:
+    """What is wrong with the rows' views and targets."""
+    first = next((it for it in table.targets if it), "")
+    for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
+        place = f"{FILE}, row {at + 1}"
+        if view not in rows:
+            yield Problem(f"{place}, column view", f"views.csv has no view {view}")
+        elif not names and target not in ("", first):
+            words = f"{target!r} beside {first!r}, but session.toml declares one target"
+            yield Problem(f"{place}, column {COLUMN}", words)
+        elif names and not (target or own[at]):
+            words = f"it is empty, and so is view {view}'s; one of {', '.join(names)} is needed"
+            yield Problem(f"{place}, column {COLUMN}", words)
+        elif names and target and target not in names:
+            words = f"{target!r} is not declared; session.toml declares {', '.join(names)}"
+            yield Problem(f"{place}, column {COLUMN}", words)
+        elif names and target and own[at] not in ("", target):
+            words = (
+                f"{target!r}, but views.csv says that view {view} shows {own[at]!r}; a view that "
+                "shows both has a row for each there, or names none"
+            )
+            yield Problem(f"{place}, column {COLUMN}", words)
+
+
+def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
+    """Checks that the points are the targets', and each there once a view.
+
+    Args:
+        table: The corners.
+        boards: (n,) the target that each is of.
+
+    Raises:
+        DataError: They are not; it names them.
+    """
+    numbers = {it: frozenset(point_numbers(it)) for it in dict.fromkeys(boards)}
+    problems: list[Problem] = []
+    seen: dict[tuple[int, int], int] = {}
+    for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
+        place, target = f"{FILE}, row {at + 1}, column point", boards[at]
+        earlier = seen.setdefault(key, at)
+        if key[1] not in numbers[target]:
+            words = f"target {target.name} has no point {key[1]}; {_range(target)}"
+            problems.append(Problem(place, words))
+        elif earlier != at:
+            words = f"point {key[1]} of view {key[0]} is there twice, first in row {earlier + 1}"
+            problems.append(Problem(place, words))
+    if problems:
+        raise problems_error(problems)
+
+
+def _range(target: Target) -> str:
+    numbers = point_numbers(target)
+    return f"its {len(numbers)} points have the numbers {min(numbers)} to {max(numbers)}"
+
+
+def corners_by_view(
+    table: CornerTable,
+    views: Sequence[View],
+    declaration: Declaration,
+    board_of: Mapping[int, Target],
+) -> dict[int, Corners]:
+    """The corners of views, each numbered as its target's corners are.
+
+    Stated standard deviations are taken relative to that of the typical corner of their camera.
+
+    Args:
+        table: The corners.
+        views: The views to take them of.
+        declaration: What the session declares.
+        board_of: The target that each view shows, by its number.
+    """
+    order = np.argsort(table.views, kind="stable")
+    cuts = np.flatnonzero(np.diff(table.views[order])) + 1
+    rows_of = {int(table.views[it[0]]): it for it in np.split(order, cuts) if len(it)}
+    camera_of = {view.number: name_of(declaration, "camera", view) for view in views}
+    typical = _typical_px(table, rows_of, camera_of)
+    index = {
+        target: {number: at for at, number in enumerate(point_numbers(target))}
+        for target in dict.fromkeys(board_of.values())
+    }
+    found = {}
+    for view in (it.number for it in views if it.number in rows_of):
+        rows = rows_of[view]
+        ids = np.array([index[board_of[view]][int(it)] for it in table.points[rows]], np.int64)
+        order = np.argsort(ids)
+        rows, stated_px = rows[order], typical.get(camera_of[view])
+        sigmas = table.sigmas_px
+        weights = None if sigmas is None or stated_px is None else stated_px / sigmas[rows]
+        found[view] = Corners(view, ids[order], table.px[rows], 0.0, weights, stated_px)
+    return found
+
+
+def _typical_px(
+    table: CornerTable, rows_of: Mapping[int, IntArray], camera_of: Mapping[int, str]
+) -> dict[str, float]:
+    """The median of the standard deviations that are stated of each camera's corners [px]."""
+    if table.sigmas_px is None:
+        return {}
+    mine: dict[str, list[FloatArray]] = {}
+    for view, camera in camera_of.items():
+        if view in rows_of:
+            mine.setdefault(camera, []).append(table.sigmas_px[rows_of[view]])
+    return {camera: float(np.median(np.concatenate(it))) for camera, it in mine.items()}
