@@ -18,6 +18,7 @@ from visioncal.estimator.observability import (
 )
 from visioncal.figures import figure
 from visioncal.files import some_of
+from visioncal.stages.found import noise_words
 from visioncal.types import FloatArray
 
 # A board whose size is off by more of its own sigmas than this is another than was stated.
@@ -231,6 +232,20 @@ def _noisy(
                     "other images: calibrate it by itself.",
                 )
             )
+    return found
+
+
+def noise_warnings(solved: Solved) -> list[str]:
+    """Words cameras whose corners scatter more than corners.csv states."""
+    if (seen := solved.seen) is None:
+        return []
+    found = []
+    for (name, problem), it in zip(seen.looks.problems.items(), seen.compressed, strict=True):
+        stack, lens = problem.stack, seen.looks.lenses[name]
+        free = int(((seen.free >= lens.start) & (seen.free < lens.stop)).sum())
+        words, is_doubt = noise_words(stack, it.residuals, 6 * len(stack.views) + free)
+        if is_doubt:
+            found.append(f"{name}: {words}")
     return found
 
 

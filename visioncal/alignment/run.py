@@ -19,7 +19,13 @@ from visioncal.alignment.faults import (
     residuals,
     versions,
 )
-from visioncal.alignment.judging import check_determined, judge, size_warnings, weakest_link
+from visioncal.alignment.judging import (
+    check_determined,
+    judge,
+    noise_warnings,
+    size_warnings,
+    weakest_link,
+)
 from visioncal.alignment.looking import Looked, look_around
 from visioncal.alignment.priors import prior_components
 from visioncal.alignment.solving import Solved, sensors_of, solve
@@ -148,6 +154,7 @@ def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
         *pushed_bases(solved),
         *solved.cell.session.warnings,
         *looked.warnings,
+        *noise_warnings(solved),
         *size_warnings(solved, spread),
         *(it.doubt for it in measured if it.is_contradicted),
     ]

@@ -129,6 +129,13 @@ def locate_command(
         wanted = None if target is None else _target(target)
         if session is not None:
             shown = _chosen(session, view)
+            if wanted is not None and any(it.has_corners for it in shown):
+                raise DataError(
+                    f"--target: session {session.name!r} has corners of its own target "
+                    "(corners.csv), and no image is searched.",
+                    culprits=["--target"],
+                    next_step="Leave it out, or name one image.",
+                )
             session = session if wanted is None else replace(session, target=wanted)
             found = _by_views(session, shown, known, origin_m, sigma_px, quiet=as_json)
         else:

@@ -97,7 +97,7 @@ def scene_of(
                 next_step="Leave it out, or record without --plan.",
             )
         read = read_plan(plan)
-        return Scene(read.cell.mount, read.cell.target, read.cell.robot, read)
+        return Scene(read.cell.mount, _findable(read.cell.target), read.cell.robot, read)
     if target is None:
         raise DataError(
             "record: --plan or --target is needed to know what to look for.",
@@ -106,10 +106,21 @@ def scene_of(
         )
     return Scene(
         mount or "eye-in-hand",
-        target_from_document(described_target(target), target),
+        _findable(target_from_document(described_target(target), target)),
         None if robot is None else load_robot(robot),
         None,
     )
+
+
+def _findable(target: Target) -> Target:
+    """Refuses a rig of points, which is not found in images."""
+    if target.kind == "points":
+        raise DataError(
+            f"record: target {target.name} is a rig of points, which no image is searched for.",
+            culprits=["--target"],
+            next_step="Record with a printed board, or write views.csv and corners.csv yourself.",
+        )
+    return target
 
 
 def facts_of(scene: Scene, cell: LiveCell, name: str) -> Facts:

@@ -70,8 +70,9 @@ def see(
         seen: The target's corners, or the (h, w) grey image to find them in.
         target: What is seen.
         label: What the image is called in messages.
-        sigma_px: Noise of a corner's coordinate [px]; the calibration's where None. Corners that
-            scatter significantly more count with what they show, and a warning says so.
+        sigma_px: Noise of a corner's coordinate [px]; where None, what is stated with the corners,
+            or else the calibration's. Corners that scatter significantly more count with what they
+            show, and a warning says so.
 
     Raises:
         DataError: The target is not in the image, its corners do not determine a pose, or they do
@@ -79,7 +80,7 @@ def see(
     """
     corners = seen if isinstance(seen, Corners) else _found(eye, seen, target, label)
     _check(corners, target, label)
-    noise_px = eye.noise_px(sigma_px)
+    noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
     with one_blas_thread():
         poses, corners, squares = _fitted(eye.camera, corners, target, label, noise_px)
         looks = [_slopes(eye.camera, poses, at, corners, target) for at in range(len(poses.turns))]

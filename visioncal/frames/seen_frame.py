@@ -210,9 +210,9 @@ def camera_details(calibration: Calibration) -> dict[str, Any]:
 
 def _method(placed: _Placed, point: FloatArray) -> str:
     count, target = int(placed.seen.agrees.sum()), placed.shown.target
-    words = {"charuco": "ChArUco board", "checkerboard": "checkerboard", "marker": "marker"}
+    words = {"charuco": "ChArUco board", "points": "rig"}
     images = "one image" if count == 1 else f"{count} images"
-    told = f"{words[target.kind]} {target.name} seen in {images}"
+    told = f"{words.get(target.kind, target.kind)} {target.name} seen in {images}"
     if not point.any():
         return told
     return f"{told}; its point ({', '.join(f'{it:.6g}' for it in 1e3 * point)}) mm"

@@ -21,6 +21,7 @@ from visioncal.types import FloatArray, Progress, Rejection, Target
 # A stated lens that differs by more of its focal length is another camera's: an estimate is
 # nearer.
 _OTHER_LENS = 0.03
+_NO_IMAGE = "it has no image"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,8 @@ def sighting(
     target = _checked(session, calibration)
     asked = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, parent, asked)
+    given = {it.number for it in asked if it.has_corners}
+    lost = {view: why for view, why in lost.items() if why != _NO_IMAGE or view not in given}
     views = _usable(session, asked, target, lost)
     seen = detect(session, progress=progress, among=views)
     lost |= {it.view: it.reason for it in seen.rejections}
@@ -213,7 +216,7 @@ def _poses(
     session: Session, calibration: Calibration, parent: Parent, asked: tuple[View, ...]
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
     """The robot's poses by view, and why views without one or without an image are of no use."""
-    lost = {it.number: "it has no image" for it in asked if not (it.image or it.has_corners)}
+    lost = {it.number: _NO_IMAGE for it in asked if not it.image}
     if needs_robot(Eye.of(calibration), parent):
         reported = _flange(session, calibration, asked)
         lost = {it.view: it.reason for it in reported.rejections} | lost

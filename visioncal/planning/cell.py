@@ -7,6 +7,7 @@ import numpy as np
 from visioncal.errors import DataError
 from visioncal.estimator.closure import Noise
 from visioncal.robot import Robot
+from visioncal.targets import corner_positions
 from visioncal.transforms import exp, invert
 from visioncal.types import Camera, FloatArray, Mount, Target
 
@@ -122,6 +123,13 @@ class PlanCell:
     spread: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        if corner_positions(self.target)[:, 2].any():
+            raise DataError(
+                f"target {self.target.name} is a rig of points outside the plane z = 0 of its "
+                "frame: which of them a view will show is not known, and no stops are planned.",
+                culprits=[f"target {self.target.name}"],
+                next_step="Plan with a flat board in the rig's place.",
+            )
         for name, edge in (("x", self.x), ("z", self.z)):
             _check_pose(f"the guess of {name}", edge)
         for name in ("sigma_rad", "sigma_m"):

@@ -214,14 +214,16 @@ def stated(cell: PlanCell) -> Free:
     positions = corner_positions(cell.target)
     shape = board_prior(cell.target, positions)
     look = Appearance(cell.camera, np.zeros(len(shape)))
+    # The places of a rig's points are what its table says.
+    sized = np.array([] if cell.target.kind == "points" else [SCALE], dtype=np.int64)
     return Free(
         look,
         board_basis(positions),
         positions,
-        np.array([len(look.values) - len(shape) + SCALE]),
-        np.array([True]),
-        np.array([[shape[SCALE] ** -2.0]]),
-        np.zeros(1),
+        len(look.values) - len(shape) + sized,
+        np.ones(len(sized), dtype=bool),
+        np.diag(shape[sized] ** -2.0),
+        np.zeros(len(sized)),
     )
 
 

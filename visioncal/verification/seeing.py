@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from reprlib import repr as shorten
 
 import numpy as np
 
@@ -258,8 +259,8 @@ def _check_targets(session: Session, footing: Footing) -> None:
         for field in _differing(known, target):
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} has {field} = "
-                f"{theirs.get(field)!r}, and the calibration was made with {ours.get(field)!r}: it "
-                "is another target.",
+                f"{shorten(theirs.get(field))}, and the calibration was made with "
+                f"{shorten(ours.get(field))}: it is another target.",
                 culprits=[f"target: {field}"],
                 next_step="Verify with the target that was calibrated with, as it was described "
                 "then.",
