@@ -78,7 +78,8 @@ def parse_corners(text: str) -> CornerTable:
     Raises:
         DataError: A column is missing or a cell is wrong; it is named.
     """
-    reader = csv.reader(io.StringIO(text, newline=""))
+    # Rows are numbered by their lines: between them no line may be blank.
+    reader = csv.reader(io.StringIO(text.rstrip(), newline=""))
     columns = [name.strip() for name in next(reader, [])]
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]
@@ -92,11 +93,7 @@ def parse_corners(text: str) -> CornerTable:
             next_step=hints[0] if hints else "",
         )
     problems: list[Problem] = []
-    lines = [
-        _line(columns, cells, f"{FILE}, line {reader.line_num}", problems)
-        for cells in reader
-        if any(cell.strip() for cell in cells)
-    ]
+    lines = [_line(columns, cells, f"{FILE}, line {reader.line_num}", problems) for cells in reader]
     stated = [it.sigma_px is not None for it in lines]
     if any(stated) and not all(stated) and not problems:
         place = f"{lines[stated.index(False)].place}, column {_SIGMA}"
@@ -231,7 +228,7 @@ def _target_problems(
     """What is wrong with the rows' views and targets."""
     first = next((it for it in table.targets if it), "")
     for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
-        place = f"{FILE}, row {at + 1}"
+        place = f"{FILE}, line {at + 2}"
         if view not in rows:
             yield Problem(f"{place}, column view", f"views.csv has no view {view}")
         elif not names and target not in ("", first):
@@ -265,13 +262,13 @@ def check_points(table: CornerTable, boards: Sequence[Target]) -> None:
     problems: list[Problem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
-        place, target = f"{FILE}, row {at + 1}, column point", boards[at]
+        place, target = f"{FILE}, line {at + 2}, column point", boards[at]
         earlier = seen.setdefault(key, at)
         if key[1] not in numbers[target]:
             words = f"target {target.name} has no point {key[1]}; {_range(target)}"
             problems.append(Problem(place, words))
         elif earlier != at:
-            words = f"point {key[1]} of view {key[0]} is there twice, first in row {earlier + 1}"
+            words = f"point {key[1]} of view {key[0]} is there twice, first in line {earlier + 2}"
             problems.append(Problem(place, words))
     if problems:
         raise problems_error(problems)
