@@ -26,7 +26,8 @@ def compressed(cell, change=None):
     appearance = Appearance(cell.options.camera, np.zeros(len(BOARD_NAMES)))
     if change is not None:
         appearance = appearance.moved(change)
-    return compress(stack, board_basis(positions), appearance, cell.cam_from_target)
+    scales = np.array([9 + SCALE])
+    return compress(stack, board_basis(positions), appearance, cell.cam_from_target, scales)
 
 
 def test_poses_and_cost_follow_lens_and_board_as_their_derivatives_say():

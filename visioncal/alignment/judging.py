@@ -241,9 +241,8 @@ def noise_warnings(solved: Solved) -> list[str]:
         return []
     found = []
     for (name, problem), it in zip(seen.looks.problems.items(), seen.compressed, strict=True):
-        stack, lens = problem.stack, seen.looks.lenses[name]
-        free = int(((seen.free >= lens.start) & (seen.free < lens.stop)).sum())
-        words, is_doubt = noise_words(stack, it.residuals, 6 * len(stack.views) + free)
+        free = np.flatnonzero(np.isin(seen.looks.places(name), seen.free))
+        words, is_doubt = noise_words(problem.stack, it.residuals, problem.unknowns(it, free))
         if is_doubt:
             found.append(f"{name}: {words}")
     return found
@@ -256,7 +255,7 @@ def size_warnings(solved: Solved, spread: FloatArray) -> list[str]:
         return []
     found = []
     for board in looks.printed:
-        place = int(looks.scales[board])
+        (place,) = looks.scale_of(board)
         (at,) = solved.columns_of(np.array([place]))
         scale, prior = float(looks.values[place]), float(looks.prior_sigma[place])
         sigma = float(np.hypot(np.sqrt(spread[at, at]), prior))

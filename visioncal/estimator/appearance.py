@@ -4,10 +4,13 @@ A printed board is stretched, longer one way than the other, and bent. In the ta
 corner p lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + z(x, y)`, z being a polynomial of second
 and third order. What of it is an offset or a tilt belongs to the board's pose and is taken out, so
 that the target's frame is that of the plane which fits the corners best.
+
+The points of a rig are where its table has them, or near there, each by what it is known to.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -17,6 +20,7 @@ from visioncal.estimator.corners import CornerStack, reproject
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.poses import fit_poses
 from visioncal.estimator.shared import Shared
+from visioncal.targets import corner_positions
 from visioncal.types import Camera, FloatArray, IntArray, Mask, Target
 
 SCALE, ASPECT = 0, 1
@@ -31,6 +35,8 @@ _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 # What is known of any printed board: its sides differ by 0.1 % or so, and it is bent by a hundredth
 # of its size at the most.
 _ASPECT_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-2
+# A rig of more points is taken for exact: each adds three unknowns that all views share.
+MOST_LOOSE = 100
 # So many times what is known keeps a value in its place against any residuals.
 _ANCHOR = 1e12
 
@@ -56,19 +62,38 @@ def board_basis(positions: FloatArray) -> FloatArray:
     return basis
 
 
-def boards_basis(positions: Sequence[FloatArray]) -> FloatArray:
-    """Derivatives of several boards' corners by all of their shapes, (c, 3, 9 b)."""
-    parts = [board_basis(it).reshape(-1, len(BOARD_NAMES)) for it in positions]
-    return np.asarray(block_diag(*parts).reshape(-1, 3, len(BOARD_NAMES) * len(parts)))
+def shape_basis(target: Target) -> FloatArray:
+    """Derivatives (c, 3, s) of a target's corners by its shape.
 
-
-def board_prior(target: Target, positions: FloatArray) -> FloatArray:
-    """Standard deviations (9,) of the board's shape, as they are known beforehand.
-
-    The shape of a rig of points is none of the unknowns: its table is taken for what it is.
+    A printed board's are those of `board_basis`, of an exact rig there are none, and of another one
+    the places of its points are the shape.
     """
+    positions = corner_positions(target)
+    if target.kind != "points":
+        return board_basis(positions)
+    size = len(board_prior(target))
+    return np.eye(3 * len(positions))[:, :size].reshape(len(positions), 3, size)
+
+
+def boards_basis(targets: Sequence[Target]) -> FloatArray:
+    """Derivatives of several targets' corners by all of their shapes, (c, 3, s)."""
+    parts = [shape_basis(it) for it in targets]
+    flat = block_diag(*(it.reshape(3 * len(it), it.shape[2]) for it in parts))
+    return np.asarray(flat.reshape(len(flat) // 3, 3, flat.shape[1]))
+
+
+def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]:
+    """Where each target's shape stands among all of them, the first one's at `first`."""
+    ends = first + np.cumsum([0, *(len(board_prior(it)) for it in targets)])
+    return tuple(slice(*it) for it in pairwise(ends.tolist()))
+
+
+def board_prior(target: Target) -> FloatArray:
+    """Standard deviations (s,) of the target's shape, as they are known beforehand."""
     if target.kind == "points":
-        return np.full(len(BOARD_NAMES), np.inf)
+        sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= MOST_LOOSE else ()
+        return np.repeat(sigmas, 3).astype(float)
+    positions = corner_positions(target)
     half = float(np.ptp(positions, axis=0).max()) / 2
     bows = np.full(len(_POWERS), _BOW_SIGMA_SHARE * half)
     return np.array([target.square_sigma_m / target.square_m, _ASPECT_SIGMA, *bows])
@@ -80,8 +105,8 @@ class Appearance:
 
     Attributes:
         camera: The intrinsics.
-        board: (9 b,) the shapes of all boards, each in the order of `BOARD_NAMES`; zero for the
-            stated ones.
+        board: (s,) the shapes of all targets, printed ones in the order of `BOARD_NAMES`; zero for
+            the stated ones.
     """
 
     camera: Camera
@@ -89,11 +114,11 @@ class Appearance:
 
     @property
     def values(self) -> FloatArray:
-        """(k + 9 b,) the intrinsics and the boards' shapes."""
+        """(k + s,) the intrinsics and the boards' shapes."""
         return np.concatenate([intrinsics(self.camera), self.board])
 
     def moved(self, step: FloatArray) -> "Appearance":
-        """Returns the appearance after a (k + 9 b,) step."""
+        """Returns the appearance after a (k + s,) step."""
         values = self.values + step
         lens = len(values) - len(self.board)
         return Appearance(with_intrinsics(self.camera, values[:lens]), values[lens:])
@@ -105,7 +130,7 @@ class Free:
 
     Attributes:
         appearance: The values that the views' poses were made with.
-        basis: (c, 3, 9 b) of `boards_basis`, by corner number.
+        basis: (c, 3, s) of `boards_basis`, by corner number.
         positions: (c, 3) corners of the flat boards, each in its own frame [m].
         columns: (k,) the free ones' places among the appearance's values.
         anchored: (k,) mask of those that stay where they are, and count in the covariance only.
@@ -171,15 +196,21 @@ class Compressed:
 
 
 def compress(
-    stack: CornerStack, basis: FloatArray, appearance: Appearance, starts: FloatArray
+    stack: CornerStack,
+    basis: FloatArray,
+    appearance: Appearance,
+    starts: FloatArray,
+    scales: IntArray | None = None,
 ) -> Compressed:
     """Compresses corners to normal equations in each view's pose and the shared appearance.
 
     Args:
         stack: The corners of v views, at their places on the flat boards.
-        basis: (c, 3, 9 b) of `boards_basis`, by corner number.
+        basis: (c, 3, s) of `boards_basis`, by corner number.
         appearance: Where to linearise.
         starts: (v, 4, 4) `cam_from_target` to start from.
+        scales: Places of the boards' scales among the appearance's values, which views alone do
+            not tell.
     """
     shape = basis[stack.ids]
     bent = stack.with_points(stack.points + shape @ appearance.board)
@@ -193,9 +224,9 @@ def compress(
     information = flat.T @ flat + np.einsum("vik,vij->kj", between, answer)
     pull = flat.T @ now.residuals.reshape(-1)
     # A larger board farther away looks the same: what is left is rounding.
-    at = np.arange(now.by_intrinsics.shape[2] + SCALE, len(pull), len(BOARD_NAMES))
-    information[at] = information[:, at] = 0.0
-    pull[at] = 0.0
+    if scales is not None:
+        information[scales] = information[:, scales] = 0.0
+        pull[scales] = 0.0
     return Compressed(
         fit.cam_from_target,
         fit.information,

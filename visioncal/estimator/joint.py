@@ -5,7 +5,7 @@ of frames is closed over all stops with what is left open of these. Linearising 
 until it stays, is Gauss-Newton's method on the whole problem.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +14,13 @@ from visioncal.chance import chi2_limit
 from visioncal.errors import ConvergenceError
 from visioncal.estimator.appearance import (
     BOARD_NAMES,
-    SCALE,
     Appearance,
     Compressed,
     Free,
     board_prior,
     boards_basis,
     compress,
+    shape_slices,
 )
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.boards import Boards
@@ -28,7 +28,7 @@ from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure,
 from visioncal.estimator.corners import CornerStack, floored_sigma_px
 from visioncal.estimator.linalg import covariance
 from visioncal.estimator.measured import Measured
-from visioncal.targets import corner_positions, first_corners, numbered_positions
+from visioncal.targets import first_corners, numbered_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
@@ -103,8 +103,8 @@ class Problem:
         scene: The scene.
         stack: The corners.
         positions: (c, 3) corners of the flat boards, each in its own frame [m].
-        basis: (c, 3, 9 b) of `boards_basis`.
-        prior_sigma: (k + 9 b,) what lens and boards are known to; inf where nothing is known.
+        basis: (c, 3, s) of `boards_basis`.
+        prior_sigma: (k + s,) what lens and boards are known to; inf where nothing is known.
         contested: Whether given intrinsics are held although the corners speak against them.
     """
 
@@ -119,12 +119,12 @@ class Problem:
     def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "Problem":
         """Puts the problem together from the corners by view."""
         positions = numbered_positions(scene.targets)
-        priors = [board_prior(it, corner_positions(it)) for it in scene.targets]
+        priors = [board_prior(it) for it in scene.targets]
         return cls(
             scene,
             CornerStack.of(corners, positions),
             positions,
-            boards_basis([corner_positions(it) for it in scene.targets]),
+            boards_basis(scene.targets),
             np.concatenate([_lens_prior(scene), *priors]),
         )
 
@@ -145,24 +145,41 @@ class Problem:
         return np.arange(len(self.prior_sigma) - self.basis.shape[2])
 
     @property
-    def scale(self) -> IntArray:
-        """Places (b,) of the boards' scales."""
-        return np.arange(len(self.lens) + SCALE, len(self.prior_sigma), len(BOARD_NAMES))
+    def printed(self) -> list[int]:
+        """Which targets are printed: those that have a scale, and may be bent."""
+        return [at for at, it in enumerate(self.scene.targets) if it.kind != "points"]
 
     @property
-    def printed(self) -> list[int]:
-        """Which boards are printed: a rig of points is what its table says."""
-        return [at for at, it in enumerate(self.scene.targets) if it.kind != "points"]
+    def scale(self) -> IntArray:
+        """Places of the printed boards' scales."""
+        return self._joined(self.scale_of(board) for board in self.printed)
 
     @property
     def shape(self) -> IntArray:
         """Places of the printed boards' aspects and bends."""
-        nothing = np.zeros(0, dtype=np.int64)
-        return np.concatenate([nothing, *(self.shape_of(board) for board in self.printed)])
+        return self._joined(self.shape_of(board) for board in self.printed)
+
+    @property
+    def points(self) -> IntArray:
+        """Places of the rigs' points, as far as these are not exact."""
+        rigs = set(range(len(self.scene.targets))) - set(self.printed)
+        return self._joined(self.points_of(rig) for rig in sorted(rigs))
+
+    def scale_of(self, board: int) -> IntArray:
+        """Place (1,) of one printed board's scale."""
+        return self.points_of(board)[:1]
 
     def shape_of(self, board: int) -> IntArray:
-        """Places (8,) of one board's aspect and bend."""
-        return np.arange(self.scale[board] + 1, self.scale[board] + len(BOARD_NAMES))
+        """Places (8,) of one printed board's aspect and bend."""
+        return self.points_of(board)[1:]
+
+    def points_of(self, target: int) -> IntArray:
+        """Places of all that is unknown of where one target's corners lie on it."""
+        mine = shape_slices(self.scene.targets, len(self.lens))[target]
+        return np.arange(mine.start, mine.stop)
+
+    def _joined(self, places: Iterable[IntArray]) -> IntArray:
+        return np.concatenate([self.lens[:0], *places])
 
     def corners_of(self, board: int) -> slice:
         """The rows of one board's corners in `positions`."""
@@ -175,22 +192,40 @@ class Problem:
         residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
         return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
+    def unknowns(self, compressed: Compressed, moving: IntArray) -> int:
+        """How many unknowns the corners have told, the poses among them.
+
+        Where a rig's points are known well beforehand, corners tell little of them, and residuals
+        are no smaller for their sake.
+        """
+        rigs = np.intersect1d(self.points, moving)
+        sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
+        told = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
+        share = told / (told + floored_sigma_px(sigma_px) ** 2)
+        exact = len(moving) - len(rigs)
+        return 6 * len(compressed.information) + exact + round(float(share.sum()))
+
+    def sigma_px(self, compressed: Compressed, moving: IntArray) -> float:
+        """Noise of a corner's coordinate [px]; see `CornerStack.sigma_px`."""
+        return self.stack.sigma_px(compressed.residuals, self.unknowns(compressed, moving))
+
     @property
     def first(self) -> IntArray:
         """What is free from the start."""
         if self.scene.estimated:
-            return self.lens
+            return np.union1d(self.lens, self.points)
         if self.scene.mode == "refine" and self.has_spare_corners:
-            return np.union1d(self.lens, self.shape)
-        return self.lens[:0]
+            return np.concatenate([self.lens, np.union1d(self.shape, self.points)])
+        return self.points
 
     @property
     def counted(self) -> IntArray:
         """What is open and counts in the covariance, whether it is free or not."""
         if self.scene.estimated or self.contested:
-            return np.union1d(self.lens, self.scale[self.printed])
+            return np.concatenate([self.lens, np.union1d(self.scale, self.points)])
         stated = self.scene.matrix_sigma_px is not None
-        return np.union1d(self.lens[:4] if stated else self.lens[:0], self.scale[self.printed])
+        lens = self.lens[:4] if stated else self.lens[:0]
+        return np.concatenate([lens, np.union1d(self.scale, self.points)])
 
 
 def _lens_prior(scene: Scene) -> FloatArray:
@@ -308,8 +343,8 @@ def seen_at(problem: Problem, moving: IntArray, appearance: Appearance, poses: F
         appearance: Lens and board to linearise at.
         poses: (m, 4, 4) `cam_from_target` to start from.
     """
-    compressed = compress(problem.stack, problem.basis, appearance, poses)
-    sigma_px = problem.stack.sigma_px(compressed.residuals, 6 * len(poses) + len(moving))
+    compressed = compress(problem.stack, problem.basis, appearance, poses, problem.scale)
+    sigma_px = problem.sigma_px(compressed, moving)
     free = _known_beforehand(problem, moving, appearance, compressed, sigma_px)
     return Seen(compressed, free, sigma_px)
 
@@ -383,7 +418,7 @@ class MeasuredScale:
 
 def measured_scale(problem: Problem, arm: Arm, state: State, board: int = 0) -> MeasuredScale:
     """Measures a board's size by the robot's motion."""
-    place = problem.scale[board : board + 1]
+    place = problem.scale_of(board)
     data, at_change = _with_free(
         problem, arm, state, np.union1d(state.moving, place), ignored=place
     )

@@ -7,12 +7,11 @@ import numpy as np
 from visioncal.chance import chi2_limit
 from visioncal.errors import DataError
 from visioncal.estimator.appearance import (
-    BOARD_NAMES,
     SCALE,
     Appearance,
     Compressed,
-    board_basis,
     compress,
+    shape_basis,
 )
 from visioncal.estimator.corners import CornerStack
 from visioncal.estimator.gating import gate
@@ -91,7 +90,7 @@ def see(
         np.array([it.cam_from_target[0] for it in looks]),
         np.array([variance * covariance(it.information[0]) for it in looks]),
         np.array([it.by_shared[0, :, :lens] for it in looks]),
-        np.array([it.by_shared[0, :, lens + SCALE] for it in looks]),
+        np.array([_by_scale(it.by_shared[0, :, lens:], target) for it in looks]),
         target.square_sigma_m / target.square_m,
         poses.turns,
         warnings,
@@ -185,8 +184,13 @@ def _chosen(corners: Corners, ids: IntArray, rows: IntArray) -> Corners:
 def _compressed(
     camera: Camera, stack: CornerStack, target: Target, starts: FloatArray
 ) -> Compressed:
-    flat = Appearance(camera, np.zeros(len(BOARD_NAMES)))
-    return compress(stack, board_basis(corner_positions(target)), flat, starts)
+    basis = shape_basis(target)
+    return compress(stack, basis, Appearance(camera, np.zeros(basis.shape[2])), starts)
+
+
+def _by_scale(by_shape: FloatArray, target: Target) -> FloatArray:
+    """How a pose moves with the target's size: a rig has the size that its table says."""
+    return np.zeros(6) if target.kind == "points" else by_shape[:, SCALE]
 
 
 def _noise(

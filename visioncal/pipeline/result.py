@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult, Validation
 from visioncal.errors import DataError, VisioncalError
-from visioncal.estimator.appearance import BOARD_NAMES, Free
+from visioncal.estimator.appearance import BOARD_NAMES, Free, shape_slices
 from visioncal.estimator.arm import LEVER_M
 from visioncal.estimator.boards import Placed, place
 from visioncal.estimator.observability import edge_names
@@ -31,7 +31,7 @@ from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
 from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, Progress, SolverName
+from visioncal.types import FloatArray, Mask, Progress, SolverName
 
 _LEVELS = (*ASKED, "hand-eye")
 
@@ -209,16 +209,8 @@ def _further(known: Known) -> dict[str, Any]:
         documents["clock"] = known.clock.document()
     if known.readings is not None:
         documents |= _instrument(known, known.readings)
-    boards = known.session.boards
-    # A rig of points is what its table says.
-    printed = [it for it, (_, target) in enumerate(boards.items()) if target.kind != "points"]
-    if known.free is not None and printed and not known.session.targets:
-        documents["board"] = _board(known, known.free, 0)
-    elif known.free is not None and printed:
-        names = tuple(boards)
-        documents["boards"] = {
-            names[it]: _board(known, known.free, it) for it in sorted(known.boards) if it in printed
-        }
+    if known.free is not None:
+        documents |= _shapes(known, known.free)
     documents |= _arm(known)
     if known.diagnosis is not None:
         documents["uncertainty"] = _uncertainty(known, known.diagnosis)
@@ -280,17 +272,48 @@ def _point_sigma_mm(spread: FloatArray, point: int) -> float:
     return 1e3 * float(np.sqrt(np.trace(rows @ spread @ rows.T)))
 
 
+def _shapes(known: Known, free: Free) -> dict[str, Any]:
+    """The targets as they were found to be; of rigs those whose points are not exact."""
+    boards, documents = known.session.boards, {}
+    for kind, describe in (("board", _board), ("rig", _rig)):
+        found = {
+            name: describe(known, free, at)
+            for at, (name, target) in enumerate(boards.items())
+            if at in known.boards and (target.kind == "points") is (kind == "rig")
+        }
+        found = {name: it for name, it in found.items() if it}
+        if found:
+            documents[f"{kind}s" if known.session.targets else kind] = (
+                found if known.session.targets else found[""]
+            )
+    return documents
+
+
+def _own(known: Known, free: Free, place: int) -> tuple[slice, Mask, FloatArray]:
+    """Where one target's shape stands, which free values are its, and their sigmas."""
+    mine = shape_slices(tuple(known.session.boards.values()), free.lens_count)[place]
+    columns = (free.columns >= mine.start) & (free.columns < mine.stop)
+    sigmas = np.sqrt(np.diag(known.solved.covariance))[12 : 12 + len(free.columns)][columns]
+    return mine, columns, sigmas
+
+
+def _rig(known: Known, free: Free, place: int) -> dict[str, Any]:
+    """How far the points of a rig were moved, and how well that is known; empty for exact ones."""
+    mine, columns, sigmas = _own(known, free, place)
+    if not columns.any():
+        return {}
+    moved = free.after(known.solved.edges.shared).values[mine]
+    return {"shape": moved.reshape(-1, 3).tolist(), "sigma": sigmas.reshape(-1, 3).tolist()}
+
+
 def _board(known: Known, free: Free, place: int) -> dict[str, Any]:
     """A board as it was found to be, and how well that is known."""
-    size = len(BOARD_NAMES)
-    begin = free.lens_count + size * place
-    board = (free.columns >= begin) & (free.columns < begin + size)
-    shape = free.after(known.solved.edges.shared).board[size * place : size * (place + 1)]
+    mine, board, sigmas = _own(known, free, place)
+    shape = free.after(known.solved.edges.shared).values[mine]
     starts = first_corners(tuple(known.session.boards.values()))
     ends = [*starts[1:].tolist(), len(free.positions)]
     bend = free.corners_after(known.solved.edges.shared)[starts[place] : ends[place], 2]
-    sigmas = np.sqrt(np.diag(known.solved.covariance))[12 : 12 + len(free.columns)][board]
-    names = [BOARD_NAMES[at - begin] for at in free.columns[board]]
+    names = [BOARD_NAMES[at - mine.start] for at in free.columns[board]]
     return {
         "shape": dict(zip(BOARD_NAMES, shape.tolist(), strict=True)),
         "sigma": dict(zip(names, sigmas.tolist(), strict=True)),

@@ -16,9 +16,9 @@ from visioncal.estimator.appearance import (
     SCALE,
     Appearance,
     Free,
-    board_basis,
     board_prior,
     compress,
+    shape_basis,
 )
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import COMPLIANCE, ArmModel, block_size
@@ -212,13 +212,13 @@ def place_sigmas(
 def stated(cell: PlanCell) -> Free:
     """Lens and board as they are stated, the board's size being open by as much as is stated."""
     positions = corner_positions(cell.target)
-    shape = board_prior(cell.target, positions)
+    shape = board_prior(cell.target)
     look = Appearance(cell.camera, np.zeros(len(shape)))
-    # The places of a rig's points are what its table says.
+    # The places of a rig's points are taken for what its table says.
     sized = np.array([] if cell.target.kind == "points" else [SCALE], dtype=np.int64)
     return Free(
         look,
-        board_basis(positions),
+        shape_basis(cell.target),
         positions,
         len(look.values) - len(shape) + sized,
         np.ones(len(sized), dtype=bool),

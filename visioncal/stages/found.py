@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from visioncal.chance import chi2_limit
+from visioncal.estimator.appearance import MOST_LOOSE
 from visioncal.estimator.closure import held_shift
 from visioncal.estimator.corners import CornerStack
 from visioncal.estimator.joint import (
@@ -18,6 +20,9 @@ from visioncal.estimator.joint import (
 )
 from visioncal.figures import figure
 from visioncal.types import FloatArray, IntArray
+
+# A rig that is as stated seems not to be in one session of ten thousand.
+_FALSE_ALARM = 1e-4
 
 
 def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
@@ -34,6 +39,8 @@ def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
     for board in problem.printed:
         yield from _scale_finding(problem, arm, state, board)
         yield from _bend_finding(problem, state, board)
+    for rig in range(len(problem.scene.targets)):
+        yield from _points_finding(problem, state, rig)
     yield from _lens_finding(problem, state)
 
 
@@ -85,8 +92,8 @@ def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tup
 
 
 def _noise_words(problem: Problem, state: State) -> tuple[str, bool]:
-    stack, residuals = problem.stack, state.seen.compressed.residuals
-    return noise_words(stack, residuals, 6 * len(stack.views) + len(state.moving))
+    seen = state.seen.compressed
+    return noise_words(problem.stack, seen.residuals, problem.unknowns(seen, state.moving))
 
 
 def _scale_finding(problem: Problem, arm: Arm, state: State, board: int) -> Iterator[str]:
@@ -103,7 +110,7 @@ def _scale_finding(problem: Problem, arm: Arm, state: State, board: int) -> Iter
 
 def _measured(problem: Problem, arm: Arm, state: State, board: int) -> MeasuredScale | None:
     """What the robot measures, where the fit has taken it up."""
-    taken = _moves(state, problem.scale[board : board + 1])
+    taken = _moves(state, problem.scale_of(board))
     return measured_scale(problem, arm, state, board) if taken else None
 
 
@@ -133,6 +140,30 @@ def _bend_finding(problem: Problem, state: State, board: int) -> Iterator[str]:
         "depth. Its shape was estimated with the rest; a board on a stiff, flat plate makes a "
         "better result."
     )
+
+
+def _points_finding(problem: Problem, state: State, rig: int) -> Iterator[str]:
+    """Whether a rig's points lie farther from where its table has them than it says."""
+    target, places = problem.scene.targets[rig], problem.points_of(rig)
+    if not target.point_sigmas_m:
+        return
+    if not len(places):
+        yield (
+            f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
+            f"their sigma_m counts for up to {MOST_LOOSE}."
+        )
+        return
+    moved = state.again().appearance.values[places].reshape(-1, 3)
+    sigmas = np.array(target.point_sigmas_m)
+    away = np.linalg.norm(moved, axis=1)
+    worst = int(np.argmax(away / sigmas))
+    if (away[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
+        yield (
+            f"Point {target.point_numbers[worst]} of target {target.name} lies "
+            f"{figure(1e3 * float(away[worst]))} mm from where its table has it, which is stated "
+            f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both: "
+            "measure the point again."
+        )
 
 
 def _lens_finding(problem: Problem, state: State) -> Iterator[str]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.estimator.appearance import (
-    BOARD_NAMES,
     Appearance,
     Compressed,
     Free,
@@ -35,7 +34,7 @@ from visioncal.estimator.linalg import covariance
 from visioncal.estimator.observability import worst_directions
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
-from visioncal.targets import corner_positions, numbered_positions
+from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, IntArray
 
@@ -197,7 +196,7 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
         if other is None:
             return answer
         problem, state = answer.problem, answer.state
-        place = problem.scale[[other.board]]
+        place = problem.scale_of(other.board)
         if other.contradicts:
             problem = problem.without_prior(place)
         moving = np.union1d(state.moving, place)
@@ -211,7 +210,7 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
 def _wrongly_sized(answer: _Answer, arm: Arm) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     problem, state = answer.problem, answer.state
-    held = [it for it in problem.printed if problem.scale[it] not in state.moving]
+    held = [it for it in problem.printed if problem.scale_of(it)[0] not in state.moving]
     measured = [measured_scale(problem, arm, state, board) for board in held]
     # An arm whose links may all be too long is hard to tell from a board that is too large.
     other = [it for it in measured if (it.is_another if arm.errors is None else it.contradicts)]
@@ -240,10 +239,10 @@ def _speaks_against_lens(answer: _Answer, arm: Arm) -> bool:
 
 def held(scene: Scene) -> Free:
     """Lens and board as they are stated, with nothing free."""
-    nothing = np.zeros(0)
+    nothing, basis = np.zeros(0), boards_basis(scene.targets)
     return Free(
-        Appearance(scene.camera, np.zeros(len(BOARD_NAMES) * len(scene.targets))),
-        boards_basis([corner_positions(it) for it in scene.targets]),
+        Appearance(scene.camera, np.zeros(basis.shape[2])),
+        basis,
         numbered_positions(scene.targets),
         nothing.astype(np.int64),
         nothing.astype(bool),

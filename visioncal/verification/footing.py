@@ -9,13 +9,19 @@ import numpy as np
 from visioncal.calibration import Calibration
 from visioncal.calibration.edge import read_covariance
 from visioncal.errors import DataError
-from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Free, boards_basis
+from visioncal.estimator.appearance import (
+    BOARD_NAMES,
+    Appearance,
+    Free,
+    board_prior,
+    boards_basis,
+)
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Edges, Noise
 from visioncal.estimator.observability import edge_names
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
-from visioncal.targets import corner_positions, numbered_positions, target_from_document
+from visioncal.targets import numbered_positions, target_from_document
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray, Target
 
@@ -91,8 +97,8 @@ class Footing:
             return None
         targets, size = tuple(self.targets.values()), len(self.looks)
         return Free(
-            Appearance(camera.camera, _shape(self.calibration, tuple(self.targets))),
-            boards_basis([corner_positions(it) for it in targets]),
+            Appearance(camera.camera, _shape(self.calibration, self.targets)),
+            boards_basis(targets),
             numbered_positions(targets),
             np.array(self.looks, dtype=np.int64),
             np.zeros(size, dtype=bool),
@@ -190,10 +196,16 @@ def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:
     )
 
 
-def _shape(calibration: Calibration, names: tuple[str, ...]) -> FloatArray:
-    """(9 b,) what the boards were found to be like; those that were not looked at are flat."""
+def _shape(calibration: Calibration, targets: Mapping[str, Target]) -> FloatArray:
+    """(s,) what the targets were found to be like; those that were not looked at are as stated."""
     stages = calibration.stages
-    several = stages.get("boards", {})
-    shapes = [(several.get(it, {}) if it else stages.get("board", {})).get("shape") for it in names]
-    flat = dict.fromkeys(BOARD_NAMES, 0.0)
-    return np.array([(it or flat)[name] for it in shapes for name in BOARD_NAMES])
+    found = {**stages.get("boards", {}), **stages.get("rigs", {})}
+    found[""] = stages.get("board", stages.get("rig", {}))
+    shapes: list[FloatArray] = []
+    for name, target in targets.items():
+        stated = np.zeros(len(board_prior(target)))
+        shape = found.get(name, {}).get("shape")
+        if isinstance(shape, Mapping):
+            shape = [shape[it] for it in BOARD_NAMES]
+        shapes.append(stated if shape is None else stated + np.ravel(shape))
+    return np.concatenate(shapes)

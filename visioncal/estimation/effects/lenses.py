@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimation.problem import Effect
-from visioncal.estimator.appearance import BOARD_NAMES, Appearance, Compressed, compress
+from visioncal.estimator.appearance import Appearance, Compressed, compress
 from visioncal.estimator.corners import floored_sigma_px
 from visioncal.estimator.joint import Problem
 from visioncal.estimator.linalg import covariance
@@ -68,26 +68,37 @@ class Looks:
         return slice(sum(len(it.lens) for it in self.problems.values()), len(self.values))
 
     @property
-    def scales(self) -> IntArray:
-        """Places (b,) of the boards' scales."""
-        return np.arange(self.boards.start, self.boards.stop, len(BOARD_NAMES))
-
-    @property
     def printed(self) -> list[int]:
         """Which boards are printed; see `Problem.printed`."""
-        return next(iter(self.problems.values())).printed
+        return self._one.printed
+
+    @property
+    def sized(self) -> IntArray:
+        """Places of the boards' scales, and of rigs' points that are not exact."""
+        return self._here(np.union1d(self._one.scale, self._one.points))
+
+    def scale_of(self, board: int) -> IntArray:
+        """Place (1,) of one printed board's scale."""
+        return self._here(self._one.scale_of(board))
 
     def shape_of(self, board: int) -> IntArray:
-        """Places (8,) of one board's aspect and bend."""
-        start = int(self.scales[board])
-        return np.arange(start + 1, start + len(BOARD_NAMES))
+        """Places (8,) of one printed board's aspect and bend."""
+        return self._here(self._one.shape_of(board))
+
+    @property
+    def _one(self) -> Problem:
+        """Any camera's corners: all see the same boards."""
+        return next(iter(self.problems.values()))
+
+    def _here(self, places: IntArray) -> IntArray:
+        """Places of boards' values, by those that they have with one camera alone."""
+        return np.asarray(places - len(self._one.lens) + self.boards.start)
 
     @cached_property
     def prior_sigma(self) -> FloatArray:
         """(k,) what the values are known to beforehand; inf where nothing is."""
         lenses = [it.prior_sigma[it.lens] for it in self.problems.values()]
-        one = next(iter(self.problems.values()))
-        return np.concatenate([*lenses, one.prior_sigma[len(one.lens) :]])
+        return np.concatenate([*lenses, self._one.prior_sigma[len(self._one.lens) :]])
 
     @cached_property
     def stated(self) -> FloatArray:
@@ -97,7 +108,7 @@ class Looks:
     @property
     def first(self) -> IntArray:
         """What is free from the start: sizes, lenses that were estimated or are to be refined."""
-        free = [self.scales[self.printed]]
+        free = [self.sized]
         for name, problem in self.problems.items():
             scene, lens = problem.scene, self.lenses[name]
             known = scene.matrix_sigma_px is not None and scene.mode != "hold"
@@ -127,11 +138,10 @@ class Looks:
         for name, problem in self.problems.items():
             end = begin + len(problem.stack.views)
             appearance = Appearance(self.camera(name), self.values[self.boards])
-            compressed = compress(problem.stack, problem.basis, appearance, self.poses[begin:end])
+            mine = self.poses[begin:end]
+            compressed = compress(problem.stack, problem.basis, appearance, mine, problem.scale)
             places = self.places(name)
-            open_values = int(np.isin(places, free).sum())
-            unknowns = 6 * (end - begin) + open_values
-            sigma = problem.stack.sigma_px(compressed.residuals, unknowns)
+            sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, free)))
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
             pull[places] += weight * compressed.shared_pull
