@@ -30,6 +30,7 @@ from visioncal.pipeline.result import run
 from visioncal.recording import board, write_recording
 from visioncal.report import write_report
 from visioncal.session import Session
+from visioncal.stages.detect import detect
 from visioncal.targets import load_target, target_document, target_from_document
 from visioncal.transforms import invert, log
 from visioncal.verification.footing import Footing
@@ -375,3 +376,20 @@ def test_commands_take_a_rig_or_say_why_not(cube, tmp_path):
     planned = visioncal("plan", cube, "--add", 2, "-o", tmp_path / "plan")
     assert planned.status == 2
     assert "rig of points outside the plane z = 0" in planned.err
+
+
+def test_corners_of_images_give_what_the_images_give(rendered, tmp_path):
+    session = Session.load(rendered)
+    found = detect(session)
+    session.save(tmp_path / "cell")
+    for image in (tmp_path / "cell").rglob("*.png"):
+        image.unlink()
+    rows = [
+        f"{view},{point},{u_px!r},{v_px!r}"
+        for view, it in found.corners.items()
+        for point, (u_px, v_px) in zip(it.ids.tolist(), it.px.tolist(), strict=True)
+    ]
+    (tmp_path / "cell" / "corners.csv").write_text("\n".join(["view,point,u_px,v_px", *rows]))
+    ours, theirs = (to_document(calibrate(it)) for it in (tmp_path / "cell", session))
+    for name in ("transforms", "noise", "views", "rms", "verdict"):
+        assert ours[name] == theirs[name]
