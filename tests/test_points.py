@@ -29,7 +29,7 @@ from visioncal.errors import DataError
 from visioncal.pipeline.result import run
 from visioncal.recording import board, write_recording
 from visioncal.report import write_report
-from visioncal.session import Session
+from visioncal.session import Session, corners
 from visioncal.stages.detect import detect
 from visioncal.targets import load_target, target_document, target_from_document
 from visioncal.transforms import invert, log
@@ -393,3 +393,28 @@ def test_corners_of_images_give_what_the_images_give(rendered, tmp_path):
     ours, theirs = (to_document(calibrate(it)) for it in (tmp_path / "cell", session))
     for name in ("transforms", "noise", "views", "rms", "verdict"):
         assert ours[name] == theirs[name]
+
+
+def test_more_corners_than_a_session_holds_are_refused(monkeypatch):
+    monkeypatch.setattr(corners, "_MOST_CORNERS", 2)
+    rows = "".join(f"1,{at},10.0,20.0\n" for at in range(3))
+    with pytest.raises(DataError, match="more than 2 rows"):
+        corners.parse_corners("view,point,u_px,v_px\n" + rows)
+
+
+def test_a_rig_lies_beside_its_description(tmp_path):
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "points.csv").write_text("point,x_m,y_m,z_m\n", encoding="utf-8")
+    target = tmp_path / "inside" / "rig.toml"
+    target.write_text('kind = "points"\npoints = "../points.csv"\n', encoding="utf-8")
+    with pytest.raises(DataError, match="leads out of the folder"):
+        load_target("rig.toml", target.parent)
+
+
+def test_corners_outside_of_the_folder_are_not_read(tmp_path):
+    elsewhere = tmp_path / "elsewhere.csv"
+    elsewhere.write_text("view,point,u_px,v_px\n", encoding="utf-8")
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "corners.csv").symlink_to(elsewhere)
+    with pytest.raises(DataError, match="leads out of its folder"):
+        corners.read_corners(tmp_path / "session")

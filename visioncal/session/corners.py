@@ -1,7 +1,5 @@
 """corners.csv: where images show known points of the targets, as another detector found them."""
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from visioncal.files import did_you_mean, read_text_inside, sha256
 from visioncal.session.boards import COLUMN
 from visioncal.session.document import Declaration
 from visioncal.session.kinds import name_of
+from visioncal.session.streams import numbered_rows
 from visioncal.session.table import Problem, View, problems_error, read_integer, read_number
 from visioncal.targets import point_numbers
 from visioncal.types import Corners, FloatArray, IntArray, Target
@@ -20,6 +19,8 @@ from visioncal.types import Corners, FloatArray, IntArray, Target
 FILE = "corners.csv"
 _NEEDED = ("view", "point", "u_px", "v_px")
 _SIGMA = "sigma_px"
+# Five hundred corners of each of two thousand views: a gigabyte of memory.
+_MOST_CORNERS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +80,8 @@ def parse_corners(text: str) -> CornerTable:
         DataError: A column is missing or a cell is wrong; it is named.
     """
     # Rows are numbered by their lines: between them no line may be blank.
-    reader = csv.reader(io.StringIO(text.rstrip(), newline=""))
-    columns = [name.strip() for name in next(reader, [])]
+    rows = numbered_rows(text.rstrip(), FILE, 1)
+    columns = [name.strip() for name in next(rows, (1, [""]))[1]]
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]
     other = [it for it in columns if it not in known or columns.count(it) > 1]
@@ -93,7 +94,15 @@ def parse_corners(text: str) -> CornerTable:
             next_step=hints[0] if hints else "",
         )
     problems: list[Problem] = []
-    lines = [_line(columns, cells, f"{FILE}, line {reader.line_num}", problems) for cells in reader]
+    lines: list[_Line] = []
+    for number, cells in rows:
+        if len(lines) == _MOST_CORNERS:
+            raise DataError(
+                f"{FILE} has more than {_MOST_CORNERS:,} rows.",
+                culprits=[FILE],
+                next_step="Take fewer views, or fewer points of each.",
+            )
+        lines.append(_line(columns, cells, f"{FILE}, line {number}", problems))
     stated = [it.sigma_px is not None for it in lines]
     if any(stated) and not all(stated) and not problems:
         place = f"{lines[stated.index(False)].place}, column {_SIGMA}"

@@ -125,7 +125,7 @@ def parse_stream(text: str, label: str) -> Stream:
         DataError: A cell is no number; it is named.
     """
     head, _, body = text.partition("\n")
-    _, names = next(_rows(head, label, 1), (1, []))
+    _, names = next(numbered_rows(head, label, 1), (1, []))
     columns = tuple(name.strip() for name in names)
     values = _plain_numbers(body, len(columns))
     if values is None:
@@ -149,7 +149,7 @@ def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
     """Reads rows cell by cell, and names those that are wrong."""
     rows: list[list[float]] = []
     problems: list[str] = []
-    for line, cells in _rows(body, label, 2):
+    for line, cells in numbered_rows(body, label, 2):
         place = f"{label}, line {line}"
         if not any(cell.strip() for cell in cells):
             continue
@@ -175,7 +175,7 @@ def _numbers(body: str, columns: Sequence[str], label: str) -> FloatArray:
     return np.array(rows, dtype=float).reshape(len(rows), len(columns))
 
 
-def _rows(text: str, label: str, first: int) -> Iterator[tuple[int, list[str]]]:
+def numbered_rows(text: str, label: str, first: int) -> Iterator[tuple[int, list[str]]]:
     """Yields rows with the number of the line in which they end, the text's first being `first`."""
     reader = csv.reader(io.StringIO(text, newline=""))
     try:
