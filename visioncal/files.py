@@ -393,6 +393,14 @@ class Table:
             raise self.refuse(key, value, needed)
         return float(value)
 
+    def numbers(self, key: str, count: int) -> list[float]:
+        """Reads a list of so many finite numbers."""
+        needed = f"a list of {count} numbers"
+        values = self._value(key, None, needed)
+        if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
+            raise self.refuse(key, values, needed)
+        return [Table({key: value}, self.label).number(key) for value in values]
+
     def integer(self, key: str, low: int, high: int) -> int:
         """Reads a whole number from `low` to `high`."""
         needed = f"a whole number from {low} to {high}"

@@ -226,11 +226,7 @@ def number_list(row: Table, key: str, size: int) -> FloatArray:
     Raises:
         DataError: The field is something else.
     """
-    values = row.content.get(key)
-    needed = f"a list of {size} numbers"
-    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != size:
-        raise row.refuse(key, values, needed)
-    return np.array([Table({key: value}, row.label).number(key) for value in values])
+    return np.array(row.numbers(key, size))
 
 
 def _axis(row: Table) -> FloatArray:
