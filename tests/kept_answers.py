@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tracked
 from cells import calibrated
 
 from visioncal.alignment import align
@@ -27,6 +26,7 @@ from visioncal.simulation import (
     simulate,
     sweep,
     sweep_session,
+    tracked,
 )
 from visioncal.simulation.layout import (
     CameraAt,

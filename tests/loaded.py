@@ -1,11 +1,12 @@
 """The example of a medium arm that is loaded at its flange, read by a tracker."""
 
 import numpy as np
-from tracked import Shop, Tracked, above, known_of, session_of, tracked
+from tracked import known_of
 
 from visioncal.pipeline.known import Known
 from visioncal.simulation import Payload, arm_named, forward
 from visioncal.simulation.sag import giving_of, sagging
+from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
 from visioncal.types import FloatArray
 
 # Shoulder and elbow yield, the rest does not [N m/rad].

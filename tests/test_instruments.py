@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 from commands import visioncal as command
 from tracked import (
-    POSE,
-    THREE,
-    Tracked,
     errors_of,
     information,
     known_of,
     mounting_bound,
     reads,
-    session_of,
     solved_of,
-    tracked,
 )
 
 import visioncal
@@ -28,6 +23,8 @@ from visioncal.estimator.workspace import postures
 from visioncal.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation.arms import forward
+from visioncal.simulation.records import POSE
+from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
 from visioncal.transforms import compose, exp, invert
 
 PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)

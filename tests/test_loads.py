@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from loaded import HUNG, NOMINAL, postures
-from tracked import Tracked, known_of, session_of, tracked
+from tracked import known_of
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.loads import loads_of
+from visioncal.simulation.tracked import Tracked, session_of, tracked
 
 HEADER = ("view", "cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw")
 SEEN = ("0", "0", "0", "1", "0", "0", "0", "1")

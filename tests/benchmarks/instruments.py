@@ -14,17 +14,12 @@ import numpy as np
 import thirdparty
 from results import write_section
 from tracked import (
-    THREE,
-    Shop,
-    Tracked,
     errors_of,
     information,
     known_of,
     mounting_bound,
     reads,
-    session_of,
     solved_of,
-    tracked,
 )
 
 from visioncal.estimator.closure import Edges, fit_closure
@@ -33,6 +28,7 @@ from visioncal.estimator.workspace import postures
 from visioncal.pipeline.known import Known
 from visioncal.session import Session
 from visioncal.simulation.arms import Arm, forward
+from visioncal.simulation.tracked import THREE, Shop, Tracked, session_of, tracked
 from visioncal.transforms import invert
 from visioncal.types import FloatArray
 

@@ -4,8 +4,9 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 projection or a wrong chain cannot hide by being wrong in both.
 """
 
-from visioncal.simulation.arms import Arm, arm_named, forward, industrial_arm, ur_arm
+from visioncal.simulation.arms import ARMS, Arm, arm_named, forward, industrial_arm, ur_arm
 from visioncal.simulation.cell import Cell, simulate
+from visioncal.simulation.described import cell_names, read_cell
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
@@ -17,7 +18,14 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session, write_network
-from visioncal.simulation.optics import fine_camera, fisheye_camera, project, rays, wide_camera
+from visioncal.simulation.optics import (
+    CAMERAS,
+    fine_camera,
+    fisheye_camera,
+    project,
+    rays,
+    wide_camera,
+)
 from visioncal.simulation.options import (
     CellOptions,
     Motion,
@@ -39,6 +47,7 @@ from visioncal.simulation.render import Scene, prepare_scene, render, render_vie
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.seen import Network, Sight
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
+from visioncal.simulation.touching import touch, write_touches
 from visioncal.simulation.warmup import (
     Heat,
     Round,
@@ -49,6 +58,8 @@ from visioncal.simulation.warmup import (
 )
 
 __all__ = [
+    "ARMS",
+    "CAMERAS",
     "Arm",
     "BoardAt",
     "CameraAt",
@@ -73,6 +84,7 @@ __all__ = [
     "WarmUp",
     "WarmUpOptions",
     "arm_named",
+    "cell_names",
     "charuco_target",
     "checkerboard_target",
     "exact",
@@ -85,6 +97,7 @@ __all__ = [
     "prepare_scene",
     "project",
     "rays",
+    "read_cell",
     "read_truth",
     "render",
     "render_view",
@@ -93,11 +106,13 @@ __all__ = [
     "simulate_warm_up",
     "sweep",
     "sweep_session",
+    "touch",
     "truth_path",
     "ur_arm",
     "wide_camera",
     "write_network",
     "write_session",
     "write_sweep",
+    "write_touches",
     "write_warm_up",
 ]

@@ -47,10 +47,15 @@ class Stream(IntEnum):
     PAIRS = 8
     LENS = 9
     SWEEP = 10
+    BUMP = 11
+    TOUCHES = 12
 
 
-# What another draw of the same cell draws anew.
+# What another draw of the same cell draws anew, and what another recording of it.
 _DRAWN_ANEW = (Stream.ARM, Stream.ROBOT, Stream.PIXELS)
+_RECORDED_ANEW = tuple(it for it in Stream if it not in (Stream.MOUNTING, Stream.ARM, Stream.LENS))
+# Sets a recording's randomness apart from a draw's.
+_RECORDING = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +145,7 @@ def simulate(options: CellOptions, postures: FloatArray | None = None) -> Cell:
         moved = _postures(options, arm, sheets, transforms)
     else:
         moved = np.array(postures, dtype=float)
+    transforms = _bumped(options, transforms)
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = stream(options, Stream.ROBOT).standard_normal((options.views, 6)) * sigma
     payloads = _payloads(options)
@@ -199,7 +205,9 @@ def _approach(options: CellOptions) -> FloatArray:
 
 def stream(options: CellOptions, purpose: Stream, *index: int) -> np.random.Generator:
     """The generator of one source of randomness; `index` tells views apart."""
-    again = (options.draw,) if options.draw and purpose in _DRAWN_ANEW else ()
+    again: tuple[int, ...] = (options.draw,) if options.draw and purpose in _DRAWN_ANEW else ()
+    if options.recording and purpose in _RECORDED_ANEW:
+        again += (_RECORDING, options.recording)
     return np.random.default_rng([options.seed, int(purpose), *again, *index])
 
 
@@ -227,6 +235,14 @@ def _mountings(options: CellOptions, arm: Arm, sheet: Sheet) -> dict[str, FloatA
     away = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
     base_from_cam = looking_at(work, away / np.linalg.norm(away), mean_view(options, sheet))
     return {"base_from_cam": base_from_cam, "flange_from_target": flange_from_target}
+
+
+def _bumped(options: CellOptions, transforms: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """The edges once the camera was pushed, in a direction of chance."""
+    away = stream(options, Stream.BUMP).standard_normal(3)
+    away *= options.camera_moved_m / np.linalg.norm(away)
+    push = compose(np.eye(3), away)
+    return {name: it @ push if name.endswith("cam") else it for name, it in transforms.items()}
 
 
 def looking_at(point: FloatArray, away: FloatArray, view: FloatArray) -> FloatArray:

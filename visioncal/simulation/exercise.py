@@ -1,12 +1,14 @@
 """Motions of a simulated arm, and what its controller records of them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from visioncal.session import Session, Stream
-from visioncal.simulation.dynamics import DynamicArm, drive_torques
+from visioncal.simulation.dynamics import Body, DynamicArm, drive_torques, real_dynamics
+from visioncal.simulation.records import write_truth
 from visioncal.types import FloatArray
 
 _HARMONICS = 5
@@ -114,6 +116,49 @@ def record(
     numbers = range(1, done.q.shape[1] + 1)
     columns = ("stamp_s", *(name.format(it) for name in groups for it in numbers))
     return Stream(columns, np.column_stack([done.times_s, *groups.values()]))
+
+
+@dataclass(frozen=True)
+class ExerciseOptions:
+    """What a recording for the dynamics is drawn from.
+
+    Attributes:
+        robot: `ur5e` or `ur10e`.
+        load: What the flange carries; None for nothing.
+        senses: How well the controller records.
+        rate_hz: Samples a second.
+        seed: Of everything random; the arm is the same with and without a load.
+    """
+
+    robot: str = "ur10e"
+    load: Body | None = None
+    senses: Senses = field(default_factory=Senses)
+    rate_hz: float = 250.0
+    seed: int = 0
+
+
+def write_exercise(options: ExerciseOptions, folder: Path | str) -> Path:
+    """Writes the streams `excite`, `sweeps` and `fresh` of an arm, and its truth beside them.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: Nothing is known of the arm, or the folder cannot be written.
+    """
+    folder = Path(folder)
+    empty = real_dynamics(options.robot, np.random.default_rng([options.seed, 0]), stribeck=True)
+    built = empty if options.load is None else empty.carrying(options.load)
+    rng, count, rate = np.random.default_rng([options.seed, 1]), len(built.bodies), options.rate_hz
+    motions = {
+        "excite": multi_sine(count, rng, rate_hz=rate),
+        "sweeps": slow_sweep(count, rng, seconds=30.0, rate_hz=rate),
+        "fresh": multi_sine(count, rng, rate_hz=rate),
+    }
+    streams = {name: record(built, it, rng, options.senses) for name, it in motions.items()}
+    exercise_session(options.robot, streams, folder.name).save(folder)
+    write_truth(folder, {"schema": 1, "options": asdict(options), "arm": asdict(empty)})
+    return folder
 
 
 def exercise_session(robot: str, streams: Mapping[str, Stream], name: str = "exercise") -> Session:

@@ -183,6 +183,12 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         if self.stops < 1:
             raise DataError(f"simulation: stops is {self.stops}, at least 1 is needed.")
+        for moved in self.moved:
+            if moved.from_stop is not None and moved.from_stop >= self.stops:
+                raise DataError(
+                    f"simulation: {moved.frame} is pushed before stop {moved.from_stop}; of "
+                    f"{self.stops} stops the last is {self.stops - 1}."
+                )
         known = {CELL, *(it.name for it in self.robots)}
         on = [(it.name, it.on) for it in self.cameras]
         on += [(it.name, it.on) for it in self.boards] + [(it.name, it.on) for it in self.points]

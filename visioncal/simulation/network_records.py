@@ -1,6 +1,5 @@
 """Simulated cells of several robots on disk: the session, and the truth beside it."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.files import write_atomically
 from visioncal.session import MemoryImages, Session, View, frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell
@@ -20,7 +18,7 @@ from visioncal.simulation.records import (
     pose_row,
     target_document,
     target_place,
-    truth_path,
+    write_truth,
 )
 from visioncal.simulation.render import Scene, encode, prepare_scene, render
 from visioncal.simulation.second import Shown
@@ -56,7 +54,7 @@ def write_network(
     """
     folder = Path(folder)
     network_session(cell, folder.name, progress, seen=seen).save(folder)
-    write_atomically(truth_path(folder), _truth_text(cell))
+    write_truth(folder, _truth_of(cell))
     return folder
 
 
@@ -86,6 +84,7 @@ def network_session(
     files = _rendered(cell, sights, progress) if seen == "images" else {}
     targets = {it.name: it.target for it in cell.options.boards}
     documents = {it: target_document(target) for it, target in targets.items()}
+    single = next(iter(documents.values()), None)
     numbers_used = dict.fromkeys(key for row in rows for key in row.numbers)
     texts_used = dict.fromkeys(key for row in rows for key in row.text)
     images = ("image",) if any(row.image for row in rows) else ()
@@ -95,7 +94,7 @@ def network_session(
         columns,
         [[row.cell(column) for column in columns] for row in rows],
         MemoryImages(files),
-        target_document=documents if len(documents) > 1 else next(iter(documents.values())),
+        target_document=documents if len(documents) > 1 else single,
     )
 
 
@@ -227,9 +226,8 @@ def seed_of(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
-def _truth_text(cell: Network) -> str:
-    options = asdict(cell.options)
-    content = {
+def _truth_of(cell: Network) -> dict[str, Any]:
+    return {
         "schema": 1,
         "parents": cell.parents,
         "transforms": cell.transforms,
@@ -238,8 +236,7 @@ def _truth_text(cell: Network) -> str:
             {"frame": it.frame, "from_stop": first_pushed(cell.options, it)}
             for it in cell.options.moved
         ],
-        "options": options,
+        "options": asdict(cell.options),
         "arms": {name: asdict(arm) for name, arm in cell.true_arms.items()},
         "base_from_flange": cell.true_base_from_flange,
     }
-    return json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n"

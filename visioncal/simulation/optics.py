@@ -4,6 +4,7 @@ Models: Brown (1971) with the rational radial term that OpenCV uses, and the equ
 polynomial of Kannala and Brandt (2006) in OpenCV's parametrisation. Pixel centres at integers.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -115,6 +116,13 @@ def rays(camera: Camera, px: FloatArray) -> FloatArray:
     x, y = _undo_brown(_coefficients(camera), x_bent, y_bent)
     directions = np.stack([x, y, np.ones_like(x)], axis=-1)
     return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
+
+
+CAMERAS: Mapping[str, Callable[[], Camera]] = {
+    "wide": wide_camera,
+    "fine": fine_camera,
+    "fisheye": fisheye_camera,
+}
 
 
 def sees(camera: Camera, points_cam: FloatArray, margin_px: float) -> npt.NDArray[np.bool_]:

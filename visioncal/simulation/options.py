@@ -1,5 +1,6 @@
 """What a simulated cell is made of, and how good or bad it is."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -35,6 +36,12 @@ def checkerboard_target() -> Target:
         square_m=0.025,
         square_sigma_m=2.5e-5,
     )
+
+
+TARGETS: Mapping[str, Callable[[], Target]] = {
+    "charuco_9x6_30mm": charuco_target,
+    "checkerboard_9x6_25mm": checkerboard_target,
+}
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,8 @@ class CellOptions:
             change of one option leaves the others' draws as they were.
         draw: Which draw of the real arm and of all noise; the cell, and what the robot moves to,
             are the same for all.
+        recording: Which recording of the same cell and arm: each has stops and noise of its own.
+        camera_moved_m: How far the camera was pushed from where it sits in this cell [m].
     """
 
     robot: str = "ur10e"
@@ -143,6 +152,8 @@ class CellOptions:
     second: Second | None = None
     seed: int = 0
     draw: int = 0
+    recording: int = 0
+    camera_moved_m: float = 0.0
 
     def __post_init__(self) -> None:
         if self.views < 1:

@@ -23,7 +23,7 @@ from visioncal.simulation.sweep import Sweep
 from visioncal.transforms import exp
 from visioncal.types import Camera, FloatArray, Target
 
-_POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # An operator's pace: a stop every so many seconds [s].
 _PACE_S = 4.0
 
@@ -79,7 +79,7 @@ def write_session(
         _image_session(cell, folder.name, progress) if images else pairs_session(cell, folder.name)
     )
     session.save(folder)
-    write_atomically(truth_path(folder), truth_text(cell))
+    write_truth(folder, truth_of(cell))
     if progress is not None:
         progress(1.0)
     return folder
@@ -100,7 +100,7 @@ def write_sweep(moved: Sweep, folder: Path | str) -> Path:
     folder = Path(folder)
     sweep_session(moved, folder.name).save(folder)
     clock = {"camera_minus_robot_s": moved.options.camera_minus_robot_s}
-    write_atomically(truth_path(folder), truth_text(moved.cell, clock))
+    write_truth(folder, truth_of(moved.cell) | clock)
     return folder
 
 
@@ -354,23 +354,28 @@ def approach_text(cell: Cell, view: int) -> dict[str, str]:
 def pose_row(pose: FloatArray) -> dict[str, float]:
     """Seven columns of a pose (4, 4)."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-    return dict(zip(_POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
+    return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
 
-def truth_text(cell: Cell, more: Mapping[str, Any] | None = None) -> str:
-    """The content of a truth's file, with more than a cell has."""
+def truth_of(cell: Cell) -> dict[str, Any]:
+    """What a truth's file says of a cell."""
     options = asdict(cell.options)
     camera = options.pop("camera")
     arm = asdict(cell.true_arm)
     del arm["name"]
-    content = {
+    return {
         "schema": 1,
-        "transforms": cell.transforms,
+        "transforms": dict(cell.transforms),
         "camera": camera,
         "wrong_views": cell.wrong_views,
         "options": options,
         "arm": arm,
         "base_from_flange": cell.true_base_from_flange,
         "cam_from_target": cell.cam_from_target,
-    } | dict(more or {})
-    return json.dumps(content, indent=1, default=np.ndarray.tolist) + "\n"
+    }
+
+
+def write_truth(folder: Path, content: Mapping[str, Any]) -> None:
+    """Writes the truth of a session beside its folder; arrays as lists."""
+    text = json.dumps(content, indent=1, default=np.ndarray.tolist)
+    write_atomically(truth_path(folder), text + "\n")

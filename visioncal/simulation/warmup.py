@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.files import write_atomically
 from visioncal.session import Session
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import Arm, forward
 from visioncal.simulation.cell import Cell, before_camera, detected, seen_by, simulate
 from visioncal.simulation.options import CellOptions
-from visioncal.simulation.records import pairs_session, truth_path, truth_text
+from visioncal.simulation.records import pairs_session, truth_of, write_truth
 from visioncal.simulation.second import chains
 from visioncal.transforms import invert
 from visioncal.types import FloatArray
@@ -251,7 +250,7 @@ def write_warm_up(moved: WarmUp, folder: Path | str, *, temperatures: bool = Tru
     """
     folder = Path(folder)
     moved.session(folder.name, temperatures=temperatures).save(folder)
-    write_atomically(truth_path(folder), truth_text(moved.cell, {"heat": asdict(moved.heat)}))
+    write_truth(folder, truth_of(moved.cell) | {"heat": asdict(moved.heat)})
     return folder
 
 

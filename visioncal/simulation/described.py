@@ -1,0 +1,170 @@
+"""Descriptions of whole cells: a TOML file of one's own, or one that comes with visioncal.
+
+The keys are the fields of `NetworkOptions` and of what it holds; `[targets.NAME]` are its boards.
+"""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
+
+from visioncal.errors import DataError
+from visioncal.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.simulation.arms import ARMS
+from visioncal.simulation.layout import (
+    CELL,
+    BoardAt,
+    CameraAt,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    PointAt,
+    RobotAt,
+)
+from visioncal.simulation.optics import CAMERAS
+from visioncal.simulation.options import TARGETS
+from visioncal.types import Camera, Target
+
+Thing: TypeAlias = RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | NetworkOptions
+_T = TypeVar("_T", bound=Thing)
+
+_FOLDER = Path(__file__).with_name("cells")
+# What a file has of each kind, by names: its table, and the field of the options.
+_KINDS: Mapping[str, tuple[type[Thing], str]] = {
+    "robots": (RobotAt, "robots"),
+    "cameras": (CameraAt, "cameras"),
+    "targets": (BoardAt, "boards"),
+    "instruments": (InstrumentAt, "instruments"),
+    "points": (PointAt, "points"),
+}
+_TABLES = (*_KINDS, "moved")
+# Whole numbers go up to this.
+_MOST = 1_000_000
+
+
+def cell_names() -> tuple[str, ...]:
+    """The cells that come with visioncal."""
+    return tuple(sorted(_shipped()))
+
+
+def read_cell(name_or_path: str) -> NetworkOptions:
+    """Reads what a whole cell is made of.
+
+    Args:
+        name_or_path: A name of `cell_names`, or the path of a `.toml`.
+
+    Raises:
+        DataError: There is no such cell; or a field is not known, missing, of another type or out
+            of range.
+    """
+    path = find_described(
+        name_or_path, what="cell", shipped=_shipped(), suffixes=(".toml",), folder=None
+    )
+    document = parse_toml(read_text(path), path.name)
+    own = {key: value for key, value in document.items() if key not in _TABLES}
+    robots = tuple(_table(document, "robots", path.name))
+    if not robots:
+        raise DataError(
+            f"{path.name}: robots is missing; a table [robots.NAME] for each robot is needed.",
+            culprits=[f"{path.name}: robots"],
+        )
+    reader = _Reader(path.name, (CELL, *robots))
+    things: dict[str, tuple[Thing, ...]] = {
+        target: tuple(
+            reader.read(kind, row, f"{key}.{name}", name=name)
+            for name, row in _table(document, key, path.name).items()
+        )
+        for key, (kind, target) in _KINDS.items()
+    }
+    pushed = document.get("moved", [])
+    if not isinstance(pushed, list):
+        raise Table(document, path.name).refuse("moved", pushed, "a table [[moved]] for each push")
+    moved = tuple(reader.read(Moved, row, f"moved {at}") for at, row in enumerate(pushed, start=1))
+    return reader.read(NetworkOptions, own, "", moved=moved, **things)
+
+
+def _shipped() -> dict[str, Path]:
+    return {path.stem: path for path in _FOLDER.glob("*.toml")}
+
+
+def _table(document: Mapping[str, Any], key: str, label: str) -> Mapping[str, Any]:
+    content = document.get(key, {})
+    if not isinstance(content, dict):
+        raise Table(document, label).refuse(key, content, f"a table [{key}.NAME] for each")
+    return content
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads tables by the types of the fields that they fill.
+
+    Attributes:
+        file: The file's name, for messages.
+        carriers: What things can be on.
+    """
+
+    file: str
+    carriers: tuple[str, ...]
+
+    def read(self, kind: type[_T], row: object, path: str, **given: object) -> _T:
+        """One table as an object of a dataclass.
+
+        Args:
+            kind: The dataclass.
+            row: The table.
+            path: Where it stands in the file; empty for the file itself.
+            given: Fields that are no keys of the table.
+        """
+        label = f"{self.file}, {path}" if path else self.file
+        if not isinstance(row, dict):
+            raise Table({path: row}, self.file).refuse(path, row, "a table")
+        types = {it: kind for it, kind in get_type_hints(kind).items() if it not in given}
+        unknown = sorted(row.keys() - types.keys())
+        if unknown:
+            known = [*types, *([] if path else _TABLES)]
+            raise DataError(
+                f"{label}: {unknown[0]} is not known; the fields are {', '.join(known)}.",
+                culprits=[f"{label}: {unknown[0]}"],
+                next_step=did_you_mean(unknown[0], known),
+            )
+        needed = {it.name for it in fields(kind) if _has_no_default(it)}
+        table = Table(row, label)
+        values: dict[str, Any] = {
+            key: self._value(table, key, hint)
+            for key, hint in types.items()
+            if key in row or key in needed
+        }
+        return kind(**values | given)
+
+    def _value(self, table: Table, key: str, hint: object) -> object:
+        if hint is Camera:
+            return CAMERAS[table.choice(key, tuple(CAMERAS))]()
+        if hint is Target:
+            return TARGETS[table.choice(key, tuple(TARGETS))]()
+        if key == "robot":
+            return table.choice(key, ARMS)
+        if key == "on":
+            return table.choice(key, self.carriers)
+        if hint is bool:
+            return table.flag(key, False)
+        if hint is str:
+            return table.text(key)
+        if hint is float:
+            return _number(table, key)
+        if int in (hint, *get_args(hint)):
+            return table.integer(key, 1 if key == "stops" else 0, _MOST)
+        return tuple(table.numbers(key, 3))
+
+
+def _number(table: Table, key: str) -> float:
+    """A number, which is no standard deviation below zero and no share above one."""
+    value = table.number(key, positive=key == "scale")
+    if key == "share_seen" and not 0.0 < value <= 1.0:
+        raise table.refuse(key, value, "a share above 0, up to 1,")
+    if "sigma" in key and value < 0.0:
+        raise table.refuse(key, value, "a number of 0 or more")
+    return value
+
+
+def _has_no_default(it: Field[Any]) -> bool:
+    return it.default is MISSING and it.default_factory is MISSING

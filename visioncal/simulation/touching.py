@@ -1,0 +1,221 @@
+"""Touches by the arm of a simulated cell: with a tool's tip, of a fixed point and of a fixture."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DataError
+from visioncal.files import write_atomically
+from visioncal.simulation.arms import forward, inverse, reach_m
+from visioncal.simulation.cell import (
+    LEAST_DEXTERITY,
+    Cell,
+    Stream,
+    home_posture,
+    lowest_m,
+    stream,
+)
+from visioncal.simulation.records import pose_row
+from visioncal.transforms import compose, exp, invert
+from visioncal.types import FloatArray, Mask
+
+# How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
+_CONTACT_M, _CONE_RAD = 5e-5, 0.75
+# The drawn points, in the fixture's frame [m].
+_DRAWN_M = np.array(
+    [
+        [0.0, 0.0, 0.0],
+        [0.24, 0.0, 0.0],
+        [0.24, 0.16, 0.0],
+        [0.0, 0.15, 0.01],
+        [0.05, 0.04, 0.03],
+        [0.19, 0.05, 0.03],
+        [0.17, 0.12, 0.045],
+        [0.06, 0.11, 0.02],
+    ]
+)
+# Aiming anew for what gives way converges by the share of the yielding in each round.
+_ROUNDS = 6
+_EXACT = 1e-8
+_TRIES = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """Touches of one table.
+
+    Attributes:
+        columns: What the rows have beside the pose and the joints, by the columns' names.
+        base_from_flange: (n, 4, 4) poses as reported.
+        joints: (n, k) joint angles as reported [rad].
+    """
+
+    columns: Mapping[str, tuple[str, ...]]
+    base_from_flange: FloatArray
+    joints: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """What the arm of a cell touched.
+
+    Attributes:
+        flange_from_tool: (4, 4) the tool; its tip is the origin.
+        base_from_fixture: (4, 4) the fixture.
+        tip: Touches of one point, for the tool.
+        features: Touches of the fixture's origin, x axis and xy plane, with that tool.
+        points: Touches of the drawn points, with that tool.
+    """
+
+    flange_from_tool: FloatArray
+    base_from_fixture: FloatArray
+    tip: Touched
+    features: Touched
+    points: Touched
+
+    @property
+    def transforms(self) -> dict[str, FloatArray]:
+        """The tool and the fixture, by the names of a result."""
+        return {
+            "flange_from_tool": self.flange_from_tool,
+            "base_from_fixture": self.base_from_fixture,
+        }
+
+    @property
+    def drawing(self) -> list[list[str]]:
+        """The drawing's rows: `point`, `x_mm`, `y_mm`, `z_mm`."""
+        rows = (1e3 * _DRAWN_M).round(6).tolist()
+        return [[_name(at), *map(str, row)] for at, row in enumerate(rows)]
+
+
+def touch(cell: Cell) -> Touching:
+    """Touches a point by the tool's tip, axis and plane, and then a fixture by the tip.
+
+    Args:
+        cell: The cell; its arm touches without a load, and errs as it does before the camera.
+
+    Raises:
+        DataError: The arm does not reach enough postures.
+    """
+    rng = stream(cell.options, Stream.TOUCHES)
+    turn = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
+    flange_from_tool = compose(turn, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
+    lies = Rotation.from_rotvec([*rng.normal(0.0, 0.03, 2), rng.uniform(-0.5, 0.5)]).as_matrix()
+    reach = reach_m(cell.arm)
+    base_from_fixture = compose(lies, np.array([0.45 * reach, -0.1 * reach, 0.12 * reach]))
+
+    far, aside = rng.uniform(0.08, 0.12, 4), rng.uniform(-0.02, 0.02, 2)
+    along = [[0.0, 0.0, it] for it in far[:2]]
+    across = [[x, 0.0, z] for x, z in zip(far[2:], aside, strict=True)]
+    in_tool = np.concatenate([np.zeros((10, 3)), along, across])
+    corner = np.tile(base_from_fixture[:3, 3] + [0.0, 0.0, 0.05], (len(in_tool), 1))
+    kinds = ("point",) * 10 + ("z",) * 2 + ("xz",) * 2
+    tip = _touched(cell, flange_from_tool, corner, in_tool, {"kind": kinds}, rng)
+
+    featured = np.zeros((9, 3))
+    featured[3:6, 0], featured[6:, :2] = rng.uniform(0.1, 0.25, 3), rng.uniform(0.1, 0.2, (3, 2))
+    features = ("origin",) * 3 + ("x",) * 3 + ("xy",) * 3
+
+    def on_fixture(places: FloatArray, columns: Mapping[str, tuple[str, ...]]) -> Touched:
+        met = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
+        return _touched(cell, flange_from_tool, met, np.zeros_like(met), columns, rng)
+
+    names = tuple(_name(at) for at in range(len(_DRAWN_M)))
+    return Touching(
+        flange_from_tool,
+        base_from_fixture,
+        tip,
+        on_fixture(featured, {"kind": features}),
+        on_fixture(_DRAWN_M, {"point": names}),
+    )
+
+
+def _name(at: int) -> str:
+    return f"P{at + 1}"
+
+
+def _touched(
+    cell: Cell,
+    flange_from_tool: FloatArray,
+    places: FloatArray,
+    in_tool: FloatArray,
+    columns: Mapping[str, tuple[str, ...]],
+    rng: np.random.Generator,
+) -> Touched:
+    """Brings places of the tool (n, 3) to places in the base (n, 3) [m], tilted each its way."""
+    met = places + _CONTACT_M * rng.standard_normal(places.shape)
+    reached = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
+    down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    straight = compose(down.as_matrix(), met[0] - down.apply(reached[0]))
+    home = home_posture(cell.options, cell.arm, straight[None], rng)
+    options = cell.options
+    sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
+    joints = np.zeros((len(met), cell.arm.a.size))
+    left = np.ones(len(met), dtype=bool)
+    for _ in range(_TRIES):
+        count = int(left.sum())
+        tilt = _CONE_RAD * np.sqrt(rng.uniform(0.0, 1.0, count))
+        lean, spin = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-1.0, 1.0, count)
+        axes = np.stack([np.cos(lean), np.sin(lean), np.zeros(count)], axis=1)
+        turns = Rotation.from_rotvec(tilt[:, None] * axes) * down
+        turns = turns * Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0]))
+        goals = np.tile(np.eye(4), (count, 1, 1))
+        goals[:, :3, :3] = turns.as_matrix()
+        goals[:, :3, 3] = met[left] - turns.apply(reached[left])
+        # Once the joints are where they read, the flange stands off by its repeatability.
+        goals = goals @ exp(-sigma * rng.standard_normal((count, 6)))
+        found, good = _standing(cell, goals, home)
+        joints[np.flatnonzero(left)[good]] = found[good]
+        left[left] = np.logical_not(good)
+        if not left.any():
+            return Touched(columns, forward(cell.arm, joints), joints)
+    raise DataError(
+        f"simulation: the {cell.arm.name} reaches {len(met) - int(left.sum())} of {len(met)} "
+        "touches.",
+        next_step="Take another robot or seed.",
+    )
+
+
+def _standing(cell: Cell, goals: FloatArray, home: FloatArray) -> tuple[FloatArray, Mask]:
+    """(m, n) joints at which the real arm stands at (m, 4, 4), and (m,) which of them serve."""
+    joints, aims = np.tile(home, (len(goals), 1)), goals
+    for _ in range(_ROUNDS):
+        reach = inverse(cell.true_arm, aims, joints)
+        joints = reach.joints
+        stands = cell.flange_at(joints)
+        aims = goals @ invert(stands) @ aims
+    good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
+    good &= np.abs(stands - goals).max(axis=(1, 2)) < _EXACT
+    return joints, good & (lowest_m(cell.arm, joints) > 0.0)
+
+
+def write_touches(touched: Touching, folder: Path) -> None:
+    """Writes `touches.csv`, `features.csv`, `points.csv` and the drawing, `cad.csv`.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    tables = {"touches": touched.tip, "features": touched.features, "points": touched.points}
+    for name, table in tables.items():
+        poses = [pose_row(it) for it in table.base_from_flange]
+        joints = [f"q{at}_rad" for at in range(1, table.joints.shape[1] + 1)]
+        rows = (
+            [at, *(it[at] for it in table.columns.values()), *poses[at].values(), *q.tolist()]
+            for at, q in enumerate(table.joints)
+        )
+        header = ["view", *table.columns, *poses[0], *joints]
+        write_atomically(folder / f"{name}.csv", _csv(header, rows))
+    write_atomically(folder / "cad.csv", _csv(["point", "x_mm", "y_mm", "z_mm"], touched.drawing))
+
+
+def _csv(header: list[str], rows: Iterable[list[object] | list[str]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()

@@ -1,0 +1,172 @@
+"""Readings of an instrument: an arm that errs, a tracker beside it, a tool on its flange."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.session import MemoryImages, Session
+from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
+from visioncal.simulation.records import POSE, load_row, pose_row, write_truth
+from visioncal.simulation.sag import Payload, giving_of, sagging
+from visioncal.transforms import compose, exp, invert
+from visioncal.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What a session is drawn from.
+
+    Attributes:
+        robot: Its name.
+        stops: How many.
+        points: Places of the points on the flange [m]; one alone where poses are read.
+        poses: Whether the first point is a probe whose rotation is read, too.
+        sigma_m: Noise of a coordinate [m].
+        sigma_rad: Noise of a probe's rotation [rad].
+        robot_sigma_m: Repeatability of the flange [m].
+        robot_sigma_rad: The same of its rotation [rad].
+        dh_sigma_m: Errors of the arm's lengths [m].
+        dh_sigma_rad: Errors of its angles [rad].
+        compliance: What each joint yields to a torque [rad/(N m)]; empty for a rigid arm.
+        payloads: What hangs on the flange, stop by stop in turn.
+        seed: Of everything random.
+    """
+
+    robot: str = "ur10e"
+    stops: int = 30
+    points: tuple[tuple[float, float, float], ...] = ((0.03, -0.02, 0.12),)
+    poses: bool = False
+    sigma_m: float = 2e-5
+    sigma_rad: float = 5e-5
+    robot_sigma_m: float = 3e-5
+    robot_sigma_rad: float = 3e-5
+    dh_sigma_m: float = 0.0
+    dh_sigma_rad: float = 0.0
+    compliance: tuple[float, ...] = ()
+    payloads: tuple[Payload, ...] = ()
+    seed: int = 0
+
+
+THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
+
+
+@dataclass(frozen=True, eq=False)
+class Shop:
+    """The truth and what was read.
+
+    Attributes:
+        options: What it was drawn from.
+        arm: The nominal arm.
+        true_arm: The real one.
+        base_from_instrument: (4, 4).
+        flange_from_probe: (4, 4); the first point's place, without a turn where places are read.
+        joints: (s, n) [rad].
+        rows: Each reading's stop, point, and (4, 4) pose in the instrument's frame.
+    """
+
+    options: Tracked
+    arm: Arm
+    true_arm: Arm
+    base_from_instrument: FloatArray
+    flange_from_probe: FloatArray
+    joints: FloatArray
+    rows: tuple[tuple[int, int, FloatArray], ...]
+
+
+def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
+    """Moves the arm all over its workspace, or to (s, n) joints [rad], and reads."""
+    rng = np.random.default_rng([7, options.seed])
+    arm = arm_named(options.robot)
+    errors = ArmErrors(options.dh_sigma_m, options.dh_sigma_rad, options.dh_sigma_rad)
+    true_arm = disturb(arm, errors, rng)
+    x = compose(exp(np.array([[0.1, -0.2, 2.5, 0, 0, 0]]))[0, :3, :3], np.array([2.5, -1.0, 0.4]))
+    turn = exp(np.array([[0.5, 1.0, -0.3, 0, 0, 0]]))[0, :3, :3] if options.poses else np.eye(3)
+    z = compose(turn, np.array(options.points[0]))
+    if joints is None:
+        joints = above(arm, options.stops, rng)
+    sigmas = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
+    giving = giving_of(true_arm, options.compliance, 1.0, ())
+    standing = sagging(true_arm, giving, joints, payloads_of(options, len(joints)))
+    flange = forward(true_arm, standing) @ exp(rng.normal(size=(len(joints), 6)) * sigmas)
+    rows = []
+    for stop, pose in enumerate(flange):
+        for point, place in enumerate(options.points):
+            on_flange = z if point == 0 else compose(np.eye(3), np.array(place))
+            true = invert(x) @ pose @ on_flange
+            turned = exp(np.r_[rng.normal(size=3) * options.sigma_rad, 0, 0, 0][None])[0, :3, :3]
+            place_read = true[:3, 3] + options.sigma_m * rng.normal(size=3)
+            rows.append((stop, point, compose(true[:3, :3] @ turned, place_read)))
+    return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
+
+
+def payloads_of(options: Tracked, stops: int) -> list[Payload]:
+    """What hung on the flange at each stop; empty for nothing."""
+    hung = options.payloads
+    return [hung[at % len(hung)] for at in range(stops)] if hung else []
+
+
+def above(arm: Arm, stops: int, rng: np.random.Generator) -> FloatArray:
+    """Postures all over the workspace, above the table [rad]."""
+    kept: list[FloatArray] = []
+    while len(kept) < stops:
+        q = rng.uniform(-2.5, 2.5, (1, len(arm.offset)))
+        if forward(arm, q)[0, 2, 3] > 0.1:
+            kept.append(q[0])
+    return np.array(kept)
+
+
+def session_of(
+    shop: Shop, *, joints: bool = True, poses: bool = False, **document: object
+) -> Session:
+    """The session as it stands in memory.
+
+    Args:
+        shop: What was read.
+        joints: Whether rows have joint angles and the session names the robot.
+        poses: Whether rows have the nominal arm's poses.
+        document: Tables of session.toml, in the place of the right ones.
+    """
+    options = shop.options
+    nominal = forward(shop.arm, shop.joints)
+    payloads = payloads_of(options, len(shop.joints))
+    rows = []
+    for view, (stop, point, read) in enumerate(shop.rows):
+        keys = POSE if options.poses else POSE[:3]
+        numbers = {f"meas_{key}": it for key, it in pose_row(read).items() if key in keys}
+        if poses:
+            numbers |= pose_row(nominal[stop])
+        if joints:
+            numbers |= {f"q{at}_rad": it for at, it in enumerate(shop.joints[stop].tolist(), 1)}
+        if payloads:
+            numbers |= load_row(payloads[stop])
+        name = "abc"[point] if len(options.points) > 1 else ""
+        rows.append({"view": view, "stop": stop, "point": name} | numbers)
+    noise = {"sigma_m": options.sigma_m}
+    if options.poses:
+        noise["sigma_rad"] = options.sigma_rad
+    facts = {"schema": 1, "name": "tracked", "instrument": noise}
+    facts |= {"robot": {"model": options.robot}} if joints else {}
+    cells = [[str(it) for it in row.values()] for row in rows]
+    return Session.assemble(facts | document, list(rows[0]), cells, MemoryImages({}))
+
+
+def write_tracked(shop: Shop, folder: Path | str) -> Path:
+    """Writes readings as a session's folder, and the truth as `<folder>.truth.json` beside it.
+
+    Raises:
+        DataError: The folder cannot be written.
+    """
+    folder = Path(folder)
+    session_of(shop, name=folder.name).save(folder)
+    content = {
+        "schema": 1,
+        "transforms": {
+            "base_from_instrument": shop.base_from_instrument,
+            "flange_from_probe": shop.flange_from_probe,
+        },
+        "options": asdict(shop.options),
+        "arm": asdict(shop.true_arm),
+    }
+    write_truth(folder, content)
+    return folder
