@@ -1,44 +1,63 @@
 """`visioncal simulate`."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
+import numpy as np
 import typer
 
 from visioncal.cli.console import messages, shown_progress
+from visioncal.cli.simulated import given_for
+from visioncal.errors import DataError
 from visioncal.simulation import (
+    ARMS,
+    CAMERAS,
     CellOptions,
     Payload,
     Round,
+    Second,
     SweepOptions,
     WarmUpOptions,
     arm_named,
+    cell_names,
     charuco_target,
     checkerboard_target,
-    fine_camera,
-    fisheye_camera,
+    read_cell,
     simulate,
+    simulate_network,
     simulate_warm_up,
+    touch,
     truth_path,
-    wide_camera,
+    write_network,
     write_session,
     write_sweep,
+    write_touches,
     write_warm_up,
 )
 from visioncal.simulation import sweep as swept
+from visioncal.simulation.dynamics import Body
+from visioncal.simulation.exercise import ExerciseOptions, Senses, write_exercise
+from visioncal.simulation.records import truth_of, write_truth
+from visioncal.simulation.tracked import THREE, Tracked, tracked, write_tracked
 from visioncal.types import CameraMount
 
-_CAMERAS = {"wide": wide_camera, "fine": fine_camera, "fisheye": fisheye_camera}
+Read: TypeAlias = Literal["point", "points", "probe"]
+
 # Where the centre of a simulated load is, in the flange's frame [m].
 _CENTRE_M = (0.0, 0.0, 0.1)
+# Half of the side of a load that is a cube [m], and torque for a current of each drive [N m/A].
+_HALF_M = 0.05
+_GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 _BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
 
 
 def simulate_command(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="Where to write the session.")],
     mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand",
     views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20,
-    robot: Annotated[str, typer.Option(help="ur3e, ur5e or ur10e.")] = "ur10e",
+    robot: Annotated[str, typer.Option(help=f"{', '.join(ARMS)}.")] = "ur10e",
     camera: Annotated[
         Literal["wide", "fine", "fisheye"],
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
@@ -46,6 +65,9 @@ def simulate_command(
     board: Annotated[
         Literal["charuco", "checkerboard"], typer.Option(help="What is printed.")
     ] = "charuco",
+    second_board: Annotated[
+        bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")
+    ] = False,
     robot_sigma_mm: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="Repeatability of the robot [mm].")
     ] = 0.03,
@@ -83,8 +105,29 @@ def simulate_command(
             help="A cold arm that works for 100 minutes: pose pairs, and its joints' temperatures."
         ),
     ] = False,
+    cell: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE.toml",
+            help=f"A whole cell: {', '.join(cell_names())}, or a file that describes one.",
+        ),
+    ] = None,
+    instrument: Annotated[
+        Read | None,
+        typer.Option(help="A tracker that reads one point or three on the flange, or a probe."),
+    ] = None,
+    torques: Annotated[
+        bool, typer.Option("--torques", help="Streams of a moving arm's torques, without views.")
+    ] = False,
+    touches: Annotated[
+        bool,
+        typer.Option("--touches", help="Also touches of a tool and a fixture, in touches.csv ..."),
+    ] = False,
     currents: Annotated[
-        bool, typer.Option(help="With --warm-up: motor currents instead of temperatures.")
+        bool,
+        typer.Option(
+            help="Motor currents: with --warm-up for temperatures, with --torques for torques."
+        ),
     ] = False,
     stiffness_knm: Annotated[
         float | None,
@@ -94,15 +137,25 @@ def simulate_command(
         list[float] | None,
         typer.Option(min=0.0, help="What the arm carries; several times for stops in turn."),
     ] = None,
+    recording: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Another recording of the same cell: fresh stops, for verify and locate."
+        ),
+    ] = 0,
+    camera_moved_mm: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="How far the camera was knocked [mm].")
+    ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
     """Write a simulated session, and its truth in a file beside it."""
+    given = given_for(context)
     options = CellOptions(
         robot=robot,
         mount=mount,
         views=views,
         target=_BOARDS[board](),
-        camera=_CAMERAS[camera](),
+        camera=CAMERAS[camera](),
         state_intrinsics=with_intrinsics,
         robot_sigma_m=1e-3 * robot_sigma_mm,
         robot_sigma_rad=1e-3 * robot_sigma_mrad,
@@ -112,23 +165,105 @@ def simulate_command(
         board_scale=board_scale,
         compliance_rad_per_nm=_compliance(robot, stiffness_knm),
         payloads=tuple(Payload(it, _CENTRE_M) for it in payload_kg or ()),
+        second=Second() if second_board else None,
+        recording=recording,
+        camera_moved_m=1e-3 * camera_moved_mm,
         seed=seed,
     )
-    if warm_up:
+    if cell is not None:
+        _whole_cell(cell, folder, options, given, images=images)
+    elif instrument is not None:
+        stops = views if "views" in given else Tracked.stops
+        write_tracked(tracked(_read_by(instrument, options, stops)), folder)
+    elif torques:
+        write_exercise(_exercise(robot, payload_kg, seed, currents=currents), folder)
+    elif warm_up:
         how = WarmUpOptions(options, round=Round(first=views))
         write_warm_up(simulate_warm_up(how), folder, temperatures=not currents)
     elif sweep:
         clocks = SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms)
         write_sweep(swept(options, clocks), folder)
     else:
-        with shown_progress(quiet=False) as told:
-            write_session(
-                simulate(options),
-                folder,
-                lambda share: told("render", round(share * views), views),
-                images=images,
-            )
+        _single(options, folder, images=images, touches=touches)
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
+
+
+def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) -> None:
+    """Writes a cell of one robot, and what its tool touched."""
+    cell = simulate(options)
+    touched = touch(cell) if touches else None
+    with shown_progress(quiet=False) as told:
+        write_session(
+            cell,
+            folder,
+            lambda share: told("render", round(share * options.views), options.views),
+            images=images,
+        )
+    if touched is not None:
+        write_touches(touched, folder)
+        truth = truth_of(cell)
+        truth["transforms"] |= touched.transforms
+        write_truth(folder, truth)
+
+
+def _whole_cell(
+    name: str, folder: Path, options: CellOptions, given: frozenset[str], *, images: bool
+) -> None:
+    """Writes a whole cell; what the user gives comes before what is described."""
+    described = read_cell(name)
+    changes = {"views": "stops", "wrong_views": "stray_images", "seed": "seed"}
+    described = replace(
+        described, **{own: getattr(options, it) for it, own in changes.items() if it in given}
+    )
+    cell = simulate_network(described)
+    if not (cell.sights or cell.readings):
+        raise DataError(
+            f"--cell {name}: nothing in this cell is seen or read.",
+            culprits=[name],
+            next_step="Give it a camera that sees a target, or an instrument and points.",
+        )
+    with shown_progress(quiet=False) as told:
+        count = len(cell.sights)
+        write_network(
+            cell,
+            folder,
+            lambda share: told("render", round(share * count), count),
+            seen="images" if images else "poses",
+        )
+
+
+def _read_by(instrument: Read, options: CellOptions, stops: int) -> Tracked:
+    """What an instrument reads of the arm of a cell."""
+    return Tracked(
+        robot=options.robot,
+        stops=stops,
+        points=THREE if instrument == "points" else THREE[:1],
+        poses=instrument == "probe",
+        robot_sigma_m=options.robot_sigma_m,
+        robot_sigma_rad=options.robot_sigma_rad,
+        dh_sigma_m=options.dh_sigma_m,
+        dh_sigma_rad=options.dh_sigma_rad,
+        compliance=options.compliance_rad_per_nm,
+        payloads=options.payloads,
+        seed=options.seed,
+    )
+
+
+def _exercise(
+    robot: str, payload_kg: list[float] | None, seed: int, *, currents: bool
+) -> ExerciseOptions:
+    """An arm's motions, empty or with a cube on its flange."""
+    loads = payload_kg or [0.0]
+    if len(loads) > 1:
+        raise DataError(
+            f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
+            culprits=["--payload-kg"],
+            next_step="Make a session of each load, with the same --seed.",
+        )
+    inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
+    load = Body(loads[0], np.array(_CENTRE_M), inertia) if loads[0] else None
+    senses = Senses(gains_nm_a=_GAINS_NM_A if currents else ())
+    return ExerciseOptions(robot, load, senses, seed=seed)
 
 
 def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
