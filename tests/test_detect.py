@@ -7,6 +7,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from varied_arms import placed
+from varied_images import Lens, Light, Print, draw
 
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, Seen, find_target
@@ -183,6 +186,26 @@ def test_a_legacy_board_declared_as_one_is_found():
     np.testing.assert_array_equal(seen.ids, exact.ids)
     # Wrong numbering would be off by a square, some 60 px.
     assert np.abs(seen.px - exact.px).max() < 1.0
+
+
+@pytest.mark.parametrize("declared", [{}, {"columns": 18}, {"legacy": True}])
+def test_a_large_board_that_a_wide_lens_bends_is_judged_by_neighbours(declared):
+    board = {"kind": "charuco", "columns": 20, "rows": 10, "square_m": 0.03, "marker_m": 0.02}
+    printed = Print(board | {"dictionary": "DICT_5X5_250"}, 0.03)
+    lens = Lens("fisheye", (1024, 768), np.array([520.0, 519.0, 503.0, 378.0]), np.zeros(4))
+    turn = Rotation.from_rotvec([0.5, 0.4, 0.6])
+    pose = placed(np.array([0.0, 0.0, 0.35]) - turn.apply(printed.centre), turn)
+    image = np.full((768, 1024), 120.0, np.float32)
+    draw(image, lens, printed, pose, Light(30, 210, 120, 0.7, 1.0), 40.0)
+    target = Target("wide", "charuco", 20, 10, 0.03, 3e-5, 0.02, "DICT_5X5_250")
+    seen = find_target(image.astype(np.uint8), replace(target, **declared))
+    if declared:
+        assert isinstance(seen, NotFound)
+        assert seen.misfit
+    else:
+        exact = lens.project(printed.corners @ pose[:3, :3].T + pose[:3, 3])
+        # Wrong numbering would be off by a square.
+        assert np.abs(seen.px - exact[seen.ids]).max() < 2.0
 
 
 def test_an_image_of_another_size_is_named_with_line_and_sizes(charuco):

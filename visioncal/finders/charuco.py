@@ -16,6 +16,8 @@ from visioncal.types import FloatArray, Image, Target
 _LAYOUT_MISFIT = 0.35
 # A homography has eight unknowns and a marker gives eight equations: three markers check it.
 _LAYOUT_MARKERS = 3
+# A marker and those around it: of this many, some are of the rows above and below.
+_NEIGHBOURS = 9
 
 # (4, 2) corners [px] by a marker's id.
 _Markers: TypeAlias = Mapping[int, FloatArray]
@@ -94,14 +96,31 @@ def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]
 
 
 def _misfit(markers: _Markers, target: Target) -> float:
-    """Rms distance of the markers from their places on a plane, in sides of a marker."""
-    on_board, in_image = _matches(markers, target)
-    if len(on_board) < 4 * _LAYOUT_MARKERS:
+    """Rms distance of the markers from their places on a plane, in sides of a marker.
+
+    A wide lens bends a board of many squares by more than a side, but nowhere a few neighbours:
+    where the whole board does not fit a plane, each marker is judged together with those around it.
+    """
+    on_board, in_image = (it.reshape(-1, 4, 2) for it in _matches(markers, target))
+    if len(on_board) < _LAYOUT_MARKERS:
         return 0.0
-    homography = np.asarray(cv2.findHomography(on_board, in_image)[0])
+    whole = _off_plane(on_board, in_image)
+    if whole <= _LAYOUT_MISFIT:
+        return whole
+    centres = in_image.mean(axis=1)
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
+    near = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
+    parts = [_off_plane(on_board[it], in_image[it]) for it in near]
+    return float(np.sqrt(np.mean(np.square(parts))))
+
+
+def _off_plane(on_board: FloatArray, in_image: FloatArray) -> float:
+    """Rms distance of (n, 4, 2) corners of markers from a homography, in sides of a marker."""
+    flat, px = on_board.reshape(-1, 2), in_image.reshape(-1, 2)
+    homography = np.asarray(cv2.findHomography(flat, px)[0])
     if homography.shape != (3, 3):
         return 0.0
-    predicted = cv2.perspectiveTransform(on_board[None], homography)[0]
-    sides = np.linalg.norm(np.diff(in_image.reshape(-1, 4, 2), axis=1), axis=2)
-    errors = np.linalg.norm(predicted - in_image, axis=1)
+    predicted = cv2.perspectiveTransform(flat[None], homography)[0]
+    sides = np.linalg.norm(np.diff(in_image, axis=1), axis=2)
+    errors = np.linalg.norm(predicted - px, axis=1)
     return float(np.sqrt(np.mean(errors**2)) / np.median(sides))
