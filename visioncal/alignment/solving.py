@@ -21,7 +21,7 @@ from visioncal.stages.choose import chosen, padded
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
-from visioncal.targets import first_corners, rotation_transforms
+from visioncal.targets import rotation_transforms
 from visioncal.types import IntArray, Mask, Target
 
 
@@ -202,9 +202,8 @@ def _started(
     state = State(edges, np.zeros(0))
     rough = _problem(cell, [chosen(it, 0, None) for it in views])
     picks = pick(rough.predicted(state), _sighted(cell, views, targets))
-    firsts = dict(zip(targets, first_corners(tuple(targets.values())).tolist(), strict=True))
     views = [
-        chosen(view, at, targets.get(row.seen), firsts.get(row.seen, 0))
+        chosen(view, at, targets.get(row.seen))
         for view, at, row in zip(views, picks.tolist(), cell.rows, strict=True)
     ]
     return cell, views, _problem(cell, views), state, tied.untied

@@ -201,8 +201,8 @@ def _chosen(seen: Known, robot: PoseNumbers) -> Known:
     part = robot_part(
         np.array([base_from_flange[it.view] for it in both]).reshape(-1, 4, 4), seen.session.mount
     )
-    targets = list(seen.session.boards.values())
-    choice = choose_poses(both, part, targets[both[0].board] if targets and both else None)
+    # Nothing asks for the corners any more, so that no target is needed to renumber them.
+    choice = choose_poses(both, part, None)
     return replace(seen, poses={it.view: it for it in choice.views})
 
 

@@ -191,19 +191,18 @@ def distances_to(
     return np.asarray(np.where(candidates.valid, away, np.inf))
 
 
-def chosen(view: ViewPoses, pick: int, target: Target | None, first: int = 0) -> ViewPoses:
+def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
     """Leaves one pose to a view, and numbers its corners accordingly.
 
     Args:
         view: The view.
         pick: Which of its poses.
         target: What it shows.
-        first: The number of the target's first corner, where several are numbered through.
     """
     corners, turn = view.corners, view.turns[pick]
     if corners is not None and target is not None and turn:
         # Turned, corner i lies where corner rotations[i] was: what was seen as that one is i.
-        renumbered = np.argsort(rotations(target)[turn])[corners.ids - first] + first
+        renumbered = np.argsort(rotations(target)[turn])[corners.ids - view.first] + view.first
         order = np.argsort(renumbered)
         weights = None if corners.weights is None else corners.weights[order]
         px = corners.px[order]

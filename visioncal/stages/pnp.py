@@ -47,6 +47,7 @@ class ViewPoses:
         by_shared: (c, 6, k) how each candidate moves with the unknowns that all views share, once
             it is known which these are; k = 0 before.
         board: Which of several targets it is.
+        first: The number of the target's first corner, where several are numbered through.
     """
 
     view: int
@@ -56,6 +57,7 @@ class ViewPoses:
     covariance: FloatArray
     by_shared: FloatArray
     board: int = 0
+    first: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,8 @@ def _with_rivals(
     best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, mirrored))
     mean_squares = [mean_square_by_view(stack, it.residuals) for it in (best, other)]
     turns_of = [rotation_transforms(it) for it in targets]
-    boards = np.searchsorted(first_corners(targets), stack.ids[stack.starts], side="right") - 1
+    firsts = first_corners(targets)
+    boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
     spreads = [floored_sigma_px(sigma_px) ** 2 * covariance(it.information) for it in (best, other)]
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
@@ -170,6 +173,7 @@ def _with_rivals(
                 np.concatenate(spread),
                 np.zeros((len(turns) * len(fits), 6, 0)),
                 board,
+                int(firsts[board]),
             )
         )
     return tuple(views)
