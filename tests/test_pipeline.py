@@ -8,6 +8,7 @@ from cells import calibrated, error_of, known_of, session_of
 
 from visioncal.errors import DataError
 from visioncal.pipeline.steps import STAGES
+from visioncal.pipeline.unused import nothing_seen
 from visioncal.pipeline.views import view_evidence
 from visioncal.simulation import (
     CellOptions,
@@ -153,3 +154,16 @@ def test_a_session_that_holds_all_views_back_is_told_so(given):
     with pytest.raises(DataError, match="are held back") as caught:
         calibrated(cell, session=held)
     assert "Clear role" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [
+        ("too few corners: 4 of 4, needs 6", "shows enough of the target"),
+        ("no board: no marker of DICT_5X5_100 is seen", "shows the target"),
+    ],
+)
+def test_a_board_with_too_few_corners_is_told_from_one_that_is_not_seen(reason, words):
+    known = known_of(simulate(FINE))
+    unseen = replace(known, corners={}, reasons=dict.fromkeys(known.corners, reason))
+    assert words in nothing_seen(unseen).message

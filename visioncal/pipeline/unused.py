@@ -48,6 +48,13 @@ def nothing_seen(known: Known) -> DataError:
             f"session {known.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
+    few = [it for it in known.lost_views if "too few corners" in it]
+    if few:
+        return DataError(
+            f"session {known.session.name!r}: no view shows enough of the target.",
+            next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
+            "corners enough.",
+        )
     return DataError(
         f"session {known.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "
