@@ -23,6 +23,7 @@ class Lens:
 
     @property
     def k(self) -> np.ndarray:
+        """(3, 3) the matrix as OpenCV has it."""
         fx, fy, cx, cy = self.matrix
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
@@ -52,6 +53,7 @@ class Print:
 
     @property
     def kind(self) -> str:
+        """charuco, checkerboard or marker."""
         return self.document["kind"]
 
     @cached_property
@@ -65,7 +67,9 @@ class Print:
     @cached_property
     def origin(self) -> np.ndarray:
         """Where the target's frame begins, in squares from the print's upper left corner."""
-        return np.array({"charuco": 0.0, "checkerboard": 1.0, "marker": 0.5}[self.kind] * np.ones(2))
+        return np.array(
+            {"charuco": 0.0, "checkerboard": 1.0, "marker": 0.5}[self.kind] * np.ones(2)
+        )
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -86,6 +90,7 @@ class Print:
 
     @property
     def dictionary(self) -> cv2.aruco.Dictionary:
+        """The markers."""
         name = self.document["dictionary"]
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
