@@ -1,6 +1,8 @@
 """Exciting motions: their series, their criterion, their limits, against plain calculations."""
 
+import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -8,6 +10,7 @@ import pytest
 from apart import clearances
 from small_arm import small_arm
 
+from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.condition import smooth_condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
@@ -24,7 +27,7 @@ from visioncal.robot.bodies import Body
 from visioncal.simulation.arms import ur_arm
 from visioncal.transforms import compose
 
-QUICK = ExcitationRequest(harmonics=4, seconds=0.0, starts=1, steps=20)
+QUICK = ExcitationRequest(harmonics=4, starts=1, steps=20)
 
 
 def some_series(joints: int = 3, seed: int = 0) -> Series:
@@ -183,6 +186,18 @@ def test_the_same_seed_gives_the_same_motion_and_another_seed_another():
     assert np.abs(first - other).max() > 0.01
 
 
+def test_a_slow_computer_finds_the_same_motion_unless_a_limit_of_time_is_wished(monkeypatch):
+    allowed = allowed_motion(small_arm(), Share())
+    wished = replace(QUICK, steps=3, harmonics=3, starts=2)
+    first = excite(allowed, wished)
+    hours = itertools.count(step=3600.0)
+    monkeypatch.setattr(excitation, "time", SimpleNamespace(process_time=lambda: next(hours)))
+    slow = excite(allowed, wished)
+    assert np.array_equal(first.series.free, slow.series.free)
+    assert slow.starts == 2
+    assert excite(allowed, replace(wished, seconds=60.0)).starts == 1
+
+
 def breaking(kind: str) -> Motion:
     """A motion of the small arm that breaks one limit alone."""
     times = np.linspace(0.0, 1.0, 201)
@@ -285,8 +300,9 @@ def test_limits_that_leave_nothing_are_named():
     with pytest.raises(DegenerateError, match="none of 2000 postures") as told:
         excite(flooded, QUICK)
     assert "floor" in told.value.culprits
-    weak = allowed_motion(small_arm(torque_nm=0.5), Share())
-    with pytest.raises(DegenerateError, match="torque of joint_"):
+    # Level within 20 degrees, its second joint holds more than 8 N m; upright it would hold none.
+    weak = allowed_motion(small_arm(torque_nm=8.0, lower_deg=-20.0, upper_deg=20.0), Share())
+    with pytest.raises(DegenerateError, match="torque of joint_2"):
         excite(weak, replace(QUICK, harmonics=3))
 
 
@@ -297,6 +313,8 @@ def test_limits_that_leave_nothing_are_named():
         ({"period_s": 60.0}, "60 s is too long"),
         ({"harmonics": 2}, "2 harmonics"),
         ({"seconds": -1.0}, "-1 s from"),
+        ({"seconds": float("nan")}, "nan s from"),
+        ({"starts": 0}, "from 0 starts"),
     ],
 )
 def test_wishes_that_make_no_sense_are_refused(wrong, words):

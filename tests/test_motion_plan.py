@@ -143,13 +143,13 @@ def quick(monkeypatch):
     """Searches a little only: what is written does not depend on how good it is."""
 
     def short(allowed, request, progress):
-        return excite(allowed, replace(request, steps=4, starts=1), progress)
+        return excite(allowed, replace(request, steps=4), progress)
 
     monkeypatch.setattr(dynamics_plan, "excite", short)
 
 
 def plan(robot: object, out: Path, *more: object) -> Done:
-    return visioncal("dynamics", "plan", robot, "-o", out, "--seconds", 0, *more)
+    return visioncal("dynamics", "plan", robot, "-o", out, "--starts", 1, *more)
 
 
 def table(path: Path) -> tuple[list[str], np.ndarray]:

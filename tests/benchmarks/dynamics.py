@@ -34,7 +34,7 @@ from visioncal.simulation.exercise import Exercise, multi_sine, slow_sweep
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 
-WORLDS, SEARCH_S, RATE_HZ, REPEATS = 20, 25.0, 500.0, 3
+WORLDS, RATE_HZ, REPEATS = 20, 500.0, 3
 PANDA = Path(__file__).parents[3] / "shared" / "data" / "dyn_franka_panda"
 PANDA_LIMITS = (5.0, 1.5, 2.4, 4.9, 6.2, 3.4, 17.9)
 WITH_ROTORS = FrictionTerms(motor_inertia=True, slow_rad_s=SLOW_RAD_S)
@@ -64,7 +64,7 @@ class World:
 def excitation(name: str) -> Exercise:
     """The motion that `visioncal dynamics plan` writes for an arm."""
     allowed = allowed_motion(load_robot(name), Share())
-    motion = excite(allowed, ExcitationRequest(seconds=SEARCH_S)).series.sampled(RATE_HZ)
+    motion = excite(allowed, ExcitationRequest()).series.sampled(RATE_HZ)
     return Exercise(motion.times_s, motion.q, motion.dq, motion.ddq)
 
 

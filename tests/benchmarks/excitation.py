@@ -1,6 +1,6 @@
-"""Exciting motions after 25 s of search, from several seeds.
+"""Exciting motions that the planner finds, from several seeds.
 
-PYTHONPATH=tests python tests/benchmarks/excitation.py [SEEDS [SECONDS]]
+PYTHONPATH=tests python tests/benchmarks/excitation.py [SEEDS]
 """
 
 import sys
@@ -17,16 +17,16 @@ from visioncal.dynamics.limits import Allowed, Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
 from visioncal.robot import load_robot
 
-SEEDS, SECONDS = 10, 25.0
+SEEDS = 10
 ROBOTS = ("ur5e", "ur10e", "panda")
 NO_FRICTION = FrictionTerms(coulomb=False, viscous=False, offset=False)
 
 
-def figures(job: tuple[str, int, float]) -> tuple[float, ...]:
+def figures(job: tuple[str, int]) -> tuple[float, ...]:
     """What one search finds: conditions, shares of the limits, distance [mm], starts, seconds."""
-    name, seed, seconds = job
+    name, seed = job
     allowed = allowed_motion(load_robot(name), Share())
-    found = excite(allowed, ExcitationRequest(seconds=seconds, seed=seed))
+    found = excite(allowed, ExcitationRequest(seed=seed))
     condition, kept = found.condition, found.kept
     return (
         condition.weighted,
@@ -80,12 +80,11 @@ def row(name: str, found: np.ndarray) -> str:
 
 def main() -> None:
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS
-    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else SECONDS
-    jobs = [(name, seed, seconds) for name in ROBOTS for seed in range(seeds)]
+    jobs = [(name, seed) for name in ROBOTS for seed in range(seeds)]
     with Pool(2) as pool:
         found = np.array(pool.map(figures, jobs, chunksize=1)).reshape(len(ROBOTS), seeds, -1)
     lines = [
-        f"{seconds:g} s of one core's time from each of {seeds} seeds; motions of 20 s with 5 "
+        f"{ExcitationRequest().starts} starts from each of {seeds} seeds; motions of 20 s with 5 "
         "harmonics, for inertias and three terms of friction a joint. Conditions: median / worst "
         "of the seeds. Weighted: rows divided by the joints' greatest torques, columns of unit "
         "length; plain: rows as they are, columns of unit length; links alone: plain, without the "

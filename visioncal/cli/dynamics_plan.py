@@ -36,7 +36,8 @@ def dynamics_plan_command(
     sweep_speeds: options.SweepSpeeds = 6,
     no_sweeps: options.NoSweeps = False,
     rate_hz: options.Rate = 500.0,
-    seconds: options.Seconds = 25.0,
+    starts: options.Starts = 4,
+    seconds: options.Seconds = None,
     seed: options.SearchSeed = 0,
     margin_deg: Margin = 3.0,
     speed: options.SpeedShare = 0.9,
@@ -73,7 +74,14 @@ def dynamics_plan_command(
         bodies=_bodies(arm, boxes or [], tool),
         payload=None if payload is None else _payload(payload),
     )
-    wished = ExcitationRequest(duration, harmonics, _terms(friction), seconds, seed)
+    wished = ExcitationRequest(
+        duration,
+        harmonics,
+        _terms(friction),
+        starts,
+        seed,
+        seconds=np.inf if seconds is None else seconds,
+    )
     swept = None if no_sweeps else SweepRequest(speeds=sweep_speeds, seed=seed)
     plan = _planned(allowed, wished, swept, quiet=as_json)
     document = motion_document(plan)

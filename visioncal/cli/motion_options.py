@@ -55,12 +55,21 @@ Rate: TypeAlias = Annotated[
         "--rate", min=1.0, max=4000.0, help="Rows a second of the tables.", rich_help_panel=_MOTION
     ),
 ]
-Seconds: TypeAlias = Annotated[
-    float,
+Starts: TypeAlias = Annotated[
+    int,
     typer.Option(
-        "--seconds",
-        help="How long to search, in s of one core; longer until a motion is found.",
+        "--starts",
+        help="Random motions to search from; more take longer and find better ones.",
         rich_help_panel=_MOTION,
+    ),
+]
+Seconds: TypeAlias = Annotated[
+    float | None,
+    _number(
+        "--seconds",
+        panel=_MOTION,
+        words="End the search after so many s of one core, once a motion is found; what is found "
+        "then depends on the computer.",
     ),
 ]
 SearchSeed: TypeAlias = Annotated[

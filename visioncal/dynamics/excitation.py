@@ -3,8 +3,9 @@
 Swevers, Verdonck and De Schutter (2007, Dynamic model identification for industrial robots): the
 coefficients of finite Fourier series are optimised for the condition of the regressor, within the
 limits of joints, drives and cell. Here the condition is made smooth, and sharper from round to
-round; descents start from random motions until the time is up, and the best one is kept that a
-look at a thousand samples a second finds within all limits.
+round; descents start from random motions, and the best one is kept that a look at a thousand
+samples a second finds within all limits. The same request gives the same motion, on a slow computer
+too, unless it limits the time.
 """
 
 import time
@@ -38,8 +39,6 @@ _MODEST, _POSTURES = 0.5, 2000
 # They are halved so many times, at most, until they are clear of everything: a descent that begins
 # within a body may never come out of it.
 _HALVINGS, _CLEAR_HZ = 8, 10.0
-# Where no motion was found that keeps all limits, so many starts are made although the time is up.
-_LEAST_STARTS = 4
 # A motion that breaks a limit is made smaller by this, so many times, before it is given up.
 _SMALLER, _TRIES = 0.97, 5
 # Figures do not change with more samples than these.
@@ -58,20 +57,20 @@ class ExcitationRequest:
         period_s: How long it lasts [s].
         harmonics: How many harmonics of that period it has.
         terms: The friction that is to be told besides the inertias.
-        seconds: How long it is searched for [s of one core's time]; descents are ended even if
-            they take longer, until a motion is found.
-        seed: Of the random motions that the search starts from.
-        starts: The most of them.
+        starts: How many random motions the search starts from.
+        seed: Of these.
         steps: The most of each round of a descent.
+        seconds: A limit of the search [s of one core's time], at which no more descents are begun
+            and the last one is ended, once a motion is found.
     """
 
     period_s: float = 20.0
     harmonics: int = 5
     terms: FrictionTerms = field(default_factory=FrictionTerms)
-    seconds: float = 25.0
+    starts: int = 4
     seed: int = 0
-    starts: int = 1000
     steps: int = 80
+    seconds: float = np.inf
 
     def __post_init__(self) -> None:
         if not SHORTEST_S <= self.period_s <= LONGEST_S:
@@ -86,11 +85,11 @@ class ExcitationRequest:
                 f"a motion of {self.harmonics} harmonics is wished; {FEWEST} to {MOST} is needed.",
                 culprits=["--harmonics"],
             )
-        if not 0.0 <= self.seconds < np.inf or min(self.starts, self.steps) < 1:
+        if not self.seconds >= 0.0 or min(self.starts, self.steps) < 1:
             raise DataError(
                 f"a search of {self.seconds:g} s from {self.starts} starts with {self.steps} steps "
                 "is wished; 0 s or more, a start and a step are needed.",
-                culprits=["--seconds"],
+                culprits=["--starts", "--seconds"],
             )
 
 
@@ -161,15 +160,15 @@ class _Search:
 
     def run(self) -> Excitation:
         request, starts = self._request, 0
-        while starts < request.starts and (self._left_s > 0.0 or self._is_needed(starts)):
-            self._keep(self._descend(self._start(), hurry=not self._is_needed(starts)))
+        while starts < request.starts and not self._is_over:
+            self._keep(self._descend(self._start(), starts))
             starts += 1
         if self._best is None:
             raise DegenerateError(
                 f"robot {self._allowed.robot.name}: no motion was found that keeps the limits; of "
                 f"the last one tried, {some_of(self._breaches, _NAMED)}.",
                 culprits=self._breaches,
-                next_step="Search for longer (--seconds), or leave the motion more room: "
+                next_step="Search from more starts (--starts), or leave the motion more room: "
                 "--duration, --margin-deg, --clearance-mm, --floor.",
             )
         condition, series, kept = self._best
@@ -178,26 +177,27 @@ class _Search:
             request, self._base, self._weights, *found, time.process_time() - self._begin
         )
 
-    def _is_needed(self, starts: int) -> bool:
-        """Whether another start is made although the time is up."""
-        return self._best is None and starts < _LEAST_STARTS
-
     @property
-    def _left_s(self) -> float:
-        return self._request.seconds - (time.process_time() - self._begin)
+    def _is_over(self) -> bool:
+        """Whether the time is up; never before a motion is found."""
+        taken_s = time.process_time() - self._begin
+        return self._best is not None and taken_s > self._request.seconds
 
-    def _descend(self, free: FloatArray, *, hurry: bool) -> FloatArray:
-        """Goes down from a motion, round by round; in a hurry it stops when the time is up."""
+    def _descend(self, free: FloatArray, place: int) -> FloatArray:
+        """Goes down from the start at `place`, round by round, until the time is up."""
+        steps = len(_ROUNDS) * self._request.steps
+        done = place * steps
 
         def look(_: FloatArray) -> None:
+            nonlocal done
+            done += 1
             if self._progress is not None:
-                seconds = self._request.seconds
-                self._progress("excitation", int(seconds - max(self._left_s, 0.0)), int(seconds))
-            if hurry and self._left_s <= 0.0:
+                self._progress("excitation", done, self._request.starts * steps)
+            if self._is_over:
                 raise StopIteration
 
         for sharpness, price in _ROUNDS:
-            if hurry and self._left_s <= 0.0:
+            if self._is_over:
                 break
             found = minimize(
                 self._objective.value,

@@ -75,6 +75,9 @@ def motion_document(plan: MotionPlan) -> dict[str, Any]:
 def _excitation(found: Excitation) -> dict[str, Any]:
     mean, sines, cosines = found.series.coefficients
     request = found.request
+    search = {"seed": request.seed, "seconds": found.seconds, "starts": found.starts}
+    if np.isfinite(request.seconds):
+        search["wished_seconds"] = request.seconds
     return {
         "period_s": request.period_s,
         "harmonics": request.harmonics,
@@ -87,12 +90,7 @@ def _excitation(found: Excitation) -> dict[str, Any]:
         "base_parameters": list(found.base.names),
         "weights": found.weights.tolist(),
         "kept": _kept(found.kept) | {"rate_hz": CHECK_HZ},
-        "search": {
-            "seed": request.seed,
-            "seconds": found.seconds,
-            "starts": found.starts,
-            "wished_seconds": request.seconds,
-        },
+        "search": search,
     }
 
 
