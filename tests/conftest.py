@@ -4,10 +4,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
+from visioncal.drivers import ur, ur_net, ur_primary, ur_watch
 from visioncal.simulation import CellOptions, simulate, write_session
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+
+# The same examples everywhere, and none fails because a computer is busy.
+settings.register_profile(
+    "steady", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("steady")
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +32,19 @@ def rendered(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("rendered sessions, größer") / "cell"
     options = replace(CellOptions(), views=12, state_intrinsics=False, seed=11)
     return write_session(simulate(options), folder)
+
+
+@pytest.fixture
+def patient(monkeypatch) -> None:
+    """Lets a UR's driver wait for a simulated controller as long as a busy computer makes it."""
+    for module, name in (
+        (ur, "_CALL_S"),
+        (ur, "_BEGIN_S"),
+        (ur_net, "_CONNECT_S"),
+        (ur_net, "_ANSWER_S"),
+        (ur_primary, "_WAIT_S"),
+        (ur_watch, "_SILENCE_S"),
+    ):
+        monkeypatch.setattr(module, name, 10.0)
+    monkeypatch.setattr(ur_net.Dashboard.__init__, "__defaults__", (10.0,))
+    monkeypatch.setattr(ur, "_LEAST_HZ", 0.1)

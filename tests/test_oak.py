@@ -292,6 +292,7 @@ def test_a_devices_raw_frames_are_recorded(monkeypatch, tmp_path):
     a_device(monkeypatch)
     raw = tmp_path / "raw.mkv"
     camera = OakCamera(DeviceWishes((64, 48), more={"raw": str(raw)}))
+    camera.frame(timeout_s=PATIENT_S)
     frame = camera.frame(timeout_s=PATIENT_S)
     camera.close()
     replayed, stamps = ReplayedOak(raw), []
@@ -299,7 +300,7 @@ def test_a_devices_raw_frames_are_recorded(monkeypatch, tmp_path):
         while True:
             stamps.append(replayed.frame(timeout_s=PATIENT_S).stamp_s)
     replayed.close()
-    # All of them, whether or not anybody took them.
+    # All of them, whether or not anybody took them: one at least while exposure and focus settled.
     assert np.abs(np.array(stamps) - frame.stamp_s).min() < 2e-6
     assert len(stamps) > 2
 

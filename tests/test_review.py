@@ -71,7 +71,7 @@ def served(*arguments) -> Iterator[tuple[subprocess.Popen, str]]:
 
 def ask(url: str, path: str, method: str = "GET", **headers: str) -> tuple[int, dict, bytes]:
     """Asks for a path exactly as it is written."""
-    connection = HTTPConnection(urlsplit(url).netloc, timeout=30)
+    connection = HTTPConnection(urlsplit(url).netloc, timeout=60)
     try:
         connection.request(method, path, headers=headers)
         answer = connection.getresponse()
@@ -82,7 +82,7 @@ def ask(url: str, path: str, method: str = "GET", **headers: str) -> tuple[int, 
 
 def is_open(host: str, port: int) -> bool:
     with socket.socket() as it:
-        it.settimeout(5)
+        it.settimeout(60)
         return it.connect_ex((host, port)) == 0
 
 
@@ -183,7 +183,7 @@ def test_the_server_ends_with_status_0_and_frees_its_port(number, out):
         # A browser keeps a connection in reserve, which must not hold the end up.
         with socket.create_connection(("127.0.0.1", port)):
             process.send_signal(number)
-            assert process.wait(timeout=10) == 0
+            assert process.wait(timeout=60) == 0
         assert not is_open("127.0.0.1", port)
         assert "Traceback" not in process.stderr.read()
 
@@ -205,7 +205,7 @@ def test_a_browser_draws_it_and_asks_nobody_else(out, tmp_path):
             picture = page.picture_once(drawn, patience_s=90)
             requested = page.requested
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=60) == 0
     assert drawn(picture)
     assert f"{url}recording.rrd" in requested
     assert [it for it in requested if not it.startswith((url, "data:", "blob:"))] == []
@@ -246,12 +246,12 @@ def test_the_native_viewer_ends_with_all_that_it_started(number, out, stub, tmp_
         command(out), stderr=subprocess.PIPE, text=True, env=ENVIRONMENT | stub(STUB)
     )
     try:
-        end = time.monotonic() + 30
+        end = time.monotonic() + 60
         while not told.exists() and time.monotonic() < end:
             time.sleep(0.05)
         viewer = json.loads(told.read_text())
         process.send_signal(number)
-        assert process.wait(timeout=20) == 0
+        assert process.wait(timeout=60) == 0
         assert process.stderr.read() == ""
     finally:
         process.kill()

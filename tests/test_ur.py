@@ -25,7 +25,7 @@ TCP = (0.01, -0.02, 0.15, 0.1, 0.2, -0.3)
 STEP = np.array([0.3, -0.1, 0.1, 0.0, 0.05, -0.2])
 # A motion of many seconds, in which something happens.
 FAR, SLOW = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.1
-PATIENCE_S = 20.0
+PATIENCE_S = 30.0
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +47,7 @@ def stands(controller):
     return not controller.truth.state([time.monotonic()]).dq.any()
 
 
+@pytest.mark.usefixtures("patient")
 def test_an_arm_moves_tells_where_it_is_and_stops(controller):
     with closing(UrArm(controller.host)) as arm:
         assert isinstance(arm, MovingArm)
@@ -61,14 +62,15 @@ def test_an_arm_moves_tells_where_it_is_and_stops(controller):
         assert after.q == pytest.approx(goal)
         # 0.3 rad at 0.5 rad/s and 1 rad/s^2 take 1.1 s: the limits of speed are kept.
         assert after.stamp_s - before.stamp_s > 1.1
-        arm.start_move(before.q, speed=0.2, acceleration=1.0)
+        arm.start_move(goal + FAR, speed=0.2, acceleration=1.0)
         wait_while(lambda: np.abs(arm.state().dq).max() < 0.1)
         arm.halt()
         wait_while(arm.moving)
-        assert np.abs(arm.state().q - before.q).max() > 0.05
+        assert np.abs(arm.state().q - goal - FAR).max() > 0.05
         arm.halt()
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_state_is_the_flange_in_the_controllers_base(controller):
     with closing(UrArm(controller.host)) as arm:
         state = arm.state()
@@ -85,9 +87,11 @@ def test_a_state_is_the_flange_in_the_controllers_base(controller):
     assert state.currents_a[0] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_state_is_stamped_with_the_time_at_which_the_arm_was_there(controller):
     with closing(UrArm(controller.host)) as arm:
-        start = arm.state().q
+        # States at rest: the shortest delay of many is found in spite of a busy computer.
+        start = [arm.state() for _ in range(50)][-1].q
         arm.start_move(start + STEP, speed=0.4, acceleration=4.0)
         states = []
         while arm.moving():
@@ -100,10 +104,11 @@ def test_a_state_is_stamped_with_the_time_at_which_the_arm_was_there(controller)
     fast = [place for place, it in enumerate(states) if abs(it.dq[0]) > 0.3]
     assert len(fast) > 5
     late = [(truth.q[it, 0] - states[it].q[0]) / states[it].dq[0] for it in fast]
-    # States take well under a millisecond; the shortest delay is found in spite of a busy computer.
+    # States take well under a millisecond.
     assert np.median(np.abs(late)) < 4e-3
 
 
+@pytest.mark.usefixtures("patient")
 def test_watching_needs_no_remote_control_and_moves_nothing(controller):
     controller.truth.inject("local-control")
     try:
@@ -115,7 +120,7 @@ def test_watching_needs_no_remote_control_and_moves_nothing(controller):
             assert not arm.moving()
             with pytest.raises(DriverError, match="only watched"):
                 arm.start_move(before.q, speed=1.0, acceleration=1.0)
-            ends = controller.truth.guide(before.q + 0.1, speed=0.2, acceleration=1.0)
+            ends = controller.truth.guide(before.q + 0.1, speed=SLOW, acceleration=1.0)
             wait_while(lambda: not arm.moving())
             time.sleep(max(0.0, ends - time.monotonic()))
             wait_while(arm.moving)
@@ -125,6 +130,7 @@ def test_watching_needs_no_remote_control_and_moves_nothing(controller):
         controller.truth.inject("remote-control")
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize(
     ("fault", "message", "safety"),
     [
@@ -150,10 +156,12 @@ def test_a_motion_that_is_stopped_is_told_with_what_to_press(controller, fault, 
             controller.truth.inject("release")
             controller.truth.inject("remote-control")
         # Once it is freed, it goes on with no new connection.
+        wait_while(lambda: arm.state().safety != "normal")
         arm.start_move(arm.state().q + 0.01, speed=SLOW, acceleration=1.0)
         wait_while(arm.moving)
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_controller_that_dies_in_a_motion_is_noticed():
     with spawn() as controller, closing(UrArm(controller.host)) as arm:
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
@@ -177,6 +185,7 @@ def test_a_controller_that_falls_silent_in_a_motion_is_noticed():
         arm.halt()
 
 
+@pytest.mark.usefixtures("patient")
 def test_what_the_driver_does_not_use_is_served_too(controller):
     """The dashboard's and the outputs' clients, waiting motions, and straight ones."""
     dashboard = import_module("dashboard_client").DashboardClient(controller.host)
@@ -228,6 +237,7 @@ def test_the_arm_stops_where_the_computer_that_moves_it_dies(controller):
     assert wait_while(lambda: not stands(controller), limit_s=5.0) < 5.0
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_wrong_motion_is_refused_before_it_is_sent(controller):
     with closing(UrArm(controller.host)) as arm:
         with pytest.raises(DriverError, match="A UR has six joints"):

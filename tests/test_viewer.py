@@ -301,7 +301,7 @@ def greens(picture: np.ndarray) -> int:
     return int(np.sum((green > red + 60) & (green > blue + 60)))
 
 
-def drawn_view(client: ViewerClient, place: int, file: Path, patience_s: float = 25) -> np.ndarray:
+def drawn_view(client: ViewerClient, place: int, file: Path, patience_s: float = 120) -> np.ndarray:
     """Goes to a view and takes pictures until two in a row are alike and not blank."""
     end, last = time.monotonic() + patience_s, np.zeros((1, 1, 3), np.uint8)
     while time.monotonic() < end:

@@ -80,17 +80,18 @@ class ControllerServer:
     async def _tick(
         self, machine: Machine, script: ControlScript, rtde: RtdePort, began_s: float
     ) -> None:
-        """Lets time pass: the script acts, and the states go out."""
-        period = 1.0 / self._options.rate_hz
-        due = time.monotonic()
+        """Lets time pass: the script acts, and the states go out, each of a whole cycle.
+
+        Cycles that a busy computer missed are left out, not made up for.
+        """
+        cycle = 0
         while True:
-            now = time.monotonic()
-            script.tick(now)
+            cycle = max(cycle + 1, int((time.monotonic() - began_s) * self._options.rate_hz))
+            up_s = cycle / self._options.rate_hz
+            await asyncio.sleep(began_s + up_s - time.monotonic())
+            script.tick(time.monotonic())
             if not self._silence.frozen:
-                rtde.send(Moment(machine, script.registers, now, now - began_s))
-            # What a busy computer missed is left out, not made up for.
-            due = max(due + period, now)
-            await asyncio.sleep(due - now)
+                rtde.send(Moment(machine, script.registers, began_s + up_s, up_s))
 
     async def _dashboard(
         self, machine: Machine, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
