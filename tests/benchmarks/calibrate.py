@@ -16,13 +16,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
-from results import write_section
+from results import few, first, write_section
 
 import visioncal
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.targets import charuco_board
 
-VIEWS, REPEATS = 40, 5
+VIEWS, REPEATS = few((40, 5), (6, 1))
 THREADS = os.cpu_count() or 1
 
 
@@ -76,11 +76,8 @@ def measured(ending: str, jpeg_quality: int | None, *, given: bool) -> list[str]
 
 def main() -> None:
     """Prints the table and keeps it."""
-    rows = [
-        measured(ending, quality, given=given)
-        for ending, quality in (("png", None), ("jpg", 95))
-        for given in (True, False)
-    ]
+    kinds = [(*it, given) for it in (("png", None), ("jpg", 95)) for given in (True, False)]
+    rows = [measured(ending, quality, given=given) for ending, quality, given in first(kinds)]
     head = ["files", "intrinsics", "visioncal [s]", "OpenCV detection [s]", "ratio"]
     lines = [head, ["---"] * len(head), *rows]
     table = "\n".join("| " + " | ".join(row) + " |" for row in lines)

@@ -8,7 +8,6 @@ have it, on the same calibrated model from the same starts.
     PYTHONPATH=tests python tests/benchmarks/correct.py [WORLDS]
 """
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 from cells import calibrated
-from results import write_section
+from results import few, first, wished, write_section
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 import visioncal
@@ -26,8 +25,8 @@ from visioncal.robot.inverse import Inverse
 from visioncal.simulation import Cell, forward, simulate
 
 WORLDS = 5
-TARGETS = 500
-REPEATS = 7
+TARGETS = few(500, 20)
+REPEATS = few(7, 1)
 HOME = np.array([0.4, -1.3, 1.5, -1.75, -1.57, 0.3])
 
 
@@ -142,7 +141,7 @@ def costs(result: visioncal.Calibration) -> list[str]:
 def main(worlds: int) -> None:
     """Prints the tables and keeps them."""
     rows, result = [], None
-    for robot in ("ur5e", "ur10e"):
+    for robot in first(("ur5e", "ur10e")):
         options = replace(WRONG_LINKS, robot=robot, views=40)
         found = []
         for seed in range(worlds):
@@ -176,4 +175,4 @@ def main(worlds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS)
+    main(wished(WORLDS))

@@ -6,7 +6,6 @@ the recording of a Panda, their parts are left out.
     PYTHONPATH=tests python tests/benchmarks/dynamics.py [WORLDS]
 """
 
-import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -16,7 +15,7 @@ from time import process_time
 
 import numpy as np
 from moved_arms import recorded, robot_with_bodies, true_base
-from results import write_section
+from results import few, wished, write_section
 
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned, condition
@@ -34,7 +33,8 @@ from visioncal.simulation.exercise import Exercise, multi_sine, slow_sweep
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 
-WORLDS, RATE_HZ, REPEATS = 20, 500.0, 3
+WORLDS, RATE_HZ, REPEATS = 20, 500.0, few(3, 1)
+SEARCH = few(ExcitationRequest(), ExcitationRequest(starts=1, steps=3))
 PANDA = Path(__file__).parents[3] / "shared" / "data" / "dyn_franka_panda"
 PANDA_LIMITS = (5.0, 1.5, 2.4, 4.9, 6.2, 3.4, 17.9)
 WITH_ROTORS = FrictionTerms(motor_inertia=True, slow_rad_s=SLOW_RAD_S)
@@ -64,7 +64,7 @@ class World:
 def excitation(name: str) -> Exercise:
     """The motion that `visioncal dynamics plan` writes for an arm."""
     allowed = allowed_motion(load_robot(name), Share())
-    motion = excite(allowed, ExcitationRequest()).series.sampled(RATE_HZ)
+    motion = excite(allowed, SEARCH).series.sampled(RATE_HZ)
     return Exercise(motion.times_s, motion.q, motion.dq, motion.ddq)
 
 
@@ -73,7 +73,9 @@ def world(job: tuple[int, Exercise]) -> World:
     seed, motion = job
     rng = np.random.default_rng(seed)
     built = real_dynamics("ur5e", rng, stribeck=True)
-    streams = [recorded(built, it, rng) for it in (motion, slow_sweep(6, rng))]
+    streams = [
+        recorded(built, it, rng) for it in (motion, slow_sweep(6, rng, seconds=few(60.0, 15.0)))
+    ]
     found = identify(load_robot("ur5e"), streams, Options(terms=WITH_ROTORS))
     result = found.identified
     away = result.values - true_base(result.base, built)
@@ -289,4 +291,4 @@ parameters with their covariance, and also to bodies.
 {faster:.1f} times faster than figaroh, {bare_faster:.1f} times than its bare steps."""
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS)
+    main(wished(WORLDS))

@@ -3,11 +3,10 @@
 PYTHONPATH=tests python tests/benchmarks/dynamics_use.py [WORLDS]
 """
 
-import sys
 from multiprocessing import Pool
 
 import numpy as np
-from results import write_section
+from results import wished, write_section
 
 from visioncal.dynamics import (
     ArmDynamics,
@@ -158,4 +157,4 @@ def main(worlds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS)
+    main(wished(WORLDS))

@@ -8,7 +8,6 @@ at its flange by 10, 20 and 50 N and read by a tracker to 30 um.
     PYTHONPATH=tests python tests/benchmarks/elastic.py [WORLDS] [PROCESSES]
 """
 
-import sys
 from dataclasses import replace
 from multiprocessing import Pool
 
@@ -16,7 +15,7 @@ import numpy as np
 from bound import compliance_bound, workspace_bound_m
 from cells import calibrated
 from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded, predicted_m
-from results import write_section
+from results import WORDS, few, first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
 from visioncal.estimator.workspace import postures
@@ -29,7 +28,7 @@ WORLDS = 20
 STIFF = {"ur10e": (6e3, 2e4), "generic-6r-1800": (4e5, 1.5e6)}
 CLEAN = replace(
     WRONG_LINKS,
-    views=100,
+    views=few(100, 30),
     roll_rad=np.pi,
     branches=True,
     target=replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m),
@@ -46,7 +45,7 @@ DIRTY = replace(
 # The same with a board whose size is as stated, to 1e-5.
 MEASURED = replace(DIRTY, target=CLEAN.target)
 # Postures at which the bound is taken, of those at which the error is.
-EVERY = 10
+EVERY = few(10, 200)
 
 
 def sagging(options: CellOptions) -> CellOptions:
@@ -132,7 +131,7 @@ def row(words: str, options: CellOptions, found: list[tuple[tuple[float, ...], l
 
 def main(worlds: int, processes: int | None) -> None:
     """Prints the tables and keeps them."""
-    rows = [
+    kinds = [
         (words, function, replace(base, robot=robot, mount=mount))
         for words, function, base in (
             ("as stated", world, CLEAN),
@@ -142,6 +141,7 @@ def main(worlds: int, processes: int | None) -> None:
         for robot in STIFF
         for mount in ("eye-in-hand",)
     ]
+    rows = first(kinds)
     with Pool(processes) as pool:
         lines = [
             row(words, base, pool.map(it, [replace(base, seed=at) for at in range(worlds)]))
@@ -185,6 +185,6 @@ def main(worlds: int, processes: int | None) -> None:
 
 if __name__ == "__main__":
     main(
-        int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS,
-        int(sys.argv[2]) if len(sys.argv) > 2 else None,
+        wished(WORLDS),
+        int(WORDS[1]) if len(WORDS) > 1 else None,
     )

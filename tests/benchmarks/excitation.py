@@ -3,11 +3,11 @@
 PYTHONPATH=tests python tests/benchmarks/excitation.py [SEEDS]
 """
 
-import sys
+from dataclasses import replace
 from multiprocessing import Pool
 
 import numpy as np
-from results import write_section
+from results import few, first, wished, write_section
 
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.condition import condition_of
@@ -18,6 +18,7 @@ from visioncal.dynamics.model import DynamicModel
 from visioncal.robot import load_robot
 
 SEEDS = 10
+SEARCH = few(ExcitationRequest(), ExcitationRequest(starts=1, steps=3))
 ROBOTS = ("ur5e", "ur10e", "panda")
 NO_FRICTION = FrictionTerms(coulomb=False, viscous=False, offset=False)
 
@@ -26,7 +27,7 @@ def figures(job: tuple[str, int]) -> tuple[float, ...]:
     """What one search finds: conditions, shares of the limits, distance [mm], starts, seconds."""
     name, seed = job
     allowed = allowed_motion(load_robot(name), Share())
-    found = excite(allowed, ExcitationRequest(seed=seed))
+    found = excite(allowed, replace(SEARCH, seed=seed))
     condition, kept = found.condition, found.kept
     return (
         condition.weighted,
@@ -79,12 +80,13 @@ def row(name: str, found: np.ndarray) -> str:
 
 
 def main() -> None:
-    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS
-    jobs = [(name, seed) for name in ROBOTS for seed in range(seeds)]
+    seeds = wished(SEEDS)
+    robots = first(ROBOTS)
+    jobs = [(name, seed) for name in robots for seed in range(seeds)]
     with Pool(2) as pool:
-        found = np.array(pool.map(figures, jobs, chunksize=1)).reshape(len(ROBOTS), seeds, -1)
+        found = np.array(pool.map(figures, jobs, chunksize=1)).reshape(len(robots), seeds, -1)
     lines = [
-        f"{ExcitationRequest().starts} starts from each of {seeds} seeds; motions of 20 s with 5 "
+        f"{SEARCH.starts} starts from each of {seeds} seeds; motions of 20 s with 5 "
         "harmonics, for inertias and three terms of friction a joint. Conditions: median / worst "
         "of the seeds. Weighted: rows divided by the joints' greatest torques, columns of unit "
         "length; plain: rows as they are, columns of unit length; links alone: plain, without the "
@@ -96,7 +98,7 @@ def main() -> None:
         "| robot | base | weighted | plain | links alone | raw | random | range % | speed % | "
         "acceleration % | torque % | beyond | nearest mm | starts | s |",
         "| --- |" + " ---: |" * 14,
-        *(row(name, it) for name, it in zip(ROBOTS, found, strict=True)),
+        *(row(name, it) for name, it in zip(robots, found, strict=True)),
     ]
     text = "\n".join(lines)
     print(text)

@@ -6,10 +6,8 @@ environment: `pip install -e .[bench]`.
     PYTHONPATH=tests python tests/benchmarks/figaroh_peer.py [WORLDS]
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from multiprocessing import Pool
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,14 +16,14 @@ from typing import TypeAlias
 
 import numpy as np
 from cells import calibrated
-from results import write_section
+from results import few, first, need, wished, write_section
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 import visioncal
 from visioncal.estimator.arm import ArmErrors
 from visioncal.estimator.armmodel import ArmModel
 from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
-from visioncal.estimator.kinematics import fit_level
+from visioncal.estimator.kinematics import LEVELS, fit_level
 from visioncal.estimator.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
@@ -34,7 +32,7 @@ from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log
 from visioncal.types import FloatArray
 
-WORLDS, REPEATS = 10, 3
+WORLDS, REPEATS = 10, few(3, 1)
 # The arm's true departures, of which the ways that are `told` know.
 SIZE_M, SIZE_RAD = 5e-4, 1e-3
 # Half a micrometre on half a metre.
@@ -146,7 +144,9 @@ def fitted(world: World, noise: Noise | None) -> tuple[Edges, ArmModel]:
     edges = Edges(start.x, start.z, np.zeros(0))
     errors = {"links": ArmErrors(basis, SIZE_RAD, 0.0, of_links=True)}
     if noise is None:
-        level = fit_level(_chain(world, cell.base_from_flange), edges, {"links": basis}, ("links",))
+        level = fit_level(
+            _chain(world, cell.base_from_flange), edges, {"links": basis}, LEVELS["geometry"]
+        )
         if level is None:
             raise RuntimeError("the arm's errors do not show")
         errors, edges, noise = dict(level.errors), level.fit.edges, level.fit.noise
@@ -236,7 +236,7 @@ def main(worlds: int) -> None:
     """Prints the table and keeps it."""
     found = {}
     with Pool() as pool:
-        for mount in ("eye-in-hand", "eye-to-hand"):
+        for mount in first(("eye-in-hand", "eye-to-hand")):
             row = replace(WRONG_LINKS, robot="ur10e", mount=mount, views=60)
             found[mount] = pool.map(measured, [replace(row, seed=it) for it in range(worlds)])
     text = TEXT.format(worlds=worlds) + table(found)
@@ -264,6 +264,5 @@ and a verdict.
 """
 
 if __name__ == "__main__":
-    if find_spec("figaroh") is None:
-        sys.exit("figaroh is not installed: pip install -e .[bench]")
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS)
+    need("figaroh", "-e .[bench]")
+    main(wished(WORLDS))

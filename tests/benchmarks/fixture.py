@@ -25,7 +25,7 @@ from parts import (
     some_touches,
     uneven,
 )
-from results import write_section
+from results import few, write_section
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
@@ -37,7 +37,7 @@ from visioncal.estimator.pointpairs import PointPairs
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 
-COUNTS, SEEDS = (3, 4, 6, 12), 300
+COUNTS, SEEDS = (3, 4, 6, 12), few(300, 3)
 EVEN_M, SLIPS_M = 1e-4, (1e-3, 3e-3)
 FEATURES = {
     "2 of each": ("origin", "x", "xy") * 2,

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 from mistakes import MISTAKES, Poses, guessed, is_named, seen_in
-from results import write_section
+from results import few, write_section
 
 from visioncal.simulation import CellOptions, simulate
 from visioncal.types import MOUNTS
 
-PLANTED, SOUND = 20, 30
+PLANTED, SOUND = few((20, 30), (1, 1))
 ROBOTS = ("ur3e", "ur5e", "ur10e")
 # Repeatability [m], [rad] and noise of a corner [px].
 NOISES = ((3e-5, 5e-5, 0.05), (3e-4, 5e-4, 0.1), (1e-3, 2e-3, 0.3))

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from bound import edge_bound
 from cells import calibrated, error_of
-from results import write_section
+from results import few, first, wished, write_section
 from worlds import BOTH_AT_ONCE, Problem, opencv
 
 from visioncal.errors import VisioncalError
@@ -139,7 +139,7 @@ def bound_table(pool, seeds: int) -> str:
     head = ("world", "error / bound, mm", "mrad", "error / OpenCV's best, mm", "mrad",
             "squared error / covariance", "sound views lost", "refused")  # fmt: skip
     rows = []
-    for row in WORLDS:
+    for row in first(WORLDS):
         kept = _run(pool, against_the_bound, [(row, seed) for seed in range(seeds)])
         mean = np.mean(kept, axis=0)
         best = np.mean(np.reshape([it[6:] for it in kept], (len(kept), -1, 2)), axis=0).min(axis=0)
@@ -184,8 +184,8 @@ def wrong_table(pool, seeds: int) -> str:
             "all wrong and no right view left out", "a wrong view missed",
             "squared error / covariance", "refused")  # fmt: skip
     rows = []
-    for row in ROBUST:
-        for wrong in (0, 2, 4, 6):
+    for row in first(ROBUST):
+        for wrong in first((0, 2, 4, 6), 2):
             kept = _run(pool, with_wrong_views, [(row, wrong, seed) for seed in range(seeds)])
             mean = np.mean(kept, axis=0)
             rows.append(
@@ -225,7 +225,7 @@ def arm_table(pool, seeds: int) -> str:
         ),
     }
     rows = []
-    for words, options in arms.items():
+    for words, options in first(tuple(arms.items())):
         for mount in (IN_HAND, TO_HAND):
             for joints in (True, False):
                 row = replace(options, mount=mount)
@@ -272,7 +272,7 @@ def board_table(pool, seeds: int) -> str:
         "0.1 % too large": {"board_scale": 1.001},
     }
     rows = []
-    for words, more in boards.items():
+    for words, more in first(tuple(boards.items())):
         for given in (True, False):
             options = CellOptions(camera=FINE, pixel_sigma_px=0.1, state_intrinsics=given, **more)
             kept = _run(pool, with_a_board, [(options, seed) for seed in range(seeds)])
@@ -348,7 +348,7 @@ def real_table() -> str:
     path = folder / "ric_charuco_eye_to_hand"
     if not path.is_dir():
         return "The real session is not here (../shared/data)."
-    millimetres, degrees = real_folds(path, 20)
+    millimetres, degrees = real_folds(path, few(20, 1))
     return (
         f"`ric_charuco_eye_to_hand`, 20 times 5-fold over 15 views, everything but the corners "
         f"fitted anew in each fold: {millimetres:.2f} mm and {degrees:.3f} deg."
@@ -406,5 +406,4 @@ arms),
 
 
 if __name__ == "__main__":
-    given = [int(it) for it in sys.argv[1:]]
-    main(*given, *(SEEDS, FEW)[len(given) :])
+    main(wished(SEEDS), wished(FEW, place=1))

@@ -3,7 +3,6 @@
 PYTHONPATH=tests python tests/benchmarks/instruments.py [WORLDS]
 """
 
-import sys
 import textwrap
 import time
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import thirdparty
-from results import write_section
+from results import first, wished, write_section
 from tracked import (
     errors_of,
     information,
@@ -27,7 +26,7 @@ from visioncal.estimator.positions import fit_mounting
 from visioncal.estimator.workspace import postures
 from visioncal.pipeline.known import Known
 from visioncal.session import Session
-from visioncal.simulation.arms import Arm, forward
+from visioncal.simulation.arms import forward
 from visioncal.simulation.tracked import THREE, Shop, Tracked, session_of, tracked
 from visioncal.transforms import invert
 from visioncal.types import FloatArray
@@ -123,7 +122,7 @@ def simulated(worlds: int) -> str:
     """The table of simulated arms."""
     rows = [
         f"| {name} | {frames_row(it, worlds)} | {arm_row(it, worlds)} |"
-        for name, it in KINDS.items()
+        for name, it in first(tuple(KINDS.items()))
     ]
     text = f"""A UR10e of which 30 stops are read, by an instrument of 20 um (50 urad where a
     probe's rotation is read); the arm repeats to 0.03 mm and 0.03 mrad. {worlds} worlds a row.
@@ -218,13 +217,13 @@ def parameter_slopes(shop: Shop) -> FloatArray:
     def place(change: FloatArray) -> FloatArray:
         beta = np.zeros(6)
         beta[:4] = change[24:]
-        moved = Arm(
-            arm.name,
-            arm.a + change[:6],
-            arm.d + change[6:12],
-            arm.alpha + change[12:18],
-            beta,
-            arm.offset + change[18:24],
+        moved = replace(
+            arm,
+            a=arm.a + change[:6],
+            d=arm.d + change[6:12],
+            alpha=arm.alpha + change[12:18],
+            beta=beta,
+            offset=arm.offset + change[18:24],
         )
         return (forward(moved, shop.joints) @ shop.flange_from_probe)[:, :3, 3].ravel()
 
@@ -236,7 +235,7 @@ def real() -> str:
     """The tables of real data; a line that says so where these are not here."""
     if not DATA.is_dir():
         return "The folder of real measurements is not here (../shared/data)."
-    return "\n".join((irb120(), "", rokae(), "", talos()))
+    return "\n\n".join(it() for it in first((irb120, rokae, talos)))
 
 
 def irb120() -> str:
@@ -344,4 +343,4 @@ def main(worlds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS)
+    main(wished(WORLDS))

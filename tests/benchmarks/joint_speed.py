@@ -11,8 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import pyceres
-from results import write_section
+from results import few, need, write_section
 
 from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
 from visioncal.estimator.corners import CornerStack, reproject
@@ -24,8 +23,11 @@ from visioncal.threads import one_blas_thread
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.types import FloatArray
 
+need("pyceres", "pyceres")
+import pyceres  # noqa: E402
+
 PIXEL_PX, NOISE = 0.1, Noise(5e-5, 3e-5)
-REPEATS = 15
+REPEATS = few(15, 1)
 
 
 def cell_of(seed: int) -> Cell:
@@ -108,7 +110,7 @@ def seconds(solve: Callable[[], Edges]) -> float:
 def main() -> None:
     """Prints the table and keeps it."""
     rows = []
-    for seed in range(3):
+    for seed in range(few(3, 1)):
         cell = cell_of(seed)
         positions = corner_positions(cell.options.target)
         stack = CornerStack.of({it.view: it for it in cell.corners}, positions)

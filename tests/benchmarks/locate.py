@@ -7,7 +7,6 @@ pixels, by a declared plane and by a target. Nothing is told the noise.
     PYTHONPATH=tests python tests/benchmarks/locate.py [CELLS]
 """
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from multiprocessing import Pool
 
 import numpy as np
 from picks import Pick, calibration_of, pick_by_plane, pick_by_target
-from results import write_section
+from results import first, wished, write_section
 
 from visioncal.errors import VisioncalError
 from visioncal.simulation import CellOptions, charuco_target, fine_camera, simulate, wide_camera
@@ -120,7 +119,7 @@ def main(cells: int) -> None:
             "ball's radius [mm]", "a call takes [ms]", "cells refused")  # fmt: skip
     rows, everything = [], []
     with Pool() as pool:
-        for row in WORLDS:
+        for row in first(WORLDS):
             kept = pool.map(of_one_cell, [(row, seed) for seed in range(cells)], chunksize=2)
             found = [it for it in kept if it is not None]
             for way in ("plane", "board", "marker"):
@@ -157,5 +156,5 @@ def figures(picks: Sequence[Outcome]) -> tuple[str, ...]:
 
 if __name__ == "__main__":
     started = time.perf_counter()
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else CELLS)
+    main(wished(CELLS))
     print(f"{time.perf_counter() - started:.0f} s")

@@ -6,7 +6,6 @@ rendered) and aligned; nothing is told the noise. The bound is by code of its ow
     PYTHONPATH=tests python tests/benchmarks/network.py [CELLS]
 """
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from multiprocessing import Pool
 
 import numpy as np
 from networkbound import network_bound
-from results import write_section
+from results import few, wished, write_section
 
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
@@ -146,7 +145,7 @@ def four_cameras_s() -> float:
     )
     cell = simulate_network(NetworkOptions(cameras=cameras, stops=40))
     taken = []
-    for _ in range(3):
+    for _ in range(few(3, 1)):
         begin = time.process_time()
         aligned(cell)
         taken.append(time.process_time() - begin)
@@ -199,7 +198,7 @@ def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> s
 
 
 def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else CELLS
+    count = wished(CELLS)
     with Pool() as pool:
         cells = pool.map(clean, range(count))
         faults = pool.map(faulty, range(1000, 1000 + count))

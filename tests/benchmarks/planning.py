@@ -6,7 +6,6 @@ calibrations of simulated views at the stops, from their corners on, against the
     PYTHONPATH=tests python tests/benchmarks/planning.py [WORLDS]
 """
 
-import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -15,7 +14,7 @@ from multiprocessing import Pool
 import numpy as np
 from cells import calibrated, error_of
 from planned import plan_cell, so_far_of, true_cell
-from results import write_section
+from results import few, first, wished, write_section
 from test_candidates import cell_of, whole
 from test_kinematics import WRONG_LINKS, error_m
 
@@ -36,9 +35,9 @@ from visioncal.types import FloatArray
 
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-CANDIDATES = 1500
+CANDIDATES = few(1500, 200)
 # Real arms and noises that each world's stops are tried with: one alone says little.
-DRAWS = 3
+DRAWS = few(3, 1)
 # How well the guesses are known from which is planned, and how far off bad ones are.
 GUESS_RAD, GUESS_M = 0.03, 0.01
 BAD_RAD, BAD_M = np.deg2rad(10.0), 0.05
@@ -264,11 +263,11 @@ def main(worlds: int) -> None:
                 return pool.map(function, range(worlds), 1)
             return pool.map(function, [replace(options, seed=it) for it in range(worlds)], 1)
 
-        duels = [duels_row(name, it, run(partial(duel, name), it)) for name, it in rows]
-        axes = [one_axis_row(it, np.array(run(partial(one_axis, it)))) for it in MOUNTS]
+        duels = [duels_row(name, it, run(partial(duel, name), it)) for name, it in first(rows)]
+        axes = [one_axis_row(it, np.array(run(partial(one_axis, it)))) for it in first(MOUNTS)]
         seen = [
             bad_guess_row(arm, {it: run(partial(bad_guess, it, arm)) for it in MOUNTS})
-            for arm in ARMS
+            for arm in first(ARMS)
         ]
     text = "\n".join(
         (
@@ -295,7 +294,7 @@ def main(worlds: int) -> None:
             f"\nCPU seconds to find {CANDIDATES} possible stops (how many there were):\n",
             "| arm | eye-in-hand, fair guess | bad guess | eye-to-hand, fair guess | bad guess |",
             "| --- | --- | --- | --- | --- |",
-            *(search_row(it) for it in ARMS),
+            *(search_row(it) for it in first(ARMS)),
             "\nOf 20 planned stops, those that see the whole board [%] where both guesses are off",
             f"by {1e2 * BAD_M:.0f} cm and {np.rad2deg(BAD_RAD):.0f} deg, and are said to be:\n",
             "| arm | eye-in-hand, mean | worst world | eye-to-hand, mean | worst world |",
@@ -315,4 +314,4 @@ def main(worlds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS)
+    main(wished(WORLDS))

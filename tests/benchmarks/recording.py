@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from results import write_section
+from results import few, write_section
 
 from visioncal.pipeline import Run, run
 from visioncal.recording import RecordingWriter, append_results, read_session, write_recording
@@ -23,7 +23,7 @@ from visioncal.session import Session
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.viewer import blueprint
 
-VIEWS, REPEATS = 60, 5
+VIEWS, REPEATS = few((60, 5), (8, 1))
 LIMIT_MS = 15.0
 
 

@@ -18,7 +18,7 @@ from typing import get_args
 
 import numpy as np
 from killed import kill_and_resume
-from results import write_section
+from results import WORDS, few, first, need, write_section
 
 from visioncal.capture.core import Step
 from visioncal.capture.journal import Journal
@@ -42,10 +42,10 @@ from visioncal.session import Session
 
 COMMAND = "PYTHONPATH=tests python tests/benchmarks/rehearsal.py"
 SEED = 1
-PACE_STOPS, FAULT_STOPS, KNOCK_STOPS, KILL_STOPS = 30, 4, 12, 20
+PACE_STOPS, FAULT_STOPS, KNOCK_STOPS, KILL_STOPS = few((30, 4, 12, 20), (2, 4, 2, 3))
 # Room for the four views and little more.
 DISK_BYTES = 6_000_000
-KILLS, LATEST_KILL_S = 20, 6.0
+KILLS, LATEST_KILL_S = few(20, 1), 6.0
 # A knock turns every joint by so much, so fast [rad, rad/s]: a tenth of a second long.
 KNOCK_RAD, KNOCK_SPEED = 1e-3, 0.01
 _PROGRAM = Path(__file__)
@@ -111,7 +111,7 @@ def faults(folder: Path) -> str:
         "| fault | told after [s] | the arm stood after [s] | views kept | in the end | message |",
         "|---|---:|---:|---:|---:|---|",
     ]
-    for fault in get_args(Trouble):
+    for fault in first(get_args(Trouble)):
         place = folder / fault
         _, scene, bench = stage(place, FAULT_STOPS)
         with closing(bench):
@@ -251,11 +251,11 @@ PARTS: dict[str, tuple[str, Callable[[Path], str]]] = {
 
 def main() -> None:
     """Measures what is named, else all."""
-    if sys.argv[1:2] == ["record"]:
-        host, folder, stops = sys.argv[2:5]
+    if WORDS[:1] == ("record",):
+        host, folder, stops = WORDS[1:4]
         record_beside(host, Path(folder), int(stops))
         return
-    for part in sys.argv[1:] or PARTS:
+    for part in WORDS or PARTS:
         name, measure = PARTS[part]
         with tempfile.TemporaryDirectory() as folder:
             text = measure(Path(folder))
@@ -264,4 +264,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    need("rtde_control", "-e .[ur]")
+    need("depthai", "-e .[oak]")
     main()

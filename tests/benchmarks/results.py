@@ -1,20 +1,57 @@
-"""Writes the sections of RESULTS.md, one for each benchmark script."""
+"""Writes the sections of RESULTS.md, one for each benchmark script.
+
+Every script takes `--quick`: the same way with the least of everything, in some seconds, to see
+that it still runs. It measures nothing, and leaves RESULTS.md as it is.
+"""
 
 import os
 import platform
+import sys
+from collections.abc import Sequence
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TypeVar
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
+_OPTION = "--quick"
+QUICK = _OPTION in sys.argv[1:]
+# What else is said behind the script's name.
+WORDS = tuple(it for it in sys.argv[1:] if it != _OPTION)
 
+_Any = TypeVar("_Any")
 _HEAD = """# What the benchmarks measured
 
 Each section is written by the command that it names; run that command to renew it.
 """
 
 
+def few(usual: _Any, quick: _Any) -> _Any:
+    """Chooses between what is measured and what `--quick` does."""
+    return quick if QUICK else usual
+
+
+def first(rows: Sequence[_Any], count: int = 1) -> list[_Any]:
+    """Takes all rows of a table, or with `--quick` the first ones."""
+    return list(rows[: few(len(rows), count)])
+
+
+def wished(usual: int, quick: int = 1, place: int = 0) -> int:
+    """Reads how many seeds or worlds are wished from the words on the command line."""
+    return int(WORDS[place]) if place < len(WORDS) else few(usual, quick)
+
+
+def need(package: str, how: str) -> None:
+    """Ends where a package is missing that only this benchmark needs; no error with `--quick`."""
+    if find_spec(package) is None:
+        words = f"{package} is not installed: pip install {how}"
+        if QUICK:
+            print(f"left out: {words}")
+        sys.exit(None if QUICK else words)
+
+
 def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> None:
-    """Replaces the section called `name`, or appends it.
+    """Replaces the section called `name`, or appends it; not with `--quick`.
 
     Args:
         name: The section's heading, which also identifies it.
@@ -22,6 +59,8 @@ def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> N
         text: Markdown below the heading.
         path: The file; created where it is absent.
     """
+    if QUICK:
+        return
     begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
     section = f"{begin}\n## {name}\n\n`{command}`, {_machine()}\n\n{text.strip()}\n{end}\n"
     old = path.read_text(encoding="utf-8") if path.exists() else _HEAD

@@ -10,14 +10,14 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from results import write_section
+from results import few, write_section
 from touched import TURN, Job, Made, bound, error_of, slipped, touched, turned
 
 from visioncal.estimator.closure import Noise
 from visioncal.estimator.pivot import fit_pivot
 from visioncal.transforms import compose
 
-SEEDS, SLIP_SEEDS, WORKERS = 1000, 300, 2
+SEEDS, SLIP_SEEDS, WORKERS = *few((1000, 300), (3, 3)), 2
 ROBOT = Noise(5e-5, 3e-5)
 JOBS = {
     "10 of a point": Job(),

@@ -9,12 +9,11 @@ the links, or by the motors' currents alone.
     PYTHONPATH=tests python tests/benchmarks/thermal.py [WORLDS]
 """
 
-import sys
 import time
 from dataclasses import replace
 
 import numpy as np
-from results import write_section
+from results import first, wished, write_section
 from warmed import CELL, drift_of, warmed
 
 WORLDS = 8
@@ -25,9 +24,9 @@ ARMS = {
 
 
 def main() -> None:
-    worlds = int(sys.argv[1]) if len(sys.argv) > 1 else WORLDS
+    worlds = wished(WORLDS)
     rows = []
-    for arm, cell in ARMS.items():
+    for arm, cell in first(tuple(ARMS.items())):
         for temperatures in (True, False):
             found, seconds = [], []
             for seed in range(worlds):

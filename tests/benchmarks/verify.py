@@ -7,7 +7,6 @@ own, and one change or none. A change of so much is in a random direction, or of
     PYTHONPATH=tests python tests/benchmarks/verify.py [CHECKS]
 """
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from types import MappingProxyType
 
 import numpy as np
 from later import ANYHOW, Change, Lot, knock, known_again, lot
-from results import write_section
+from results import few, first, wished, write_section
 
 from visioncal.simulation import CellOptions
 from visioncal.types import Mount
@@ -24,7 +23,7 @@ from visioncal.verification.check import check
 from visioncal.verification.footing import Footing
 from visioncal.verification.seeing import seen_by
 
-CHECKS, CELLS, FURTHER = 200, 4, 240
+CHECKS, CELLS, FURTHER = 200, few(4, 1), few(240, 60)
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 SCALE_SIGMA = 2e-4
 # Nothing is as stated: eccentric joints, gears that ripple, a bent board, another lens.
@@ -104,7 +103,7 @@ def main(checks: int) -> None:
     each = checks // CELLS
     rows = []
     with Pool() as pool:
-        for words, options in worlds:
+        for words, options in first(worlds):
             cells = [(replace(options, seed=seed), each) for seed in range(CELLS)]
             found = pool.map(counted, cells, chunksize=1)
             rows += [row(words, it, CELLS * each, [cell[it] for cell in found]) for it in CASES]
@@ -126,4 +125,4 @@ def main(checks: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else CHECKS)
+    main(wished(CHECKS, CELLS))

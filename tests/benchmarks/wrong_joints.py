@@ -7,14 +7,13 @@ joints.
     PYTHONPATH=tests python tests/benchmarks/wrong_joints.py [SESSIONS]
 """
 
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from multiprocessing import Pool
 
 import numpy as np
-from results import write_section
+from results import wished, write_section
 from slips import (
     SLIPS,
     Told,
@@ -126,4 +125,4 @@ def main(count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else SESSIONS)
+    main(wished(SESSIONS))
