@@ -42,7 +42,7 @@ from visioncal.session import Session
 
 COMMAND = "PYTHONPATH=tests python tests/benchmarks/rehearsal.py"
 SEED = 1
-PACE_STOPS, FAULT_STOPS, KNOCK_STOPS, KILL_STOPS = few((30, 4, 12, 20), (2, 4, 2, 3))
+PACE_STOPS, FAULT_STOPS, KNOCK_STOPS, KILL_STOPS = few((30, 4, 12, 20), (2, 2, 2, 2))
 # Room for the four views and little more.
 DISK_BYTES = 6_000_000
 KILLS, LATEST_KILL_S = few(20, 1), 6.0
