@@ -1,5 +1,10 @@
 """Fixtures that several tests share."""
 
+import os
+
+# A test a core: threads of theirs would only wait for one another. Read as numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from dataclasses import replace
 from pathlib import Path
 
