@@ -198,7 +198,8 @@ def knocks(folder: Path) -> str:
     return (
         f"{hand.count} knocks of {1e3 * KNOCK_RAD:g} mrad in every joint, up to 1.5 s apart, while "
         f"the arm stood at {len(steps)} stops. {len(witness.away_mm)} views were accepted; where "
-        f"each was taken, the flange was within {max(witness.away_mm):.3f} mm of what was recorded "
+        f"each was taken, the flange was within {max(witness.away_mm, default=np.nan):.3f} mm of "
+        "what was recorded "
         "(a UR5e repeats to 0.03 mm).\n"
     )
 
