@@ -20,7 +20,6 @@ from samples import HOME_RAD
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from touched import TIP, Job, touched
-from tracked import Tracked, session_of, tracked
 
 from visioncal.robot import load_robot
 from visioncal.simulation import (
@@ -39,6 +38,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.dynamics import Body, real_dynamics
 from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record
+from visioncal.simulation.tracked import Tracked, session_of, tracked
 from visioncal.types import FloatArray
 
 CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
