@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.solvers import quaternions
 from visioncal.solvers.handeye import HandEye, checked
-from visioncal.solvers.pairs import pair_up
+from visioncal.solvers.pairs import pair_products, pair_up
 from visioncal.solvers.translation import complete
 from visioncal.transforms import skew
 from visioncal.types import FloatArray
@@ -105,7 +105,7 @@ def _dual_quaternions(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _dual_products(
     left: FloatArray, left_dual: FloatArray, right: FloatArray, right_dual: FloatArray
 ) -> FloatArray:
-    return quaternions.all_products(left, right_dual) + quaternions.all_products(left_dual, right)
+    return pair_products(left, right_dual) + pair_products(left_dual, right)
 
 
 def _study_point(plane: FloatArray) -> FloatArray:
