@@ -41,5 +41,5 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     data, edges = closure_of(model, mount, q), Edges(X, Z, np.zeros(len(model.values)))
     spread = covariance(closure_information(data, edges, NOISE))
     nothing = np.zeros(len(spread))
-    result = HandEyeResult(edges, spread, NOISE, {}, (), nothing)
+    result = HandEyeResult(edges, spread, NOISE, (), nothing)
     return ArmData(data, result, model, ERROR_RAD, q, np.zeros(3))

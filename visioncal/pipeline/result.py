@@ -25,7 +25,7 @@ from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
-from visioncal.stages.handeye import SOLVER_NAMES
+from visioncal.stages.handeye import SOLVER_NAMES, Solution, compare_solvers
 from visioncal.stages.kinematics import ASKED
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
@@ -180,7 +180,7 @@ def result_of(known: Known) -> Calibration:
                 1e3 * it.rms_m,
                 None if it.rms_rad is None else float(np.rad2deg(it.rms_rad)),
             )
-            for name, it in result.solutions.items()
+            for name, it in _solutions(known).items()
         },
         noise=_noise(known),
         views=tuple(findings.views),
@@ -200,6 +200,13 @@ def _edges_in_order(known: Known) -> tuple[tuple[str, ...], Placed]:
     order = sorted(range(len(known.boards)), key=lambda it: known.boards[it])
     names = [f"{z_name}_{placed.names[it]}" if placed.names[it] else z_name for it in order]
     return (x_name, *names), placed.sorted(order)
+
+
+def _solutions(known: Known) -> dict[str, Solution]:
+    boards, first = known.shown(known.used), np.unique(known.stops, return_index=True)[1]
+    data = known.closure(known.used).merged(known.stops)
+    by_stop = replace(boards, shown=boards.shown[first])
+    return compare_solvers(data, known.solved.edges, known.solver, by_stop)
 
 
 def _further(known: Known) -> dict[str, Any]:

@@ -342,7 +342,9 @@ def _hand_eye(known: Known) -> Known:
         data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
         first = np.unique(known.stops, return_index=True)[1]
         by_stop = replace(boards, shown=boards.shown[first])
-        result = solve_hand_eye(data, known.solver, arm, known.estimated_looks, by_stop)
+        start = None if known.hand_eye is None else known.hand_eye.edges
+        looks = known.estimated_looks
+        result = solve_hand_eye(data, known.solver, arm, looks, by_stop, start)
         known = replace(known, hand_eye=result)
         model, readings, shared = known.arm_model, known.readings, result.edges.shared
         step = np.concatenate([shared[len(shared) - known.arm_size :], shared[boards.places]])

@@ -1,6 +1,5 @@
 """Stage 5: the two unknown edges, AX = XB and AX = ZB, by every solver."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import get_args
 
@@ -54,14 +53,13 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class HandEyeResult:
-    """The answer, and what the other solvers make of the same views.
+    """The answer of one solver.
 
     Attributes:
         edges: x is `flange_from_cam` or `base_from_cam`; z is `base_from_target` or
             `flange_from_target`; with them the change of lens, board and links.
         covariance: (12 + k, 12 + k) of x, z (right perturbations) and of what the views share.
         noise: Of the flange, or of both together.
-        solutions: Every solver's edges by name, the answer's own among them.
         worst: The worst directions of each edge, those of further boards behind the others.
         held: (12 + k,) how far the answer would move if what is held moved as well; its square is
             in the covariance.
@@ -70,7 +68,6 @@ class HandEyeResult:
     edges: Edges
     covariance: FloatArray
     noise: Noise
-    solutions: Mapping[str, Solution]
     worst: tuple[Direction, ...]
     held: FloatArray
 
@@ -86,6 +83,7 @@ def solve_hand_eye(
     arm: ArmErrors | None = None,
     looks: int = 0,
     boards: Boards | None = None,
+    start: Edges | None = None,
 ) -> HandEyeResult:
     """Solves for both unknown edges.
 
@@ -100,6 +98,7 @@ def solve_hand_eye(
         looks: How many of the unknowns that the views share are of lens and board; they come first.
         boards: What the views show, where there are several boards; of a stop that shows several,
             one of them.
+        start: Where the joint fit begins; a closed form's edges where none are given.
 
     Returns:
         The answer with its covariance.
@@ -111,14 +110,11 @@ def solve_hand_eye(
     boards = boards or Boards.one(len(data))
     with one_blas_thread():
         refuse_too_few(data)
-        closed = {}
-        if data.guess is None:
-            closed = {name: solve(data.robot, data.camera) for name, solve in SOLVERS.items()}
-        start = data.guess or closed[_START if solver == "joint" else solver]
-        edges = Edges(start.x, start.z, data.unchanged)
         if solver == "joint":
-            fit = fit_closure(data, edges)
+            begin = data.guess or start or SOLVERS[_START](data.robot, data.camera)
+            fit = fit_closure(data, Edges(begin.x, begin.z, data.unchanged))
         else:
+            edges = _closed_form(data, solver)
             fit = ClosureFit(edges, estimate_noise(data, edges))
         check_observability(data, fit.edges, fit.noise, boards, looks)
         # Away from its rest a closed form is pulled by more than what is held.
@@ -132,21 +128,40 @@ def solve_hand_eye(
             f"{title(data.mount)}: the joint fit of {len(data)} views does not come to rest.",
             next_step="Take another solver with --solver, and look at the worst views.",
         )
-    solutions = {"joint": _solution(data, fit.edges, boards)} if solver == "joint" else {}
-    solutions |= {
-        name: _solution(data, Edges(it.x, it.z, data.unchanged), boards)
-        for name, it in closed.items()
-    }
     worst = directions(spread, fit.edges, data.mount, boards)
-    return HandEyeResult(fit.edges, spread, fit.noise, solutions, worst, shift)
+    return HandEyeResult(fit.edges, spread, fit.noise, worst, shift)
+
+
+def compare_solvers(
+    data: Closure, edges: Edges, solver: SolverName, boards: Boards
+) -> dict[str, Solution]:
+    """What every solver makes of the same views, by its name.
+
+    Args:
+        data: The used views.
+        edges: The answer.
+        solver: Whose it is.
+        boards: What the views show.
+
+    Returns:
+        The answer first where it is the joint fit's, then every closed form where poses were read.
+    """
+    found = {"joint": edges} if solver == "joint" else {}
+    if data.guess is None:
+        found |= {name: _closed_form(data, name) for name in SOLVERS}
+    return {name: _solution(data, it, boards) for name, it in found.items()}
 
 
 def refit(data: Closure, result: HandEyeResult, solver: SolverName) -> Edges:
     """Solves again from fewer views, with the noise that is already known."""
     if solver == "joint":
         return solve_closure(data, result.edges, result.noise)[0]
-    again = SOLVERS[solver](data.robot, data.camera)
-    return Edges(again.x, again.z, data.unchanged)
+    return _closed_form(data, solver)
+
+
+def _closed_form(data: Closure, solver: str) -> Edges:
+    found = SOLVERS[solver](data.robot, data.camera)
+    return Edges(found.x, found.z, data.unchanged)
 
 
 def _solution(data: Closure, edges: Edges, boards: Boards) -> Solution:
