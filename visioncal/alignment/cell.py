@@ -156,9 +156,12 @@ def _poses(
         name: Robot.from_document(document) for name, document in session.robot_documents.items()
     }
     unread: dict[int, str] = {}
+    read: dict[int, FloatArray | None] = {}
     for it in seen:
         for name, view in it.robots.items():
-            pose = _pose(view, models.get(name))
+            if view.number not in read:
+                read[view.number] = _pose(view, models.get(name))
+            pose = read[view.number]
             if pose is None:
                 of = f" of robot {name}" if name else " of the robot"
                 unread[it.view.number] = (

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.session.columns import POSE, joint_columns
 from visioncal.session.document import Declaration
 from visioncal.session.frames import observed, robots_between
 from visioncal.session.kinds import name_of, tells_robot
@@ -125,14 +126,23 @@ def _told(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:
             telling.setdefault(name_of(declaration, "robot", view), []).append(view)
     told = {}
     for robot, mine in telling.items():
-        agreeing = Counter({at: sum(not _differ(a, b) for b in mine) for at, a in enumerate(mine)})
-        told[robot] = mine[max(agreeing, key=lambda at: (agreeing[at], -at))]
+        counts, first = Counter(map(_pose_cells, mine)), {_pose_cells(it): it for it in mine[::-1]}
+        agreeing = Counter(
+            {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
+        )
+        told[robot] = first[agreeing.most_common(1)[0][0]]
     return told
+
+
+def _pose_cells(view: View) -> tuple[float | None, ...]:
+    """What a row says of where its robot stood: most rows of a stop repeat it to the digit."""
+    names = (*POSE, *joint_columns(tuple(view.numbers)))
+    return tuple(view.numbers.get(it) for it in names)
 
 
 def _differ(first: View, second: View) -> bool:
     """Whether two rows tell of one robot that it stood in different poses."""
-    if first is second:
+    if _pose_cells(first) == _pose_cells(second):
         return False
     poses = first.base_from_flange(), second.base_from_flange()
     if poses[0] is not None and poses[1] is not None:
