@@ -11,7 +11,7 @@ from visioncal.estimation.problem import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
-    equations_by_stop,
+    equations_from,
     fit_problem,
     normal_equations,
     posterior,
@@ -141,13 +141,16 @@ def test_taking_the_flanges_out_loses_nothing():
     np.testing.assert_allclose(found, dense, atol=1e-7 * np.abs(dense).max())
 
 
-def test_equations_by_stop_add_up_to_those_of_all():
+def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
     cell, problem = problem_of(4, stops=6)
     fit = fit_problem(problem, true_state(cell, problem.tree))
-    parts = equations_by_stop(problem, fit)
-    whole = normal_equations(problem, fit.state, fit.noise)
-    for part, total in zip(parts, whole, strict=True):
-        np.testing.assert_allclose(part.sum(axis=0), total, atol=1e-9 * np.abs(parts[0]).max())
+    stops = []
+    for stop, *parts in equations_from(problem, fit):
+        later = problem.subset(problem.observations.stops >= stop)
+        for part, whole in zip(parts, normal_equations(later, fit.state, fit.noise), strict=True):
+            np.testing.assert_allclose(part, whole, atol=1e-9 * np.abs(parts[0]).max())
+        stops.append(stop)
+    assert stops == [5, 4, 3, 2, 1, 0]
 
 
 def test_the_fit_is_as_good_as_its_covariance_says():

@@ -15,7 +15,7 @@ from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import (
     Solution,
     by_noise_alone,
-    equations_by_stop,
+    equations_from,
     fitted_covariance,
 )
 from visioncal.estimator.linalg import covariance, spectrum
@@ -290,8 +290,7 @@ def _asked_spread(problem: Problem, fit: Solution, frame: str) -> FloatArray:
     """Covariances (n, 6, 6) of the changes that observations ask for."""
     linear = problem.linear(fit.state, ideal=True)
     spread = problem.total_covariance(linear, fit.noise)
-    at = 6 * problem.unknown[frame]
-    back = np.linalg.inv(linear.jacobian[:, :, at : at + 6])
+    back = np.linalg.inv(linear.jacobian[:, :, problem.edge_columns(frame)])
     return np.asarray(back @ spread @ np.swapaxes(back, 1, 2))
 
 
@@ -303,21 +302,22 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
     """
-    information, pull = equations_by_stop(problem, fit)
     known = fitted_covariance(problem, fit.state, fit.noise)
-    # Sums over each stop and all after it.
-    information, pull = (np.cumsum(it[::-1], axis=0)[::-1] for it in (information, pull))
-    best, limit = None, _move_limit(problem, len(movable) * len(pull))
+    seen = {}
     for frame in movable:
-        at = slice(6 * problem.unknown[frame], 6 * problem.unknown[frame] + 6)
         stops = np.unique(problem.observations.stops[problem.observations.involves(frame)])
-        for stop in stops[_FEWEST : 1 - _FEWEST].tolist():
-            across = information[stop][at]
+        seen[frame] = set(stops[_FEWEST : 1 - _FEWEST].tolist())
+    tried = int(problem.observations.stops.max()) + 1
+    best, limit = None, _move_limit(problem, len(movable) * tried)
+    for stop, information, pull in equations_from(problem, fit):
+        for frame in (it for it in movable if stop in seen[it]):
+            at = problem.edge_columns(frame)
+            across = information[at]
             own = across[:, at] - across @ known @ across.T
             if spectrum(across[:, at]).ratio < _TAKEN or spectrum(own).values[0] < _TAKEN:
                 continue
-            step = -covariance(own) @ pull[stop][at]
-            surprise = float(-step @ pull[stop][at])
+            step = -covariance(own) @ pull[at]
+            surprise = float(-step @ pull[at])
             if surprise > limit:
                 best, limit = (frame, stop, step), surprise
     if best is None:

@@ -216,15 +216,46 @@ class _Group:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """Residuals (n, 6), their Jacobian (n, 6, p), and that by the flanges' errors (n, 6, 6 w).
+class Block:
+    """The Jacobian (m, 6, c) of m rows by the c columns that may move them: all others are zero."""
 
-    The latter in the places of the robots that the observation's unit has; see `Problem.units`.
+    rows: IntArray
+    columns: IntArray
+    slopes: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """All residuals, linearised.
+
+    Attributes:
+        residuals: (n, 6).
+        blocks: Their Jacobian by p unknowns, one block for each pair of frames.
+        by_errors: (n, 6, 6 w) that by the flanges' errors, in the places of the robots that the
+            observation's unit has; see `Problem.units`.
+        size: How many unknowns p there are.
     """
 
     residuals: FloatArray
-    jacobian: FloatArray
+    blocks: tuple[Block, ...]
     by_errors: FloatArray
+    size: int
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """(n, 6, p) the Jacobian as one."""
+        found = np.zeros((len(self.residuals), 6, self.size))
+        for it in self.blocks:
+            found[np.ix_(it.rows, np.arange(6), it.columns)] = it.slopes
+        return found
+
+    def spread(self, covariance: FloatArray) -> FloatArray:
+        """Covariances (n, 6, 6) of what a (p, p) one of the unknowns predicts."""
+        found = np.zeros((len(self.residuals), 6, 6))
+        for it in self.blocks:
+            among = covariance[np.ix_(it.columns, it.columns)]
+            found[it.rows] = it.slopes @ among @ np.swapaxes(it.slopes, 1, 2)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,43 +525,74 @@ class Problem:
             by_measured @ adjoint(invert(error)),
             _place_slope(np.broadcast_to(np.eye(4), error.shape)),
         )
-        edges, errors, effects = self._slopes(state)
-        values = by_measured @ self.by_sensor + by_predicted @ effects
-        return Linear(
-            residuals, np.concatenate([by_predicted @ edges, values], axis=2), by_predicted @ errors
-        )
-
-    def _slopes(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How the predicted poses move, on their right.
-
-        Returns:
-            (n, 6, 6 e) with the edges, (n, 6, 6 w) with the flanges' errors, and (n, 6, k) with
-            the effects on flanges.
-        """
-        of, members = self.units
-        edges = np.zeros((len(self), 6, 6 * len(self.unknown)))
+        _, members = self.units
         errors = np.zeros((len(self), 6, 6 * members.shape[1]))
-        effects = np.zeros((len(self), 6, len(state.values)))
-        for group in self.groups:
-            rest = np.broadcast_to(np.eye(4), (len(group.rows), 4, 4))
-            for step in reversed(group.path):
-                edge = self._edge(step, state, group.rows)
-                # An edge moves on its right: at its end, or at its start where it is gone up.
-                before = invert(edge) @ rest if step.is_up else edge @ rest
-                moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
-                if step.frame in self.unknown:
-                    edges[group.rows, :, self.edge_columns(step.frame)] += moved
-                if step.robot:
-                    mine = members[of[group.rows]] == self.robots.index(step.robot)
-                    for slot in range(members.shape[1]):
-                        rows = group.rows[mine[:, slot]]
-                        errors[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
-                if step.robot in self.by_flange:
-                    effects[group.rows] += moved @ self.by_flange[step.robot][group.rows]
-                rest = before
+        blocks = []
+        for group, (values, by_sensor) in zip(self.groups, self._moved_groups, strict=True):
+            rows = group.rows
+            edges, effects = self._slopes(group, values, state, errors)
+            moved = by_measured[rows] @ by_sensor + by_predicted[rows] @ effects
+            slopes = [by_predicted[rows] @ it for it in edges.values()]
+            columns = [np.arange(self.size)[self.edge_columns(it)] for it in edges]
+            blocks.append(
+                Block(
+                    rows,
+                    np.concatenate([*columns, 6 * len(self.unknown) + values]),
+                    np.concatenate([*slopes, moved], axis=2),
+                )
+            )
         for rows in self.repeats:
             errors[rows, :, :6] = np.eye(6)
-        return edges, errors, effects
+        return Linear(residuals, tuple(blocks), by_predicted @ errors, self.size)
+
+    @cached_property
+    def _moved_groups(self) -> tuple[tuple[IntArray, FloatArray], ...]:
+        """Of each group, the places of the effects' values that move it, and by (m, 6, c) how."""
+        found = []
+        for group in self.groups:
+            by_sensor = self.by_sensor[group.rows]
+            moved = by_sensor.any(axis=(0, 1))
+            for step in group.path:
+                if step.robot in self.by_flange:
+                    moved |= self.by_flange[step.robot][group.rows].any(axis=(0, 1))
+            values = np.flatnonzero(moved)
+            found.append((values, by_sensor[:, :, values]))
+        return tuple(found)
+
+    def _slopes(
+        self, group: _Group, values: IntArray, state: State, errors: FloatArray
+    ) -> tuple[dict[str, FloatArray], FloatArray]:
+        """How the predicted poses of a group move, on their right.
+
+        Args:
+            group: The group of m observations.
+            values: (c,) places of the effects' values that move it.
+            state: The unknowns.
+            errors: (n, 6, 6 w) of all observations, to which its own by flanges' errors are added.
+
+        Returns:
+            (m, 6, 6) by the edge of each unknown frame, and (m, 6, c) by the effects on flanges.
+        """
+        of, members = self.units
+        edges: dict[str, FloatArray] = {}
+        effects = np.zeros((len(group.rows), 6, len(values)))
+        rest = np.broadcast_to(np.eye(4), (len(group.rows), 4, 4))
+        for step in reversed(group.path):
+            edge = self._edge(step, state, group.rows)
+            # An edge moves on its right: at its end, or at its start where it is gone up.
+            before = invert(edge) @ rest if step.is_up else edge @ rest
+            moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+            if step.frame in self.unknown:
+                edges[step.frame] = edges.get(step.frame, 0.0) + moved
+            if step.robot:
+                mine = members[of[group.rows]] == self.robots.index(step.robot)
+                for slot in range(members.shape[1]):
+                    rows = group.rows[mine[:, slot]]
+                    errors[rows, :, 6 * slot : 6 * slot + 6] += moved[mine[:, slot]]
+            if step.robot in self.by_flange:
+                effects += moved @ self.by_flange[step.robot][group.rows][:, :, values]
+            rest = before
+        return edges, effects
 
     def change_of(self, frame: str, state: State) -> FloatArray:
         """The change of a frame's edge that each observation asks for, were all else right.

@@ -1,15 +1,17 @@
 """Solving a problem: Levenberg-Marquardt on all unknowns, and the noise's levels by REML."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
 from visioncal.estimator.closure import RATIO_PRIOR
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance_among, damped_step, gram, squared_lengths
 from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
-from visioncal.types import FloatArray, Mask
+from visioncal.types import FloatArray, IntArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-8
 # Noise levels that change by less have settled, far below what is known of them.
@@ -121,15 +123,22 @@ def reduce(problem: Problem, state: State, linear: Linear, weights: FloatArray) 
         weights: (n, 6, 6) inverse covariances of the observations' own noise.
     """
     of, members = problem.units
-    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
-    weighted = weights @ every
-    total = gram(every, weighted)
-    width, size = linear.by_errors.shape[2], len(total) - 1
+    width, size = linear.by_errors.shape[2], linear.size
+    total = np.zeros((size + 1, size + 1))
     own, cross = np.zeros((len(members), width, width)), np.zeros((len(members), width, size + 1))
-    rows = of >= 0
-    slopes = np.swapaxes(linear.by_errors[rows], 1, 2)
-    np.add.at(own, of[rows], slopes @ weights[rows] @ linear.by_errors[rows])
-    np.add.at(cross, of[rows], slopes @ weighted[rows])
+    for block in linear.blocks:
+        # Residuals are the last column.
+        columns = np.append(block.columns, size)
+        every = np.concatenate([block.slopes, linear.residuals[block.rows, :, None]], axis=2)
+        weighted = weights[block.rows] @ every
+        total[np.ix_(columns, columns)] += gram(every, weighted)
+        if of[block.rows[0]] < 0:
+            continue
+        units, at = np.unique(of[block.rows], return_inverse=True)
+        by_errors = linear.by_errors[block.rows]
+        slopes = np.swapaxes(by_errors, 1, 2)
+        own[units] += _summed(slopes @ weights[block.rows] @ by_errors, at)
+        cross[np.ix_(units, np.arange(width), columns)] += _summed(slopes @ weighted, at)
     inverse, blind = _pseudo_inverse(own)
     answer = inverse @ cross
     total = total - gram(cross, answer)
@@ -143,6 +152,12 @@ def reduce(problem: Problem, state: State, linear: Linear, weights: FloatArray) 
         answer[:, :, :-1],
         inverse + blind,
     )
+
+
+def _summed(values: FloatArray, of: IntArray) -> FloatArray:
+    """Sums (m, a, b) values by what they are of, (m,) from 0 to u - 1, as (u, a, b)."""
+    adder = csr_array((np.ones(len(of)), (of, np.arange(len(of)))))
+    return np.asarray(adder @ values.reshape(len(of), -1)).reshape(-1, *values.shape[1:])
 
 
 def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -281,7 +296,7 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     errors = problem.error_covariance(noise)
     known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units
-    residuals, slopes = linear.residuals.copy(), linear.jacobian.copy()
+    residuals, slopes = linear.residuals.copy(), linear.jacobian
     gone = np.zeros_like(weights)
     rows = of >= 0
     if rows.any():
@@ -318,8 +333,7 @@ def mahalanobis_sq(
     linear = problem.linear(solution.state)
     known = fitted_covariance(problem.subset(used), solution.state, solution.noise)
     noise = problem.total_covariance(linear, solution.noise)
-    taken = linear.jacobian @ known @ np.swapaxes(linear.jacobian, 1, 2)
-    left = noise + np.where(used, -1.0, 1.0)[:, None, None] * taken
+    left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.spread(known)
     squares, directions = squared_lengths(linear.residuals, left, noise)
     unmeasured = np.where(problem.observations.has_rotation, 0, 3)
     return squares, np.asarray(directions - unmeasured, dtype=float)
@@ -333,33 +347,36 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
     return np.asarray(np.sum(linear.residuals * white, axis=1))
 
 
-def equations_by_stop(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """Information (s, p, p) and gradient (s, p) of each stop's observations by themselves.
+def equations_from(
+    problem: Problem, solution: Solution
+) -> Iterator[tuple[int, FloatArray, FloatArray]]:
+    """Information (p, p) and gradient (p,) of the observations from each stop on, the last first.
 
     Args:
         problem: The observations, without errors that repeats share over stops.
         solution: The unknowns and the noise.
+
+    Yields:
+        Each stop with what it and all after it say: what is known besides does not count.
     """
     state, noise = solution.state, solution.noise
     weights = _weights(problem, noise)
     linear = problem.linear(state)
-    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
-    weighted = weights @ every
     stops, of = problem.observations.stops, problem.units[0]
-    total = np.zeros((int(stops.max()) + 1, every.shape[2], every.shape[2]))
-    np.add.at(total, stops, np.swapaxes(every, 1, 2) @ weighted)
-    rows = of >= 0
-    if rows.any():
-        errors = problem.error_covariance(noise)
-        slopes = np.swapaxes(linear.by_errors[rows], 1, 2)
-        own = np.linalg.inv(errors)
-        cross = np.zeros((len(own), own.shape[1], every.shape[2]))
-        np.add.at(own, of[rows], slopes @ weights[rows] @ linear.by_errors[rows])
-        np.add.at(cross, of[rows], slopes @ weighted[rows])
-        stop_of = np.zeros(len(own), dtype=np.int64)
-        stop_of[of[rows]] = stops[rows]
-        np.subtract.at(total, stop_of, np.swapaxes(cross, 1, 2) @ np.linalg.solve(own, cross))
-    return total[:, :-1, :-1], total[:, :-1, -1]
+    every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    inverse = np.linalg.inv(problem.error_covariance(noise))
+    total = np.zeros((every.shape[2], every.shape[2]))
+    for stop in np.unique(stops)[::-1].tolist():
+        mine = np.flatnonzero(stops == stop)
+        weighted = weights[mine] @ every[mine]
+        total = total + gram(every[mine], weighted)
+        for unit in np.unique(of[mine][of[mine] >= 0]).tolist():
+            rows = of[mine] == unit
+            slopes = linear.by_errors[mine[rows]]
+            own = inverse[unit] + gram(slopes, weights[mine[rows]] @ slopes)
+            cross = gram(slopes, weighted[rows])
+            total -= cross.T @ np.linalg.solve(own, cross)
+        yield stop, total[:-1, :-1], total[:-1, -1]
 
 
 def score_gain(
