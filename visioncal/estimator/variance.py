@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from visioncal.estimator.linalg import covariance, gram
+from visioncal.estimator.linalg import covariance_root, gram
 from visioncal.types import FloatArray, Mask
 
 # Standard deviations stay within these, in units of the residuals [rad and m].
@@ -171,37 +171,36 @@ def _likelihood(
     total = components.total(sigmas)
     weights = np.linalg.inv(total)
     weighted = weights @ jacobian
-    spread = covariance(gram(jacobian, weighted) + known.information)
+    root = covariance_root(gram(jacobian, weighted) + known.information)
     pull = gram(weighted, residuals) + known.pull
-    best = spread @ pull
+    best = root @ (root.T @ pull)
     left = residuals - jacobian @ best
     pulled = (weights @ left[:, :, None])[:, :, 0]
     value = 0.5 * float(
         np.linalg.slogdet(total)[1].sum()
-        - np.linalg.slogdet(spread)[1]
+        - 2.0 * np.linalg.slogdet(root)[1]
         + np.einsum("mi,mi->", left, pulled)
         + best @ (known.information @ best - 2 * known.pull)
     )
     # How the residuals' covariance grows with the logarithm of each sigma.
     growth = 2 * sigmas[:, None, None, None] ** 2 * components.parts
     whitened = weights @ growth
-    carried = growth @ weighted
-    taken = _products(weighted[None], carried)[0]
-    traces = np.einsum("kmii->k", whitened) - np.einsum("jp,kpj->k", spread, taken)
+    # What the parameters have taken of the weights, as y y^T.
+    y = weighted @ root
+    removed = y @ np.swapaxes(y, 1, 2) @ growth
+    traces = np.einsum("kmii->k", whitened - removed)
     asked = (growth @ pulled[:, :, None])[..., 0]
     slope = 0.5 * (traces - np.einsum("mi,kmi->k", pulled, asked))
     # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
-    both = _products(carried, weights @ carried)
-    shrunk = spread @ taken
+    shrunk = np.array([gram(y, it @ y) for it in growth])
     expected = 0.5 * (
-        np.einsum("kmij,lmji->kl", whitened, whitened)
-        - 2 * np.einsum("rj,kljr->kl", spread, both)
+        np.einsum("kmij,lmji->kl", whitened - 2.0 * removed, whitened)
         + np.einsum("kij,lji->kl", shrunk, shrunk)
     )
     # Products of y P G_k P G_l P y: with them the second derivative itself, not its expectation.
     answer = (weights @ asked[..., None])[..., 0]
-    by_unknowns = asked.reshape(len(asked), -1) @ weighted.reshape(-1, weighted.shape[-1])
-    seen = np.einsum("kmi,lmi->kl", asked, answer) - by_unknowns @ spread @ by_unknowns.T
+    by_unknowns = asked.reshape(len(asked), -1) @ y.reshape(-1, y.shape[-1])
+    seen = np.einsum("kmi,lmi->kl", asked, answer) - by_unknowns @ by_unknowns.T
     curvature = seen - expected + 2.0 * np.diag(slope)
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
         curvature = expected
@@ -214,10 +213,3 @@ def _likelihood(
     return _Likelihood(
         value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
     )
-
-
-def _products(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Sums over residuals of `left_k^T right_l`, of (k, m, d, p) and (l, m, d, p): (k, l, p, p)."""
-    columns = left.shape[-1]
-    rows_l, rows_r = left.reshape(len(left), -1, columns), right.reshape(len(right), -1, columns)
-    return np.asarray(np.swapaxes(rows_l, 1, 2)[:, None] @ rows_r[None])
