@@ -237,6 +237,16 @@ def test_turns_about_one_axis_are_refused_with_that_axis(wobble_rad):
             solve_hand_eye(data)
 
 
+def test_thousands_of_views_about_one_axis_are_refused_by_the_farthest_of_them():
+    x, z = some_edges()
+    turns = np.outer(1e-3 * np.linspace(-1, 1, 2000), [0.0, 0.0, 1.0])
+    turns[777] *= 1000.0
+    robot = compose(Rotation.from_rotvec(turns).as_matrix(), some_motion(2000)[:, :3, 3])
+    # All other views, and any even choice of them, differ by 0.1 deg only: in position alone.
+    with pytest.raises(DegenerateError, match="all 2000 used views turn about the tool's z"):
+        solve_hand_eye(made_up(robot, x, z))
+
+
 def test_the_axis_has_its_name():
     x, z = some_edges()
     turns = np.outer(np.linspace(-1, 1, 8), [0.0, 0.0, 1.0])

@@ -15,7 +15,6 @@ from visioncal.estimator.closure import (
 )
 from visioncal.estimator.linalg import covariance, gram
 from visioncal.transforms import adjoint, invert
-from visioncal.types import FloatArray
 
 # Noise looks like a misfit in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -67,13 +66,12 @@ def neighbours(data: Closure, edges: Edges, noise: Noise) -> Neighbours:
     fitted, metric = covariance(information), information[:12, :12]
     seen = expected = scatter = 0.0
     for rows in np.array_split(np.arange(len(data)), min(_BLOCKS, len(data) // 2)):
-        slope = jacobian[rows].reshape(-1, jacobian.shape[2])
-        total = _block_diagonal(spread[rows])
-        # Leaving the block out changes its share of the information, too.
-        left = total - slope @ fitted @ slope.T
-        influence = fitted @ slope.T @ covariance(left)
-        moved = (influence @ residuals[rows].ravel())[:12]
-        likely = (influence @ left @ influence.T)[:12, :12] @ metric
+        weighted = np.linalg.solve(spread[rows], jacobian[rows])
+        own = gram(jacobian[rows], weighted)
+        # Leaving the block out takes its information, too.
+        without = covariance(information - own)
+        moved = (without @ gram(weighted, residuals[rows]))[:12]
+        likely = (without @ own @ fitted)[:12, :12] @ metric
         seen += float(moved @ metric @ moved)
         expected += float(np.trace(likely))
         scatter += 2.0 * float(np.trace(likely @ likely))
@@ -113,10 +111,3 @@ def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
     target = edges.z if data.mount == "eye-in-hand" else (flange @ edges.z).mean(axis=0)
     moved = base[3:] + np.cross(base[:3], target[:3, 3])
     return Drift(float(np.linalg.norm(moved)), float(np.linalg.norm(base[:3])))
-
-
-def _block_diagonal(blocks: FloatArray) -> FloatArray:
-    count, size, _ = blocks.shape
-    whole = np.zeros((count, size, count, size))
-    whole[np.arange(count), :, np.arange(count)] = blocks
-    return whole.reshape(count * size, count * size)

@@ -11,7 +11,7 @@ from visioncal.estimator.boards import Boards, place
 from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimator.linalg import Spectrum, covariance, spectrum
 from visioncal.figures import figure
-from visioncal.transforms import invert
+from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mount
 
 # Under this scaled eigenvalue ratio a direction is not determined by the motion at all.
@@ -21,6 +21,7 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
+_PAIRED = 300
 # What is wrong where unknowns that all views share are not told, and what to do.
 _UNTOLD = {
     "camera": (
@@ -111,7 +112,8 @@ def check_observability(
         )
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
     worst = worst_directions(held, still, plausible, replace(boards, begin=0))
-    _refuse(data.mount, worst[:4], _motion(data), _advice(data.mount))
+    if any(it.sigma > it.limit for it in worst[:4]):
+        _refuse(data.mount, worst[:4], _motion(data), _advice(data.mount))
     for board, name in enumerate(boards.names[1:], start=1):
         _refuse(
             data.mount,
@@ -276,9 +278,14 @@ def _frame(mount: Mount) -> str:
 
 
 def _turns(data: Closure) -> FloatArray:
-    """Rotation vectors (p, 3) of the relative motions between all pairs of views [rad]."""
-    i, j = np.triu_indices(len(data), 1)
-    relative = invert(data.robot[j]) @ data.robot[i]
+    """Rotation vectors (p, 3) of the relative motions between all pairs of views [rad].
+
+    Of more views than can be paired in a moment, those that turn least and most are among them.
+    """
+    ranked = data.robot[np.argsort(rotation_angle(invert(data.robot[0]) @ data.robot))]
+    some = np.linspace(0, len(data) - 1, min(len(data), _PAIRED)).round().astype(np.int64)
+    i, j = np.triu_indices(len(some), 1)
+    relative = invert(ranked[some[j]]) @ ranked[some[i]]
     return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
 
 

@@ -236,7 +236,7 @@ class Known:
         held = dict.fromkeys(sorted(self.held_back - self.reasons.keys()), HELD_BACK)
         return by_reason({**self.reasons, **held})
 
-    @property
+    @cached_property
     def held_back(self) -> frozenset[int]:
         """The views that the session keeps from every fit (`role = holdout`)."""
         return frozenset(view.number for view in self.session.views if view.holdout)
