@@ -8,7 +8,7 @@ from cells import calibrated, error_of
 
 from visioncal.errors import DegenerateError
 from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, solve_closure
-from visioncal.estimator.consensus import surprises, whole_units
+from visioncal.estimator.consensus import agreeing_views, surprises, whole_units
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 from visioncal.stages.agree import agree
 from visioncal.transforms import exp, invert
@@ -33,6 +33,23 @@ def test_just_the_wrong_views_are_left_out(world, wrong):
         error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
         # Chi-square of 12 stays under 39 in all but one case of ten thousand.
         assert error @ np.linalg.solve(spread, error) < 39.0
+
+
+def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch):
+    fits = []
+    monkeypatch.setattr(
+        "visioncal.estimator.consensus.fit_closure",
+        lambda data, edges: fits.append(len(data)) or fit_closure(data, edges),
+    )
+    cell = simulate(replace(WORLDS["fine, given"], views=600, seed=3))
+    # Poses that others measured: no covariance, and some are many times worse than most.
+    noise = 3e-4 * np.random.default_rng(0).standard_t(3, (600, 6))
+    found = agreeing_views(
+        Closure("eye-in-hand", cell.base_from_flange, cell.cam_from_target @ exp(noise))
+    )
+    # All views but one or two belong to the noise, of which the search first left out fifty.
+    assert found.agrees.sum() >= 598
+    assert len(fits) < 25
 
 
 def test_two_exchanged_rows_are_found():
