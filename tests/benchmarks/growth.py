@@ -87,13 +87,15 @@ def exponent(sizes: Sequence[float], taken: Sequence[float]) -> float:
     return float(np.polyfit(np.log(sizes[half:]), np.log(taken[half:]), 1)[0])
 
 
-def run_each(run: Callable, tasks: list) -> list[dict[str, float]]:
-    """Runs every task in a fresh process, one after the other."""
+def run_each(run: Callable, tasks: list, *, quick: bool) -> list[dict[str, float]]:
+    """Runs every task in a fresh process, one after the other; quickly, all in this one."""
+    if quick:
+        return [run(it) for it in tasks]
     with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         return pool.map(run, tasks, chunksize=1)
 
 
-def views_table(views: Sequence[int]) -> str:
+def views_table(views: Sequence[int], *, quick: bool) -> str:
     lines = [
         f"| cell | {' | '.join(f'{it} views [s]' for it in views)} | exponent |",
         f"| --- | {' | '.join('---:' for _ in views)} | ---: |",
@@ -104,24 +106,26 @@ def views_table(views: Sequence[int]) -> str:
          False),
         ("with an arm", WRONG_ARM, True),
     ):  # fmt: skip
-        found = run_each(of_views, [(replace(options, views=it), joints) for it in views])
+        tasks = [(replace(options, views=it), joints) for it in views]
+        found = run_each(of_views, tasks, quick=quick)
         for name in ("all", *NAMED):
             taken = [it.get(name, 0.0) for it in found]
-            if min(taken) > 0.0:
+            if min(taken) > 1e-3:
                 figures = " | ".join(f"{it:.3f}" for it in taken)
                 label = words if name == "all" else f"of it: {name}"
                 lines.append(f"| {label} | {figures} | {exponent(views, taken):.2f} |")
     return "\n".join(lines)
 
 
-def cameras_table(cameras: Sequence[int], stops: int) -> str:
+def cameras_table(cameras: Sequence[int], stops: int, small: int, *, quick: bool) -> str:
     tasks = [(it, stops, faulty) for faulty in (False, True) for it in cameras]
-    found = run_each(of_cameras, [*tasks, (4, 40, False)])
+    tasks += [(4, small, False)]
+    found = run_each(of_cameras, tasks, quick=quick)
     lines = [
         "| cameras x stops | rows | s | MB | moves named |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
-    for (count, stops_of, faulty), it in zip([*tasks, (4, 40, False)], found, strict=True):
+    for (count, stops_of, faulty), it in zip(tasks, found, strict=True):
         words = f"{count} x {stops_of}{', faults' if faulty else ''}"
         lines.append(f"| {words} | {it['rows']:.0f} | {it['all']:.2f} | {it['memory']:.0f} "
                      f"| {it['moved']:.0f} |")  # fmt: skip
@@ -133,10 +137,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     quick = parser.parse_args().quick
-    views, cameras, stops = (20, 40, 60), (2, 3, 4), 12
-    if not quick:
-        views, cameras, stops = VIEWS, CAMERAS, STOPS
-    text = f"{views_table(views)}\n\n{cameras_table(cameras, stops)}"
+    views, cameras, stops, small = VIEWS, CAMERAS, STOPS, 40
+    if quick:
+        views, cameras, stops, small = (20, 25, 30), (2, 3, 4), 12, 12
+    tables = views_table(views, quick=quick), cameras_table(cameras, stops, small, quick=quick)
+    text = "\n\n".join(tables)
     print(text)
     if not quick:
         write_section("Growth", "PYTHONPATH=tests python tests/benchmarks/growth.py", text)
