@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
 from visioncal.estimator.closure import RATIO_PRIOR
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance_among, damped_step, gram, squared_lengths
 from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import FloatArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-8
 # Noise levels that change by less have settled, far below what is known of them.
@@ -134,11 +133,14 @@ def reduce(problem: Problem, state: State, linear: Linear, weights: FloatArray) 
         total[np.ix_(columns, columns)] += gram(every, weighted)
         if of[block.rows[0]] < 0:
             continue
-        units, at = np.unique(of[block.rows], return_inverse=True)
-        by_errors = linear.by_errors[block.rows]
+        order = np.argsort(of[block.rows], kind="stable")
+        units, first = np.unique(of[block.rows[order]], return_index=True)
+        by_errors = linear.by_errors[block.rows[order]]
         slopes = np.swapaxes(by_errors, 1, 2)
-        own[units] += _summed(slopes @ weights[block.rows] @ by_errors, at)
-        cross[np.ix_(units, np.arange(width), columns)] += _summed(slopes @ weighted, at)
+        pairs = slopes @ weights[block.rows[order]] @ by_errors
+        own[units] += np.add.reduceat(pairs, first)
+        of_both = np.ix_(units, np.arange(width), columns)
+        cross[of_both] += np.add.reduceat(slopes @ weighted[order], first)
     inverse, blind = _pseudo_inverse(own)
     answer = inverse @ cross
     total = total - gram(cross, answer)
@@ -152,12 +154,6 @@ def reduce(problem: Problem, state: State, linear: Linear, weights: FloatArray) 
         answer[:, :, :-1],
         inverse + blind,
     )
-
-
-def _summed(values: FloatArray, of: IntArray) -> FloatArray:
-    """Sums (m, a, b) values by what they are of, (m,) from 0 to u - 1, as (u, a, b)."""
-    adder = csr_array((np.ones(len(of)), (of, np.arange(len(of)))))
-    return np.asarray(adder @ values.reshape(len(of), -1)).reshape(-1, *values.shape[1:])
 
 
 def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
