@@ -101,9 +101,9 @@ def whole_units(data: Closure, stops: IntArray) -> IntArray:
     Returns:
         (m,) the unit of each view, numbered likewise.
     """
-    first, second = np.nonzero(np.triu(stops[:, None] == stops, 1))
-    if not len(first):
+    if len(np.unique(stops)) == len(stops):
         return stops
+    first, second = np.nonzero(np.triu(stops[:, None] == stops, 1))
     away = log(invert(data.camera[first]) @ data.camera[second])
     if data.camera_covariance is None:
         apart = np.median(np.sum(away.reshape(-1, 2, 3) ** 2, axis=2), axis=0)
