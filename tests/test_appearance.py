@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from visioncal.camera import intrinsics
 from visioncal.estimator.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
 from visioncal.estimator.corners import CornerStack
+from visioncal.estimator.poses import reproject
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.targets import corner_positions
 from visioncal.transforms import invert, log
@@ -53,6 +54,33 @@ def test_poses_and_cost_follow_lens_and_board_as_their_derivatives_say():
         if at != 9 + SCALE:
             # Of a symmetric difference the third order is left: small beside the second.
             assert cost == pytest.approx(pull, abs=0.02 * 2 * curvature * steps[at] ** 2)
+
+
+def test_the_poses_take_their_share_of_the_information_and_no_more():
+    cell = simulate(replace(FINE, views=6, seed=0))
+    found = compressed(cell)
+    positions = corner_positions(cell.options.target)
+    stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
+    now = reproject(stack, cell.options.camera, found.cam_from_target)
+    by_board = now.by_pose[:, :, 3:] @ board_basis(positions)[stack.ids]
+    by_shared = np.concatenate([now.by_intrinsics, by_board], axis=2)
+    left = 0.0
+    for view in range(6):
+        mine = stack.view_of == view
+        span = np.linalg.qr(np.concatenate(now.by_pose[mine]))[0]
+        rows = np.concatenate(by_shared[mine])
+        rows -= span @ (span.T @ rows)
+        left += rows.T @ rows
+    open_ones = np.flatnonzero(np.arange(len(left)) != 9 + SCALE)
+    among = np.ix_(open_ones, open_ones)
+    scale = np.sqrt(np.diag(left)[open_ones])
+    scale = scale[:, None] * scale
+    # The poses are at rest to 1e-8, and what they take is a million times what they leave.
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(found.shared_information[among] / scale),
+        np.linalg.eigvalsh(left[among] / scale),
+        rtol=1e-4,
+    )
 
 
 def test_the_corners_alone_do_not_tell_the_size():

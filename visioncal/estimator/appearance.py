@@ -220,8 +220,11 @@ def compress(
     by_shared = np.concatenate([now.by_intrinsics, by_board], axis=2)
     between = stack.products_by_view(now.by_pose, by_shared)
     answer = -covariance(fit.information) @ between
-    flat = by_shared.reshape(-1, by_shared.shape[2])
-    information = flat.T @ flat + np.einsum("vik,vij->kj", between, answer)
+    # What is left once the poses have followed, squared: never less than none, and as exact as the
+    # square of their error. A difference of two squares would magnify it a millionfold.
+    left = by_shared + now.by_pose @ answer[stack.view_of]
+    flat = left.reshape(-1, left.shape[2])
+    information = flat.T @ flat
     pull = flat.T @ now.residuals.reshape(-1)
     # A larger board farther away looks the same: what is left is rounding.
     if scales is not None:
