@@ -176,6 +176,22 @@ def test_features_that_were_touched_once_are_named():
     assert reason.startswith("The origin was touched once only")
 
 
+@pytest.mark.parametrize("chosen", [[0, 1, 3, 4], [0, 1, 3, 4, 6, 6]], ids=["four", "six"])
+def test_few_touches_that_agree_by_chance_are_not_believed(chosen):
+    kinds = tuple(KINDS[it] for it in chosen)
+    squares = []
+    for seed in range(100):
+        poses = touching(ON_FEATURES[chosen], np.random.default_rng(seed), NOISE_M)
+        frame = touched_fixture(rows_of(poses, kinds), tool())
+        error = away(frame.edge.matrix, FRAME)
+        squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
+    # Chi-square of six stays under 41, five sigmas, in all but one case of a million.
+    assert max(squares) < 41.0
+    exact = touching(ON_FEATURES[chosen], np.random.default_rng(0))
+    (reason,) = touched_fixture(rows_of(exact, kinds), tool()).verdict.reasons
+    assert "0.1 mm, which is assumed" in reason
+
+
 # --- What is wrong is named.
 
 

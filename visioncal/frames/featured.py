@@ -19,6 +19,9 @@ from visioncal.frames.measured import MeasuredPoints
 from visioncal.frames.verdicts import Doubt
 from visioncal.types import Mask
 
+# Touches of each feature twice leave so many numbers to spare. Fewer agree too well by chance to
+# tell the noise: a single one is within a tenth of its sigma in one fixture of twelve.
+_TELLING = 6
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
@@ -48,16 +51,18 @@ def featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Se
     if expected is None and len(measured) == len(FEATURE_KINDS):
         # One of each kind leaves nothing to tell the noise by.
         expected = TOUCH_NOISE_M
-    fitted = _fitted(fit_features(touches, expected), measured)
+    fitted = _fitted(fit_features(touches, expected), measured, setting)
     counts = ", ".join(f"{kinds.count(it)} {it}" for it in FEATURE_KINDS)
     return fixture_frame(
         fitted, kinds, f"{counts} touches", tuple(_doubts(fitted, kinds, setting)), {}, setting
     )
 
 
-def _fitted(fit: FeatureFit, measured: MeasuredPoints) -> Fitted:
+def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted:
     agreement, matrix = fit.agreement, fit.base_from_fixture
     noise_m = agreement.fit.sigma
+    if agreement.fit.freedom < _TELLING:
+        noise_m = max(noise_m, _expected_m(setting))
     agrees = agreement.agrees
     away = np.linalg.norm(fit.residuals, axis=1)
     return Fitted(
@@ -79,21 +84,27 @@ def _fitted(fit: FeatureFit, measured: MeasuredPoints) -> Fitted:
 
 def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Doubt]:
     once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
+    assumed = (
+        f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
+        "assumed: say --touch-noise-mm as it is."
+        if setting.touch_noise_m is None and fitted.noise_m == TOUCH_NOISE_M
+        else ""
+    )
     if len(once) == len(FEATURE_KINDS):
-        assumed = (
-            f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
-            "assumed: say --touch-noise-mm as it is."
-        )
         yield Doubt(
             "Three touches leave nothing to check the fixture with. Touch each feature once more, "
-            f"elsewhere.{'' if setting.touch_noise_m is not None else assumed}"
+            f"elsewhere.{assumed}"
         )
     elif once:
         verb = "was" if len(once) == 1 else "were"
         yield Doubt(
             f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks. "
-            "Touch again, elsewhere."
+            f"Touch again, elsewhere.{assumed}"
         )
+
+
+def _expected_m(setting: Setting) -> float:
+    return TOUCH_NOISE_M if setting.touch_noise_m is None else setting.touch_noise_m
 
 
 def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:
