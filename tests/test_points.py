@@ -38,7 +38,7 @@ from visioncal.verification.seeing import see_again
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 REFINED, AUTO = f'{LENS}intrinsics = "refine"\n', LENS
-SEEDS = 6
+SEEDS = 4
 
 
 def x_of(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
