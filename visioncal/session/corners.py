@@ -55,6 +55,10 @@ class CornerTable:
             None if self.sigmas_px is None else self.sigmas_px[rows],
         )
 
+    def without_targets(self) -> "CornerTable":
+        """The same corners, whose one target needs no name."""
+        return replace(self, targets=("",) * len(self))
+
     def fact(self) -> dict[str, object]:
         """What of it counts for the session's digest, free of how the numbers are spelt."""
         sigmas = np.zeros(0) if self.sigmas_px is None else self.sigmas_px

@@ -4,7 +4,7 @@ The cell is the root. Bases, fixed cameras, instruments and boards on the floor 
 on it; each flange hangs on its base by the robot; cameras, boards and points may hang on a flange.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -68,6 +68,17 @@ def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
     """
     if declaration.frames:
         _ = _Tree(declaration, tuple(views)).said
+
+
+def frames_of_kind(frames: Iterable[str], kind: str) -> tuple[str, ...]:
+    """The frames of a kind among some: `cam` and `cam_left` of cameras."""
+    bare = frame_name(kind, "")
+    return tuple(it for it in frames if it == bare or it.startswith(f"{bare}_"))
+
+
+def thing_name(frame: str, kind: str) -> str:
+    """What a frame's thing is called: `left` of `cam_left`; its kind, where it has no name."""
+    return frame.partition("_")[2] or kind
 
 
 def robots_between(frames: Mapping[str, str], first: str, second: str) -> tuple[str, ...]:

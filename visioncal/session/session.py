@@ -15,6 +15,7 @@ from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
 from visioncal.session.boards import COLUMN, read_targets
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
+from visioncal.session.choosing import Choice
 from visioncal.session.corners import (
     FILE,
     CornerTable,
@@ -32,6 +33,7 @@ from visioncal.session.kinds import check_kinds_named, is_seen, kind_warnings
 from visioncal.session.observations import Observation, observations_of, stop_warnings
 from visioncal.session.outside import outside_warnings
 from visioncal.session.saving import placed_files, write_folder
+from visioncal.session.selecting import select
 from visioncal.session.streams import (
     FOLDER,
     Stream,
@@ -175,6 +177,23 @@ class Session:
             robot_document=robot_document,
             corners=corners,
         )
+
+    def of(
+        self, camera: str | None = None, robot: str | None = None, target: str | None = None
+    ) -> "Session":
+        """Returns the session of one camera, one robot and one target of a whole cell.
+
+        It has the rows in which this camera saw this target, with the robot's poses of their stops.
+
+        Args:
+            camera: Its name, or its frame's; may be left out where only one fits.
+            robot: The robot that moves one of them before the other; likewise.
+            target: The target; likewise.
+
+        Raises:
+            DataError: There is no such thing, several are meant, or this robot does not part these.
+        """
+        return select(self, Choice(camera, robot, target))
 
     def with_streams(self, streams: Mapping[str, Stream]) -> "Session":
         """Returns the session with streams beside its views, in the order of their names.

@@ -1,4 +1,4 @@
-"""Whether a session is of one camera and one robot, as all but `visioncal align` need it."""
+"""Whether a session is of one camera and one robot, or of a whole cell."""
 
 from visioncal.errors import DataError
 from visioncal.files import some_of
@@ -7,32 +7,41 @@ from visioncal.session.frames import frame_name
 from visioncal.session.session import Session
 
 
+def is_whole_cell(session: Session) -> bool:
+    """Whether all of a session can only be adjusted together."""
+    return bool(_several(session))
+
+
 def check_one_of_each(session: Session) -> None:
     """Refuses a session with several cameras, robots or instruments, or boards on either side.
 
     Raises:
-        DataError: It is one for `visioncal align`.
+        DataError: It is one of a whole cell.
     """
-    several = {it: list(session.declaration.named(it)) for it in KINDS if it != "target"}
-    told = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
-    if told:
-        raise _for_align(session, f"has several {' and several '.join(told)}; this takes one")
-    if not session.declaration.frames or session.mount == "instrument":
-        return
-    boards = [frame_name("target", name) for name in session.declaration.named("target")]
-    moves = {it: session.frames[it].startswith("flange") for it in boards if it in session.frames}
-    amiss = [it for it, is_moved in moves.items() if is_moved == (session.mount == "eye-in-hand")]
-    if amiss:
-        raise _for_align(
-            session,
-            f"has its camera {session.mount} and {some_of(amiss)} on {session.frames[amiss[0]]}; "
-            f"this takes boards {'in the cell' if moves[amiss[0]] else 'on the flange'} alone",
+    if words := _several(session):
+        raise DataError(
+            f"session {session.name!r} {words}.",
+            culprits=["session.toml"],
+            next_step="Name one of each with --camera, --robot and --target, where the command has "
+            "them (in Python: Session.of); or adjust all of it together: visioncal calibrate "
+            "SESSION -o OUT.",
         )
 
 
-def _for_align(session: Session, words: str) -> DataError:
-    return DataError(
-        f"session {session.name!r} {words}.",
-        culprits=["session.toml"],
-        next_step="Adjust all of it together: visioncal align SESSION -o OUT.",
+def _several(session: Session) -> str:
+    """What makes a session that of a whole cell; empty where it is none."""
+    several = {it: list(session.declaration.named(it)) for it in KINDS if it != "target"}
+    told = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
+    if told:
+        return f"has several {' and several '.join(told)}; this takes one"
+    if not session.declaration.frames or session.mount == "instrument":
+        return ""
+    boards = [frame_name("target", name) for name in session.declaration.named("target")]
+    moves = {it: session.frames[it].startswith("flange") for it in boards if it in session.frames}
+    amiss = [it for it, is_moved in moves.items() if is_moved == (session.mount == "eye-in-hand")]
+    if not amiss:
+        return ""
+    return (
+        f"has its camera {session.mount} and {some_of(amiss)} on {session.frames[amiss[0]]}; "
+        f"this takes boards {'in the cell' if moves[amiss[0]] else 'on the flange'} alone"
     )

@@ -1,0 +1,193 @@
+"""Which camera, robot and target of a whole cell are meant, and whether one robot parts them."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+
+from visioncal.errors import DataError
+from visioncal.files import did_you_mean, some_of
+from visioncal.session.frames import frame_name, frames_of_kind, robots_between, thing_name
+from visioncal.types import Mount
+
+Part: TypeAlias = Literal["camera", "robot", "target"]
+PARTS: tuple[Part, ...] = get_args(Part)
+# What has to be clear where a camera looks at things of any kind, and where none looks.
+EYE: tuple[Part, ...] = ("camera", "robot")
+ARM: tuple[Part, ...] = ("robot",)
+LENS: tuple[Part, ...] = ("camera",)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A camera, a robot and a target by name; None where any will do or there is only one.
+
+    A name is that of the session's table, as `left`, or of the frame, as `cam_left`.
+    """
+
+    camera: str | None = None
+    robot: str | None = None
+    target: str | None = None
+
+    def __bool__(self) -> bool:
+        return any(it is not None for it in (self.camera, self.robot, self.target))
+
+    def of(self, part: Part) -> str | None:
+        """The name that was given of a part."""
+        return {"camera": self.camera, "robot": self.robot, "target": self.target}[part]
+
+
+# What is meant where there is one of each.
+ANY = Choice()
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """One camera, robot and target of a cell.
+
+    Attributes:
+        mount: Whether this robot carries the camera.
+        camera: The camera's frame; empty where none is needed.
+        robot: The robot's name in the session.
+        target: The target's frame; empty likewise.
+    """
+
+    mount: Mount
+    camera: str
+    robot: str
+    target: str
+
+    @property
+    def base(self) -> str:
+        """The frame of the robot's base."""
+        return frame_name("base", self.robot)
+
+    @property
+    def flange(self) -> str:
+        """The frame of the robot's flange."""
+        return frame_name("flange", self.robot)
+
+    def frame_of(self, part: Part) -> str:
+        """The frame that a part is named by: the robot's is its flange."""
+        return {"camera": self.camera, "robot": self.flange, "target": self.target}[part]
+
+
+def choose(
+    frames: Mapping[str, str],
+    choice: Choice,
+    needs: Collection[Part] = PARTS,
+    *,
+    label: str,
+    parted: bool = True,
+) -> Chosen:
+    """Finds the one camera, robot and target that are meant.
+
+    Args:
+        frames: What each frame of the cell hangs on.
+        choice: What is named.
+        needs: What has to be clear; of the rest, any that fits is taken, or none.
+        label: What the cell is called in messages.
+        parted: Whether the robot is to move camera and target before each other.
+
+    Raises:
+        DataError: There is no such thing, several are meant, or this robot does not part these.
+    """
+    known = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
+    named = {it: _named(known[it], it, name, label) for it in PARTS if (name := choice.of(it))}
+    options = [it for it in _options(frames, known, parted=parted) if all(map(it.frame_of, needs))]
+    fitting = [it for it in options if all(it.frame_of(p) == at for p, at in named.items())]
+    if not fitting:
+        raise _none_fits(frames, known, named, needs, label)
+    for part in PARTS:
+        meant = list(dict.fromkeys(it.frame_of(part) for it in fitting))
+        if part in needs and len(meant) > 1:
+            names = [thing_name(it, part) for it in meant]
+            raise DataError(
+                f"{label} has several {part}s ({some_of(names)}), and which is meant is not said.",
+                culprits=[f"--{part}"],
+                next_step=f"Name one: --{part} {names[0]}.",
+            )
+    return fitting[0]
+
+
+# What a part's frame begins with: a robot is known by its flange.
+_KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "target"}
+
+
+def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
+    """The frame of what is named."""
+    for frame in (name, frame_name(_KINDS[part], name)):
+        if frame in known:
+            return frame
+    names = [thing_name(it, part) for it in known]
+    raise DataError(
+        f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
+        culprits=[f"--{part}"],
+        next_step=did_you_mean(name, names),
+    )
+
+
+def _options(
+    frames: Mapping[str, str], known: Mapping[Part, Collection[str]], *, parted: bool
+) -> Iterator[Chosen]:
+    """All that go together, what has a target or a camera before what has none."""
+    for flange in known["robot"]:
+        robot = flange.partition("_")[2]
+        for camera in (*known["camera"], ""):
+            between = robots_between(frames, camera, frames[flange]) if camera else ()
+            if between not in ((), (robot,)):
+                continue
+            mount: Mount = "eye-in-hand" if between else "eye-to-hand"
+            for target in (*known["target"], ""):
+                both = camera and target and parted
+                if not both or robots_between(frames, camera, target) == (robot,):
+                    yield Chosen(mount if camera else "instrument", camera, robot, target)
+
+
+def _none_fits(
+    frames: Mapping[str, str],
+    known: Mapping[Part, Collection[str]],
+    named: Mapping[Part, str],
+    needs: Collection[Part],
+    label: str,
+) -> DataError:
+    """Says why nothing goes with what is named."""
+    culprits = [f"--{it}" for it in named]
+    for part in needs:
+        if not known[part]:
+            return DataError(f"{label} has no {part}.", culprits=[f"--{part}"])
+    only = {part: next(iter(it)) for part, it in known.items() if len(it) == 1} | dict(named)
+    camera, target, flange = (only.get(it) for it in ("camera", "target", "robot"))
+    robot = None if flange is None else thing_name(flange, "robot")
+    if camera and target and "target" in needs:
+        robots = robots_between(frames, camera, target)
+        names = " and ".join(it or "robot" for it in robots)
+        on = f"{camera} is on {frames[camera]} and {target} on {frames[target]}"
+        if not robots:
+            words = f"{on}, and no robot moves them before each other"
+            step = "Name a camera or a target that a robot carries."
+        elif len(robots) > 1:
+            words = f"{on}: robots {names} part them, and one is needed"
+            step = "Name a camera and a target of which one robot carries one."
+        else:
+            words = f"{on}: robot {names} parts them, and robot {robot} does not"
+            step = f"Name that robot: --robot {names}."
+        return DataError(f"{label}: {words}.", culprits=culprits, next_step=step)
+    if camera:
+        carrier = f"{camera} is on {frames[camera]}"
+        which = f"robot {robot} has no part in what it sees" if robot else "no robot parts it"
+        return DataError(
+            f"{label}: {carrier}, and {which}.",
+            culprits=culprits,
+            next_step="Name another robot, or another camera.",
+        )
+    pairs = [
+        f"{thing_name(it.camera, 'camera')} and {thing_name(it.target, 'target')} by robot "
+        f"{thing_name(it.flange, 'robot')}"
+        for it in _options(frames, known, parted=True)
+        if it.camera and it.target
+    ]
+    return DataError(
+        f"{label}: no robot parts a camera from a target as they are named.",
+        culprits=culprits,
+        next_step=f"These go together: {some_of(pairs)}." if pairs else "",
+    )

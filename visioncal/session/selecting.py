@@ -1,0 +1,139 @@
+"""A session of one camera, one robot and one target out of that of a whole cell."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from visioncal.session.boards import COLUMN as TARGET
+from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
+from visioncal.session.columns import SELECTORS, is_number
+from visioncal.session.document import KINDS
+from visioncal.session.kinds import is_seen, name_of, tells_robot
+from visioncal.session.observations import standing
+from visioncal.session.table import View
+
+if TYPE_CHECKING:
+    from visioncal.session.session import Session
+
+# What a camera or the air tells: all other numbers of a row are the robot's.
+_NOT_OF_ROBOTS = ("stamp_s", "ambient_c", "cft_", "meas_")
+
+
+def has_several(session: "Session") -> bool:
+    """Whether it has several cameras, robots, targets or instruments."""
+    return any(len(session.declaration.named(kind)) > 1 for kind in KINDS)
+
+
+def select(
+    session: "Session",
+    choice: Choice,
+    needs: Collection[Part] = PARTS,
+    *,
+    parted: bool = True,
+) -> "Session":
+    """Takes one camera, robot and target out of a session; see `Session.of`.
+
+    Args:
+        session: A session.
+        choice: What is meant.
+        needs: What has to be clear: where no camera is needed, the rows are those without images
+            that tell where the robot stood.
+        parted: Whether the robot is to move camera and target before each other.
+
+    Raises:
+        DataError: There is no such thing, several are meant, or this robot does not part these.
+    """
+    if not choice and not has_several(session):
+        return session
+    label = f"session {session.name!r}"
+    chosen = choose(session.frames, choice, needs, label=label, parted=parted)
+    if not has_several(session):
+        return session
+    if "camera" not in needs:
+        chosen = replace(chosen, camera="", target="")
+    rows = dict(_rows(session, chosen))
+    columns = tuple(it for it in session.columns if it not in (*SELECTORS, TARGET))
+    cells = [[_cell(row, told, it) for it in columns] for row, told in rows.values()]
+    table, target = session.corner_table, chosen.target.partition("_")[2]
+    models, boards = session.robot_documents, session.target_document
+    found = session.assemble(
+        _document(session, chosen),
+        columns,
+        cells,
+        session.images,
+        target_document=boards if boards is None or not session.targets else boards[target],
+        robot_document=models.get(chosen.robot),
+        corners=None if table is None else table.of_views(tuple(rows)).without_targets(),
+    )
+    others = {it or "robot" for it in session.robots if it != chosen.robot}
+    return found.with_streams({k: it for k, it in session.streams.items() if k not in others})
+
+
+def _rows(
+    session: "Session", chosen: Chosen
+) -> Iterator[tuple[int, tuple[View, Mapping[str, float]]]]:
+    """The rows that are meant, by view, with what their stop tells of the robot."""
+    declaration, stood = session.declaration, standing(session.declaration, session.views)
+    seen = {it.view.number: (it.seer, it.seen) for it in session.observations}
+    for view in session.views:
+        if chosen.camera:
+            mine = is_seen(view) and seen.get(view.number) == (chosen.camera, chosen.target)
+        else:
+            of = name_of(declaration, "robot", view)
+            mine = tells_robot(view) and not is_seen(view) and of == chosen.robot
+        if mine:
+            told = stood[view.number].get(chosen.robot)
+            yield view.number, (view, {} if told is None else told.numbers)
+
+
+def _cell(view: View, told: Mapping[str, float], column: str) -> str:
+    if is_number(column) and not column.startswith(_NOT_OF_ROBOTS):
+        return repr(float(told[column])) if column in told else ""
+    return view.cell(column)
+
+
+def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
+    """The content of session.toml, of what is meant alone."""
+    given, declaration = dict(session.document), session.declaration
+    for name in ("frames", "clocks", "prior", "mount", *KINDS, *(f"{it}s" for it in KINDS)):
+        given.pop(name, None)
+    given["mount"] = "eye-in-hand" if chosen.mount == "instrument" else chosen.mount
+    for kind, name in (
+        ("camera", chosen.camera.partition("_")[2]),
+        ("robot", chosen.robot),
+        ("target", chosen.target.partition("_")[2]),
+    ):
+        table = _table(session.document, kind, name)
+        if table is not None:
+            given[kind] = table
+    clock = declaration.clocks.get(chosen.camera.partition("_")[2])
+    if clock is not None:
+        given["clock"] = clock.model_dump(exclude_unset=True)
+    if prior := dict(_priors(session, chosen)):
+        given["prior"] = prior
+    return given
+
+
+def _table(document: Mapping[str, Any], kind: str, name: str) -> Any:  # noqa: ANN401 - TOML's
+    """A kind's table as the singular has it: the short forms of several are written out."""
+    several = document.get(f"{kind}s", {})
+    if name not in several:
+        return document.get(kind)
+    table = several[name]
+    if kind == "target":
+        return table if isinstance(table, str) else table["target"]
+    return {"model": table} if isinstance(table, str) else table
+
+
+def _priors(session: "Session", chosen: Chosen) -> Iterator[tuple[str, Any]]:
+    """What is known beforehand of the edges, by their names in the smaller session."""
+    short = {
+        chosen.base: "base",
+        chosen.flange: "flange",
+        chosen.camera: "cam",
+        chosen.target: "target",
+    }
+    for edge, prior in session.document.get("prior", {}).items():
+        ends = [short.get(it) for it in edge.split("_from_")]
+        if len(ends) == 2 and all(ends):
+            yield f"{ends[0]}_from_{ends[1]}", prior
