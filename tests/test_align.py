@@ -364,8 +364,10 @@ def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path
     out = tmp_path / "out"
     done = visioncal("calibrate", tmp_path / "session", "-o", out, "--json")
     assert done.status == 0
-    written = json.loads((out / "alignment.json").read_text())
+    written = json.loads((out / "calibration.json").read_text())
     assert written == json.loads(done.out)
+    aligned = json.loads((out / "alignment.json").read_text())
+    assert aligned["transforms"] == written["transforms"]
     assert set(written["transforms"]) == {
         "cell_from_cam_left",
         "cell_from_cam_right",

@@ -12,6 +12,7 @@ from aligned_cells import made_up_cell
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.exports import Selection, document, export
+from visioncal.session.choosing import Choice
 from visioncal.simulation import fisheye_camera, wide_camera
 from visioncal.stored import load_calibration, load_exportable
 from visioncal.transforms import invert
@@ -100,8 +101,11 @@ def test_a_bad_verdict_is_warned_of():
     assert not document(CELL, "ros", Selection("all")).warnings
 
 
-def test_what_needs_a_calibration_says_what_it_was_given(tmp_path):
+def test_what_needs_one_camera_takes_the_only_one_that_fits(tmp_path):
     CELL.save(tmp_path / "alignment.json")
     for path in (tmp_path, tmp_path / "alignment.json"):
-        with pytest.raises(DataError, match="holds the alignment of a whole cell"):
-            load_calibration(path)
+        found = load_calibration(path)
+        expected = CELL.between("base_b", "cam_top")
+        np.testing.assert_allclose(found.edges["base_from_cam"].matrix, expected.matrix)
+    with pytest.raises(DataError, match="robots a and b part them"):
+        load_calibration(tmp_path, Choice("hand"))

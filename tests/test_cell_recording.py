@@ -86,7 +86,12 @@ def test_frames_are_drawn_where_they_were(cell, session):
 def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path):
     found = true_alignment(cell, session)
     files = write_alignment(tmp_path / "out", session, found).files
-    assert [it.name for it in files] == ["alignment.json", "report.html", "recording.rrd"]
+    assert [it.name for it in files] == [
+        "calibration.json",
+        "alignment.json",
+        "report.html",
+        "recording.rrd",
+    ]
     recording = tmp_path / "out" / "recording.rrd"
     assert read_session(recording).digest() == session.digest()
     assert read_alignment(recording).document() == found.document()

@@ -244,13 +244,15 @@ def test_of_one_robot_what_its_camera_sees_is_in_the_cell(tmp_path):
     assert [tuple(it.robots) for it in session.observations] == [("",), ("",)]
 
 
-@pytest.mark.parametrize("use", [calibrate, touches_of])
-def test_what_takes_one_camera_and_robot_points_to_align(folder, use):
+def test_what_takes_one_camera_and_robot_says_how_one_is_chosen(folder):
+    session = Session.load(folder)
+    with pytest.raises(DataError, match=r"several robots \(a, b\)"):
+        touches_of(session)
     with pytest.raises(
         DataError, match=r"several cameras \(left, right\) and several robots"
     ) as caught:
-        use(Session.load(folder))
-    assert "visioncal align" in caught.value.next_step
+        calibrate(session)
+    assert "--robot" in caught.value.next_step
 
 
 def test_boards_on_either_side_of_one_camera_are_for_align(tmp_path):

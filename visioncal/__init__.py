@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from visioncal.version import __version__
 
 if TYPE_CHECKING:
-    from visioncal.alignment import align
+    from visioncal.alignment import align, calibrate
     from visioncal.calibration import Alignment, Calibration
     from visioncal.compensation import CalibratedArm, Corrected, correct
     from visioncal.errors import (
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from visioncal.frames.seen import place_seen
     from visioncal.frames.seen_frame import seen_frame
     from visioncal.frames.sight import Sight
-    from visioncal.pipeline import calibrate
     from visioncal.robot import Loads
     from visioncal.session import Session
     from visioncal.thermal import OnlineCompensator
@@ -57,7 +56,7 @@ _HOMES = {
     "Sight": "visioncal.frames.sight",
     "VisioncalError": "visioncal.errors",
     "align": "visioncal.alignment",
-    "calibrate": "visioncal.pipeline",
+    "calibrate": "visioncal.alignment",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.picks",

@@ -9,6 +9,8 @@ from scipy.special import chdtrc, fdtrc
 
 from visioncal.calibration import Calibration, CameraResult, Edge, VerdictStatus
 from visioncal.camera import intrinsics
+from visioncal.files import some_of
+from visioncal.session.choosing import ANY, Choice
 from visioncal.transforms import inverse_right_jacobian, invert, log, pose_difference
 from visioncal.types import Camera, FloatArray, Mount
 
@@ -115,7 +117,7 @@ class Comparison:
     """Two calibrations, side by side.
 
     Attributes:
-        mounts: How the camera is mounted in each.
+        mounts: How the camera is mounted in each; `whole cell` of one.
         verdicts: The verdict of each.
         same_session: Whether both come from the same recorded facts, so that they share their
             noise and are no independent measurements.
@@ -127,7 +129,7 @@ class Comparison:
         findings: What it means, in plain sentences.
     """
 
-    mounts: tuple[Mount, Mount]
+    mounts: tuple[str, str]
     verdicts: tuple[VerdictStatus, VerdictStatus]
     same_session: bool
     edges: tuple[EdgeChange, ...]
@@ -145,7 +147,14 @@ class Comparison:
         )
 
 
-def compare(a: Calibration, b: Calibration) -> Comparison:
+def compare(
+    a: Calibration,
+    b: Calibration,
+    *,
+    camera: str | None = None,
+    robot: str | None = None,
+    target: str | None = None,
+) -> Comparison:
     """Compares two calibrations as independent measurements of one cell.
 
     Each transform has two tests, of its rotation and of its translation, on the components of
@@ -161,18 +170,32 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
     Args:
         a: The first, against which the second is measured.
         b: The second.
+        camera: Which camera is meant, of a whole cell's. Two whole cells of which nothing is named
+            are compared by all transforms that both have.
+        robot: Which robot, likewise.
+        target: Which target, likewise.
 
     Returns:
         What differs, by how much, and whether noise explains it.
+
+    Raises:
+        DataError: There is no such thing, or one is of a whole cell and it is not clear what of it
+            is meant.
     """
+    choice = Choice(camera, robot, target)
+    if choice or a.cell is None or b.cell is None:
+        # The names are of what is of a whole cell; where neither is, they are refused.
+        neither = a.cell is None and b.cell is None
+        a, b = (it.chosen(choice if neither or it.cell is not None else ANY) for it in (a, b))
     names = [name for name in a.edges if name in b.edges]
     # Two tests a transform, and one of the lens.
     limit = FALSE_ALARMS / (2 * len(names) + 1)
     freedom = (_freedom(a), _freedom(b))
     edges = tuple(_edge_change(it, a.edges[it], b.edges[it], freedom, limit) for it in names)
+    levels = (_levels(a), _levels(b))
     lens = _lens_change(a.camera, b.camera, limit)
     return Comparison(
-        mounts=(a.mount, b.mount),
+        mounts=(_mount(a), _mount(b)),
         verdicts=(a.verdict.status, b.verdict.status),
         same_session=a.session_sha256 == b.session_sha256,
         edges=edges,
@@ -180,11 +203,26 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         only_in_b=tuple(name for name in b.edges if name not in a.edges),
         lens=lens,
         noise=tuple(
-            NoiseChange(name, a.noise.get(name), b.noise.get(name))
-            for name in {**a.noise, **b.noise}
+            NoiseChange(name, levels[0].get(name), levels[1].get(name))
+            for name in {**levels[0], **levels[1]}
         ),
         findings=tuple(_findings(a, b, edges, lens)),
     )
+
+
+def _mount(calibration: Calibration) -> str:
+    return calibration.mount if calibration.cell is None else "whole cell"
+
+
+def _levels(calibration: Calibration) -> Mapping[str, float]:
+    """The noise by name; of a whole cell, with what it is of before it."""
+    if calibration.cell is None:
+        return calibration.noise
+    return {
+        f"{of} {name}": it
+        for of, levels in calibration.cell.noise.items()
+        for name, it in levels.items()
+    }
 
 
 def _freedom(calibration: Calibration) -> int:
@@ -264,10 +302,13 @@ def _findings(
             "Both come from the same session and share its noise: their sigmas say nothing about "
             "the difference."
         )
-    if a.mount != b.mount:
+    changed = [it.name for it in edges if it.is_change]
+    if a.cell is not None:
+        yield _whole_finding(changed)
+    elif a.mount != b.mount:
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
     else:
-        yield _edge_finding(a.mount, [it.name for it in edges if it.is_change])
+        yield _edge_finding(a.mount, changed)
     if lens is not None and lens.is_change:
         yield (
             "The intrinsics differ: another camera, focus or zoom."
@@ -312,6 +353,14 @@ def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
     if board:
         return f"{_BOARD_MOVED[mount]}; the {sensor} did not: its calibration still holds."
     return "No transform changed: noise explains what differs."
+
+
+def _whole_finding(changed: Sequence[str]) -> str:
+    """Says which frames of a whole cell moved."""
+    if not changed:
+        return "No transform changed: noise explains what differs."
+    frames = [it.partition("_from_")[2] for it in changed]
+    return f"{some_of(frames)} moved, or what they hang on was redefined; the others did not."
 
 
 def to_document(comparison: Comparison) -> dict[str, Any]:

@@ -1,14 +1,14 @@
 """What has joined the result of an earlier calibration: written with it anew, or kept beside."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from visioncal.calibration import Calibration, Frame, FrameFile
 from visioncal.errors import DataError
 from visioncal.files import some_of
 from visioncal.frames.seen_frame import rests_on_camera
-from visioncal.outputs import CALIBRATION, Written, write_outputs
+from visioncal.outputs import CALIBRATION, Written, write_alignment, write_outputs
 from visioncal.pipeline import Run
 from visioncal.stored import FRAMES, load_stored
 
@@ -39,6 +39,9 @@ def rewrite(folder: Path, calibration: Calibration) -> Written:
             culprits=[str(folder)],
             next_step="Name the output folder that the result was loaded from.",
         )
+    if calibration.cell is not None:
+        cell = replace(calibration.cell, placed=calibration.frames)
+        return write_alignment(folder, stored.session, cell)
     run = Run(calibration, stored.evidence)
     return write_outputs(folder, stored.session, run, stored.note)
 

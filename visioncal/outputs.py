@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from visioncal.calibration import Alignment
+from visioncal.calibration import Alignment, Calibration
 from visioncal.dynamics import FILE as DYNAMICS
 from visioncal.dynamics import Run
 from visioncal.dynamics.planned import MotionPlan
@@ -93,7 +93,7 @@ def write_outputs(
             write_recording(path, session, run.calibration, run.evidence, layout)
 
         drawings[RECORDING] = record
-    return _write(folder, {CALIBRATION: run.calibration.save}, drawings)
+    return _write(folder, {CALIBRATION: run.calibration.save}, drawings, (ALIGNMENT,))
 
 
 def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], document: str) -> Written:
@@ -135,12 +135,12 @@ def refuse_calibration(folder: Path) -> None:
         )
 
 
-def write_alignment(folder: Path, session: Session, found: Alignment) -> Written:
+def write_alignment(folder: Path, session: Session | None, found: Alignment) -> Written:
     """Writes the alignment of a cell, its report and its recording into a folder, all at once.
 
     Args:
         folder: Where to; it is made where there is none.
-        session: What was aligned.
+        session: What was aligned; None where it was not kept, which leaves the recording out.
         found: The result.
 
     Returns:
@@ -155,13 +155,18 @@ def write_alignment(folder: Path, session: Session, found: Alignment) -> Written
 
         write_cell_report(path, found)
 
-    def record(path: Path) -> None:
-        from visioncal.recording import write_cell_recording
-        from visioncal.viewer.cells import cell_blueprint
+    drawings: dict[str, _Writer] = {REPORT: report}
+    if session is not None:
 
-        write_cell_recording(path, session, found, cell_blueprint(session, found))
+        def record(path: Path) -> None:
+            from visioncal.recording import write_cell_recording
+            from visioncal.viewer.cells import cell_blueprint
 
-    return _write(folder, {ALIGNMENT: found.save}, {REPORT: report, RECORDING: record})
+            write_cell_recording(path, session, found, cell_blueprint(session, found))
+
+        drawings[RECORDING] = record
+    results = {CALIBRATION: Calibration.whole(found).save, ALIGNMENT: found.save}
+    return _write(folder, results, drawings)
 
 
 def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> Written:

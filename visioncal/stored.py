@@ -1,6 +1,7 @@
 """Finds again what an earlier calibration has written."""
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,9 @@ from visioncal.dynamics import Identified
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import absence, read_bytes
-from visioncal.outputs import ALIGNMENT, CALIBRATION, RECORDING
+from visioncal.outputs import CALIBRATION, RECORDING
 from visioncal.session import Session
+from visioncal.session.choosing import ANY, ARM, PARTS, Choice, Part
 
 # What tells the folder of a session.
 _SESSION = "session.toml"
@@ -36,11 +38,27 @@ class Stored:
     note: str = ""
 
 
-def load_calibration(path: Path) -> Calibration:
-    """Loads a result.
+def load_calibration(
+    path: Path, choice: Choice = ANY, needs: Collection[Part] = PARTS
+) -> Calibration:
+    """Loads the result of one camera and one robot, or takes it out of that of a whole cell.
 
     Args:
         path: An output folder, its calibration.json, or a recording with a result.
+        choice: Which camera, robot and target of a whole cell are meant.
+        needs: What of the three has to be clear.
+
+    Raises:
+        DataError: There is none, it cannot be read, or it is not clear what is meant.
+    """
+    return load_result(path).chosen(choice, needs)
+
+
+def load_result(path: Path) -> Calibration:
+    """Loads a result, of one camera and one robot or of a whole cell.
+
+    Args:
+        path: As for `load_calibration`; or the alignment.json of a whole cell.
 
     Raises:
         DataError: There is none, or it cannot be read.
@@ -52,31 +70,35 @@ def load_calibration(path: Path) -> Calibration:
         except DataError as error:
             if _holds_frames(path):
                 raise _frames_alone(path) from error
-            if _is_cell(path):
-                raise _cell_alone(path) from error
             raise
     # The codec takes half a second to import, which a calibration.json need not wait for.
-    from visioncal.recording import read_calibration
+    from visioncal.recording import read_alignment, read_calibration
 
     calibration = read_calibration(path)
-    if calibration is None:
+    if calibration is not None:
+        return calibration
+    cell = read_alignment(path)
+    if cell is None:
         raise _uncalibrated(path, "the recording of a session")
-    return calibration
+    return Calibration.whole(cell)
 
 
-def load_placed(path: Path) -> Calibration | FrameFile:
+def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile:
     """Loads a result, or frames that belong to none.
 
     Args:
         path: As for `load_calibration`, or a file of frames, which its content tells, or a folder
             with one and no calibration.json.
+        robot: Which robot of a whole cell is meant.
 
     Raises:
         DataError: There is neither, or it cannot be read.
     """
     alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / FRAMES).is_file()
     file = path / FRAMES if alone else path
-    return FrameFile.load(file) if _holds_frames(file) else load_calibration(path)
+    if _holds_frames(file):
+        return FrameFile.load(file)
+    return load_calibration(path, Choice(robot=robot), ARM)
 
 
 def load_exportable(path: Path) -> Calibration | FrameFile | Alignment | Identified:
@@ -89,51 +111,21 @@ def load_exportable(path: Path) -> Calibration | FrameFile | Alignment | Identif
     Raises:
         DataError: There is none of them, or it cannot be read.
     """
-    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / DYNAMICS).is_file()
-    file = path / DYNAMICS if alone else path
+    alone = path.is_dir() and not (path / CALIBRATION).exists()
+    file = path / DYNAMICS if alone and (path / DYNAMICS).is_file() else path
     if "base" in _content(file) and "transforms" not in _content(file):
         return Identified.load(file)
-    return find_alignment(path) or load_placed(path)
-
-
-def find_alignment(path: Path) -> Alignment | None:
-    """Loads the alignment of a whole cell, where a path is of one.
-
-    Args:
-        path: An alignment.json, a folder with one and no calibration.json, or a recording.
-
-    Raises:
-        DataError: It is one that cannot be read.
-    """
-    if path.suffix.lower() == ".rrd":
-        from visioncal.recording import read_alignment
-
-        return read_alignment(path)
-    return Alignment.load(path) if _is_cell(path) else None
+    frames = path / FRAMES if alone else path
+    if _holds_frames(frames):
+        return FrameFile.load(frames)
+    found = load_result(path)
+    return found if found.cell is None else found.cell
 
 
 def _holds_frames(path: Path) -> bool:
     """Tells a file of frames by its content: every calibration has transforms."""
     document = _content(path)
     return "frames" in document and "transforms" not in document
-
-
-def _holds_cell(path: Path) -> bool:
-    """Tells the alignment of a cell by its content: a calibration has no reference."""
-    return {"reference", "transforms"} <= _content(path).keys()
-
-
-def _is_cell(path: Path) -> bool:
-    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / ALIGNMENT).is_file()
-    return alone or _holds_cell(path)
-
-
-def _cell_alone(path: Path) -> DataError:
-    return DataError(
-        f"{path} holds the alignment of a whole cell, and a calibration of one camera is needed.",
-        culprits=[str(path)],
-        next_step="Name the output folder of visioncal calibrate.",
-    )
 
 
 def _content(path: Path) -> dict[str, object]:
@@ -181,14 +173,14 @@ def load_stored(path: Path) -> Stored:
         DataError: There is no result, or it cannot be read. A recording that is missing beside a
             calibration.json, is damaged or belongs to another result is no error but noted.
     """
-    calibration = load_calibration(path)
+    calibration = load_result(path)
     if path.suffix.lower() == ".rrd":
         return _with_recording(calibration, path)
     recording = (path if path.is_dir() else path.parent) / RECORDING
     if not recording.is_file():
         return _alone(calibration, f"There is no {RECORDING} beside this result.")
     try:
-        recorded = load_calibration(recording)
+        recorded = load_result(recording)
         if to_document(recorded) != to_document(calibration):
             return _alone(calibration, f"The {RECORDING} beside this result holds another one.")
         return _with_recording(calibration, recording)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.alignment.arms import ARMS_ASKED, ArmsAsked, erring_arms
-from visioncal.alignment.cell import Cell, read_cell
+from visioncal.alignment.cell import Cell, read_cell, robot_key
 from visioncal.alignment.clocks import Clocks, set_clocks
 from visioncal.alignment.faults import (
     Version,
@@ -30,10 +30,13 @@ from visioncal.alignment.looking import Looked, look_around
 from visioncal.alignment.priors import prior_components
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
-from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Untied
+from visioncal.alignment.written import corner_residuals, fit_sections, pose_noise
+from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
+from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.targets import target_document
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, Progress
 
@@ -116,7 +119,7 @@ def alignment_of(
         robots={name: it.robot for name, it in solved.cell.tree.branches.items() if it.robot},
         edges={f"{parents[name]}_from_{name}": edge for name, edge in edges.items()},
         joint_covariance=spread[: 6 * len(edges), : 6 * len(edges)],
-        cameras=_cameras(solved, looked, spread),
+        cameras=_cameras(solved, looked, spread, len(edges)),
         noise=noise,
         sights=_sights(cell, solved),
         moved=moved,
@@ -132,7 +135,18 @@ def alignment_of(
             clocks.notes,
         ),
         details=_details(clocks, solved, spread),
+        arms=_arms(session),
+        targets={name or "target": target_document(it) for name, it in session.plates.items()},
+        stages=fit_sections(session, solved, spread, len(edges)),
     )
+
+
+def _arms(session: Session) -> dict[str, RobotResult]:
+    models = session.robot_documents
+    return {
+        robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
+        for name in session.robots
+    }
 
 
 def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
@@ -216,10 +230,14 @@ def _noise(solved: Solved) -> dict[str, dict[str, float]]:
     )
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=True):
         found[frame] = {**found.get(frame, {}), "level": level}
+    for frame, levels in pose_noise(solved).items():
+        found[frame] |= levels
     return found
 
 
-def _cameras(solved: Solved, looked: Looked, spread: FloatArray) -> dict[str, CameraResult]:
+def _cameras(
+    solved: Solved, looked: Looked, spread: FloatArray, edges: int
+) -> dict[str, CameraResult]:
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
         return {}
@@ -230,13 +248,18 @@ def _cameras(solved: Solved, looked: Looked, spread: FloatArray) -> dict[str, Ca
             found[name] = CameraResult(looks.camera(name), look.estimated)
             continue
         at = solved.columns_of(lens)
-        found[name] = CameraResult(looks.camera(name), look.estimated, spread[np.ix_(at, at)])
+        found[name] = CameraResult(
+            looks.camera(name),
+            look.estimated,
+            spread[np.ix_(at, at)],
+            spread[at, : 6 * edges],
+        )
     return found
 
 
 def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
     """What became of each observation, in the order of the session's rows."""
-    away, why = residuals(solved), reasons(solved)
+    away, why, corners = residuals(solved), reasons(solved), corner_residuals(solved)
     found = {
         row.view: Sight(
             row.view,
@@ -247,6 +270,7 @@ def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
             why.get(row.view, ""),
             float(mm),
             float(deg) if turned else None,
+            *corners.get(row.view, (None, None)),
         )
         for row, used, turned, (mm, deg) in zip(
             solved.cell.rows,

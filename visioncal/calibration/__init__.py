@@ -7,12 +7,14 @@ from visioncal.calibration.frame import Frame, FrameFile, Observation
 from visioncal.calibration.parts import (
     CameraResult,
     Rms,
+    RobotResult,
     SolverResult,
     Validation,
     Verdict,
     VerdictStatus,
     ViewResult,
 )
+from visioncal.calibration.picking import picked
 from visioncal.calibration.result import Calibration
 
 __all__ = [
@@ -25,6 +27,7 @@ __all__ = [
     "Moved",
     "Observation",
     "Rms",
+    "RobotResult",
     "Sight",
     "SolverResult",
     "Untied",
@@ -32,5 +35,6 @@ __all__ = [
     "Verdict",
     "VerdictStatus",
     "ViewResult",
+    "picked",
     "to_document",
 ]

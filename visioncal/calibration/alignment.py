@@ -1,7 +1,7 @@
 """The result of aligning a whole cell: every frame of it, with respect to every other."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, get_args
@@ -9,11 +9,11 @@ from typing import Any, Self, get_args
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.calibration.document import camera_document, read_camera
 from visioncal.calibration.edge import Edge, edge_document, read_covariance, read_edge
-from visioncal.calibration.forms import CAMERA, VERDICT, Form, check
-from visioncal.calibration.frame import present
-from visioncal.calibration.parts import CameraResult, Verdict, VerdictStatus
+from visioncal.calibration.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
+from visioncal.calibration.frame import Frame, present
+from visioncal.calibration.lens import camera_document, read_camera
+from visioncal.calibration.parts import CameraResult, RobotResult, Verdict, VerdictStatus
 from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.estimation.tree import Branch, Step, Tree
@@ -22,7 +22,6 @@ from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
 from visioncal.version import __version__
 
-SCHEMA = 1
 FILE = "alignment.json"
 _FORM: Form = {
     "created": str,
@@ -33,20 +32,9 @@ _FORM: Form = {
     "transforms": {"": {}},
     "cameras": {"": CAMERA},
     "noise": {"": {"": float}},
-    "observations": [
-        {
-            "view": int,
-            "stop": int,
-            "seer": str,
-            "seen": str,
-            "used": bool,
-            "reason?": str,
-            "residual_mm?": float,
-            "residual_deg?": float,
-        }
-    ],
-    "moved": [{"frame": str, "before": str, "shift_mm": float, "turn_deg": float, "rivals": [str]}],
-    "untied": [{"frame": str, "remedy": str}],
+    "observations": [{"stop": int, "seer": str, "seen": str, **VIEW}],
+    "moved": [MOVED],
+    "untied": [UNTIED],
     "weakest": str,
     "verdict": VERDICT,
     "details": {},
@@ -66,6 +54,8 @@ class Sight:
         reason: Why it was not used, in words; empty for a used one.
         residual_mm: How far it is from what the rest of the cell predicts [mm].
         residual_deg: The same in rotation [deg]; None where a place alone was read.
+        corners: How many corners were found in its image.
+        rms_px: Reprojection error through the whole chain of frames [px].
     """
 
     view: int
@@ -76,6 +66,8 @@ class Sight:
     reason: str = ""
     residual_mm: float | None = None
     residual_deg: float | None = None
+    corners: int | None = None
+    rms_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -131,6 +123,10 @@ class Alignment:
         weakest: The weakest link, in words.
         verdict: Whether to trust it.
         details: Further figures, as they stand on disk.
+        arms: The robots by name; one that has no name goes by `robot`.
+        targets: What was printed, by name as it is described.
+        placed: Tools and fixtures by the transform that places them, as `flange_a_from_tool`.
+        stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`.
     """
 
     session_name: str
@@ -149,6 +145,10 @@ class Alignment:
     weakest: str
     verdict: Verdict
     details: Mapping[str, Any] = field(default_factory=dict)
+    arms: Mapping[str, RobotResult] = field(default_factory=dict)
+    targets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    placed: Mapping[str, Frame] = field(default_factory=dict)
+    stages: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:
@@ -178,6 +178,13 @@ class Alignment:
         Raises:
             DataError: There is no such frame, or a robot's pose is needed.
         """
+        matrix, slope = self.way(first, second, poses)
+        return Edge(matrix, slope @ self.joint_covariance @ slope.T)
+
+    def way(
+        self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """The transform of `between`, (4, 4), and (6, 6 k) how it moves with all edges."""
         tree, poses = self._tree, poses or {}
         for frame in (first, second):
             if frame != tree.root and frame not in tree.branches:
@@ -197,7 +204,7 @@ class Alignment:
             if at is not None:
                 slope[:, 6 * at : 6 * at + 6] += moved
             rest = before
-        return Edge(rest, slope @ self.joint_covariance @ slope.T)
+        return rest, slope
 
     @property
     def _tree(self) -> Tree:
@@ -235,7 +242,7 @@ class Alignment:
             "cameras": {name: camera_document(it) for name, it in self.cameras.items()},
             "noise": {name: dict(it) for name, it in self.noise.items()},
             "observations": [present(vars(it)) for it in self.sights],
-            "moved": [{**vars(it), "rivals": list(it.rivals)} for it in self.moved],
+            "moved": moved_document(self.moved),
             "untied": [vars(it) for it in self.untied],
             "weakest": self.weakest,
             "verdict": {"status": self.verdict.status, "reasons": list(self.verdict.reasons)},
@@ -270,7 +277,7 @@ class Alignment:
             DataError: It is not an alignment of a known schema.
         """
         try:
-            return cls(**_fields(parse_stored(text, label)))
+            return cls.from_document(parse_stored(text, label))
         except DataError as error:
             raise error.within(label) from error
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -279,6 +286,30 @@ class Alignment:
                 culprits=[label],
                 next_step="Run visioncal align again.",
             ) from error
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Self:
+        """Reads what `document` built.
+
+        Raises:
+            LookupError, TypeError, ValueError, AttributeError: It is another.
+        """
+        return cls(**_fields(document))
+
+
+def is_alignment(document: Mapping[str, Any]) -> bool:
+    """Tells an alignment by its content: the calibration of one camera has no reference."""
+    return {"reference", "transforms"} <= document.keys()
+
+
+def moved_document(moved: Iterable[Moved]) -> list[dict[str, Any]]:
+    """Writes what moved."""
+    return [{**vars(it), "rivals": list(it.rivals)} for it in moved]
+
+
+def read_moved(document: Iterable[Mapping[str, Any]]) -> tuple[Moved, ...]:
+    """Reads what `moved_document` wrote."""
+    return tuple(Moved(**{**it, "rivals": tuple(it["rivals"])}) for it in document)
 
 
 def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -300,7 +331,7 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
         "cameras": {name: read_camera(it) for name, it in document["cameras"].items()},
         "noise": {name: dict(it) for name, it in document["noise"].items()},
         "sights": tuple(Sight(**it) for it in document["observations"]),
-        "moved": tuple(Moved(**{**it, "rivals": tuple(it["rivals"])}) for it in document["moved"]),
+        "moved": read_moved(document["moved"]),
         "untied": tuple(Untied(**it) for it in document["untied"]),
         "weakest": document["weakest"],
         "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),

@@ -2,22 +2,20 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, get_args
-
-import numpy as np
 
 from visioncal.calibration.edge import (
     edge_document,
     pose_document,
-    read_array,
     read_covariance,
     read_edge,
     read_pose,
 )
-from visioncal.calibration.forms import CALIBRATION, check
+from visioncal.calibration.forms import CALIBRATION, SCHEMA, check
 from visioncal.calibration.frame import frames_document, present, read_frames
+from visioncal.calibration.lens import camera_document, read_camera
 from visioncal.calibration.parts import (
-    CameraResult,
     Rms,
     SolverResult,
     Validation,
@@ -25,15 +23,15 @@ from visioncal.calibration.parts import (
     VerdictStatus,
     ViewResult,
 )
+from visioncal.calibration.whole import whole_document
 from visioncal.documents import Kinds, shown
 from visioncal.robot import Robot
-from visioncal.types import Camera, FloatArray, Mount
+from visioncal.types import Mount
 from visioncal.version import __version__
 
 if TYPE_CHECKING:
     from visioncal.calibration.result import Calibration
 
-SCHEMA = 1
 # What the fields hold beside numbers, by their names.
 KINDS = Kinds(
     re.compile("reasons?|method|status|level|name|source|created|mount|words|weight"),
@@ -47,6 +45,8 @@ KINDS = Kinds(
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
     """Builds the content of calibration.json; what was not computed is absent."""
+    if calibration.cell is not None:
+        return whole_document(replace(calibration.cell, placed=calibration.frames))
     camera, robot = calibration.camera, calibration.robot
     document: dict[str, Any] = {
         "schema": SCHEMA,
@@ -83,24 +83,6 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
 def _solver_document(result: SolverResult) -> dict[str, Any]:
     poses = {name: pose_document(pose) for name, pose in result.matrices.items()}
     return poses | present({"rms_mm": result.rms_mm, "rms_deg": result.rms_deg})
-
-
-def camera_document(result: CameraResult) -> dict[str, Any]:
-    """Writes a camera's intrinsics."""
-    camera = result.camera
-    return present(
-        {
-            "model": camera.model,
-            "resolution": list(camera.resolution),
-            "matrix": camera.matrix.tolist(),
-            "distortion": camera.distortion.tolist(),
-            "estimated": result.estimated,
-            "covariance": None if result.covariance is None else result.covariance.tolist(),
-            "edge_covariance": (
-                None if result.edge_covariance is None else result.edge_covariance.tolist()
-            ),
-        }
-    )
 
 
 def _validation_document(validation: Validation) -> dict[str, Any]:
@@ -175,26 +157,6 @@ def _solver(document: Mapping[str, Any]) -> SolverResult:
     return SolverResult(poses, document["rms_mm"], document.get("rms_deg"))
 
 
-def read_camera(document: Mapping[str, Any]) -> CameraResult:
-    """Reads what `camera_document` wrote.
-
-    Raises:
-        LookupError, TypeError, ValueError: The document is another.
-    """
-    width, height = document["resolution"]
-    return CameraResult(
-        Camera(
-            document["model"],
-            (int(width), int(height)),
-            read_array(document, "matrix", (4,)),
-            read_array(document, "distortion", (-1,)),
-        ),
-        document["estimated"],
-        read_covariance(document, "covariance", (-1, -1)) if "covariance" in document else None,
-        _edge_covariance(document),
-    )
-
-
 def _validation(document: Mapping[str, Any]) -> Validation:
     holdout = document.get("holdout")
     return Validation(
@@ -202,11 +164,3 @@ def _validation(document: Mapping[str, Any]) -> Validation:
         Rms(**_figures(document["held_out"])),
         None if holdout is None else Rms(**_figures(holdout)),
     )
-
-
-def _edge_covariance(document: Mapping[str, Any]) -> FloatArray | None:
-    if "edge_covariance" not in document:
-        return None
-    rows = np.asarray(document["edge_covariance"], dtype=float)
-    unknowns = 4 + len(document["distortion"])
-    return read_array(document, "edge_covariance", (unknowns, rows.shape[-1]))

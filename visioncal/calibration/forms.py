@@ -9,6 +9,8 @@ from typing import Any, TypeAlias
 # key, and keys that are not named are free.
 Form: TypeAlias = "type | list[Any] | Mapping[str, Any]"
 
+# Of all results of a calibration.
+SCHEMA = 1
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 _RMS: Form = {"mm": float, "deg?": float, "px?": float}
 VERDICT: Form = {"status": str, "reasons": [str]}
@@ -27,6 +29,15 @@ FRAME: Form = {
 }
 CAMERA: Form = {"resolution": [int], "model": str, "estimated": bool}
 _BOARD: Form = {"shape": {"": float}, "sigma": {"": float}, "estimated": [str], "bend_mm": float}
+VIEW: Mapping[str, Any] = {
+    "view": int,
+    "used": bool,
+    "reason?": str,
+    "corners?": int,
+    "rms_px?": float,
+    "residual_mm?": float,
+    "residual_deg?": float,
+}
 # Of the further stages, what is read without more ado.
 CALIBRATION: Form = MappingProxyType(
     {
@@ -36,17 +47,7 @@ CALIBRATION: Form = MappingProxyType(
         "solvers": {"": {"rms_mm": float, "rms_deg?": float}},
         "camera?": CAMERA,
         "noise": {"": float},
-        "views": [
-            {
-                "view": int,
-                "used": bool,
-                "reason?": str,
-                "corners?": int,
-                "rms_px?": float,
-                "residual_mm?": float,
-                "residual_deg?": float,
-            }
-        ],
+        "views": [VIEW],
         "rms": _RMS,
         "validation": {"method": str, "held_out": _RMS, "holdout?": _RMS},
         "verdict": VERDICT,
@@ -65,6 +66,46 @@ CALIBRATION: Form = MappingProxyType(
         },
         "elastic?": {"joints?": [{"compliance_rad_per_nm": float}], "weight_moments?": [[float]]},
         "thermal?": {"joints": [{}]},
+    }
+)
+MOVED: Form = {
+    "frame": str,
+    "before": str,
+    "shift_mm": float,
+    "turn_deg": float,
+    "rivals": [str],
+}
+UNTIED: Form = {"frame": str, "remedy": str}
+WHOLE: Form = MappingProxyType(
+    {
+        "created": str,
+        "session": {"name": str, "sha256": str},
+        "reference": str,
+        "tree": {"": str},
+        "transforms": {"": {}},
+        "cameras": {"": CAMERA},
+        "robots": {"": {}},
+        "targets": {"": {}},
+        "noise": {"": {"": float}},
+        "views": [
+            {
+                **VIEW,
+                "stop": int,
+                "robots": [str],
+                "camera?": str,
+                "instrument?": str,
+                "target?": str,
+                "point?": str,
+            }
+        ],
+        "moved": [MOVED],
+        "untied": [UNTIED],
+        "weakest": str,
+        "verdict": VERDICT,
+        "frames?": {"": FRAME},
+        "details": {},
+        "boards?": {"": _BOARD},
+        "joint_fit?": {"cameras": {"": [int]}, "targets": {"": [int]}, "covariance": [[float]]},
     }
 )
 

@@ -1,11 +1,12 @@
 """What a calibration is made of, beside its transforms."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
 
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.robot import Robot
 from visioncal.types import Camera, FloatArray
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
@@ -48,6 +49,19 @@ class CameraResult:
     estimated: bool
     covariance: FloatArray | None = None
     edge_covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RobotResult:
+    """A robot of a whole cell.
+
+    Attributes:
+        model: Its nominal model, where that is known.
+        stages: One document for each further stage that ran on it, by name, as `kinematics`.
+    """
+
+    model: Robot | None = None
+    stages: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

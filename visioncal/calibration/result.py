@@ -1,7 +1,7 @@
 """The result of a calibration."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +10,8 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.calibration.alignment import FILE as ALIGNMENT
+from visioncal.calibration.alignment import Alignment, is_alignment
 from visioncal.calibration.document import KINDS, fields_from_document, to_document
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame
@@ -21,10 +23,13 @@ from visioncal.calibration.parts import (
     Verdict,
     ViewResult,
 )
+from visioncal.calibration.selecting import selected_fields, whole_fields
+from visioncal.calibration.whole import is_whole, read_whole
 from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
 from visioncal.robot import Loads, Robot, bent_joints
+from visioncal.session.choosing import PARTS, Choice, Part
 from visioncal.thermal import ThermalModel
 from visioncal.types import FloatArray, Mount
 
@@ -50,6 +55,8 @@ class Calibration:
         robot: The nominal robot model, where the session names a known one.
         frames: Tools and fixtures by the transform that places them, as `flange_from_tool`.
         stages: One document for each further stage that ran, by name.
+        cell: The whole cell that it stands for, whose frames `edges` places; None for one camera,
+            one robot and their targets. What is of one camera or robot, `of` takes out of it.
     """
 
     session_name: str
@@ -68,6 +75,51 @@ class Calibration:
     robot: Robot | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
     stages: Mapping[str, Any] = field(default_factory=dict)
+    cell: Alignment | None = None
+
+    @classmethod
+    def whole(cls, cell: Alignment) -> Self:
+        """The calibration that stands for a whole cell."""
+        return cls(**whole_fields(cell))
+
+    def of(
+        self, camera: str | None = None, robot: str | None = None, target: str | None = None
+    ) -> Self:
+        """Returns the calibration of one camera, one robot and one target of a whole cell.
+
+        Both transforms follow through the cell's frames, with the covariance that all of it gives
+        them. Where there is one of each, it is the calibration itself.
+
+        Args:
+            camera: Its name, or its frame's; may be left out where only one fits.
+            robot: The robot that moves camera and target before each other; likewise.
+            target: The target; likewise.
+
+        Raises:
+            DataError: There is no such thing, several are meant, or this robot does not part these.
+        """
+        return self.chosen(Choice(camera, robot, target))
+
+    def chosen(self, choice: Choice, needs: Collection[Part] = PARTS) -> Self:
+        """As `of`, for what needs to know no more than some of the three.
+
+        Args:
+            choice: What is named.
+            needs: What has to be clear; of the rest, any that fits is taken, or none.
+
+        Raises:
+            DataError: See `of`.
+        """
+        if self.cell is not None:
+            return type(self)(**selected_fields(self.cell, choice, needs))
+        if choice:
+            raise DataError(
+                f"calibration {self.session_name!r} is of one camera and one robot, which have no "
+                "names.",
+                culprits=[f"--{it}" for it in PARTS if choice.of(it)],
+                next_step="Leave their names out.",
+            )
+        return self
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:
@@ -143,7 +195,9 @@ class Calibration:
         if arm is None:
             raise DataError(
                 "this calibration holds no robot model.",
-                next_step="Name one in the session's [robot] table and calibrate again.",
+                next_step="Name one in the session's [robot] table and calibrate again."
+                if self.cell is None
+                else "It is of a whole cell: take one robot out of it with of(robot=...).",
             )
         return arm.base_from_flange(
             bent_joints(arm, q, self.compliance, loads, self.weight_moments)
@@ -213,13 +267,17 @@ class Calibration:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads a calibration.json, or the one in a folder.
+        """Reads a calibration.json or an alignment.json, or the one in a folder.
 
         Raises:
             DataError: The file is missing or is not a calibration of a known schema.
         """
         file = Path(path)
-        file = file / "calibration.json" if file.is_dir() else file
+        if file.is_dir():
+            before = file / ALIGNMENT
+            file = file / "calibration.json"
+            # A cell that was aligned by an older version.
+            file = before if before.is_file() and not file.exists() else file
         return cls.from_json(read_bytes(file), str(file))
 
     @classmethod
@@ -234,6 +292,11 @@ class Calibration:
             DataError: It is not a calibration of a known schema.
         """
         try:
+            document = parse_stored(text, label)
+            if is_whole(document):
+                return cls.whole(read_whole(document))
+            if is_alignment(document):
+                return cls.whole(Alignment.from_document(document))
             read = cls(**fields_from_document(parse_stored(text, label, KINDS)))
             # What is read of further stages when it is asked for: here, errors are the file's.
             _ = read.calibrated_robot, read.compliance, read.weight_moments

@@ -1,4 +1,4 @@
-"""`visioncal align`, and what `calibrate` does with one robot and several cameras."""
+"""`visioncal align`, and what `calibrate` does with a whole cell."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,7 @@ from visioncal.alignment import ArmsAsked, align
 from visioncal.calibration import Alignment
 from visioncal.cli.console import messages, print_verdict, shown_progress, tell_written
 from visioncal.figures import figure
+from visioncal.joining import leftover
 from visioncal.outputs import write_alignment
 from visioncal.session import Session
 
@@ -34,24 +35,31 @@ def align_command(
 ) -> None:
     """Put a whole cell in one frame: several robots, cameras and boards, adjusted together.
 
-    Writes alignment.json (every frame with its covariance, each robot's and camera's noise, what
-    moved, and every observation that disagrees), report.html and recording.rrd. Exit status 0:
+    Writes calibration.json (every frame with its covariance, each robot's and camera's noise, what
+    moved, and every observation that disagrees), the same in the older form of alignment.json,
+    report.html and recording.rrd. calibrate does the same with a whole cell. Exit status 0:
     there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
     leave a frame open.
     """
-    align_into(Session.load(session), out, arms=arms, as_json=as_json)
-
-
-def align_into(session: Session, out: Path, *, arms: ArmsAsked = "reported", as_json: bool) -> None:
-    """Aligns a session's cell, writes the result into a folder and tells of it."""
-    with shown_progress(quiet=as_json) as told:
-        result = align(session, arms=arms, progress=told)
-    written = write_alignment(out, session, result)
+    found = align_into(Session.load(session), out, arms=arms, quiet=as_json)
     if as_json:
-        typer.echo(json.dumps(result.document(), indent=2))
-    else:
+        typer.echo(json.dumps(found.document(), indent=2))
+
+
+def align_into(session: Session, out: Path, *, arms: ArmsAsked, quiet: bool) -> Alignment:
+    """Aligns a session's cell, writes the result into a folder and tells of it."""
+    left = leftover(out)
+    with shown_progress(quiet=quiet) as told:
+        result = align(session, arms=arms, progress=told)
+    if left is not None:
+        left.keep()
+    written = write_alignment(out, session, result)
+    if not quiet:
         _tell(result)
-    tell_written(written, quiet=as_json)
+    if left is not None:
+        messages().print(escape(left.words))
+    tell_written(written, quiet=quiet)
+    return result
 
 
 def _tell(result: Alignment) -> None:

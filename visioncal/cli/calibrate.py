@@ -7,7 +7,9 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from visioncal.alignment import arms_asked
 from visioncal.calibration import to_document
+from visioncal.calibration.whole import whole_document
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
 from visioncal.cli.pointing import naming, told_of
@@ -16,6 +18,7 @@ from visioncal.outputs import write_outputs
 from visioncal.pipeline import run
 from visioncal.robot import Convention
 from visioncal.session import Session
+from visioncal.session.single import is_whole_cell
 from visioncal.types import SolverName
 
 
@@ -53,12 +56,16 @@ def calibrate_command(
     Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
     earlier result there are kept in frames.json. Exit status 0: there is a result, with a verdict;
     2: the input or the motion cannot give one, and an existing folder stays as it was; 1: drawing
-    the report or the recording failed, and calibration.json is there. One robot with several
-    cameras is put in one frame, as align does it.
+    the report or the recording failed, and calibration.json is there. Several cameras or robots are
+    solved together, in one frame; other commands take one of each out of that result (--camera,
+    --robot, --target).
     """
     loaded = Session.load(session)
-    if len(loaded.cameras) > 1 and len(loaded.robots) == 1:
-        align_into(loaded, out, as_json=as_json)
+    if is_whole_cell(loaded):
+        arms = arms_asked(solver, level, convention)
+        document = whole_document(align_into(loaded, out, arms=arms, quiet=as_json))
+        if as_json:
+            typer.echo(json.dumps(document, indent=2))
         return
     left = leftover(out)
     with naming(session), shown_progress(quiet=as_json) as told:

@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.calibration import Calibration
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
 from visioncal.compensation.arms import CalibratedArm, predicted_sigma_mm
@@ -19,6 +20,7 @@ from visioncal.errors import DataError
 from visioncal.figures import figure
 from visioncal.files import check_free, did_you_mean, some_of, write_atomically
 from visioncal.robot import Loads
+from visioncal.session.choosing import ARM, EYE, Choice
 from visioncal.session.columns import no_celsius
 from visioncal.stored import load_calibration
 from visioncal.transforms import invert
@@ -93,6 +95,9 @@ def correct_command(
             "whose drift was calibrated; else as warm as it was when its session began.",
         ),
     ] = None,
+    camera: CameraName = None,
+    robot: RobotName = None,
+    target: TargetName = None,
     skip: Annotated[
         bool,
         typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
@@ -104,7 +109,9 @@ def correct_command(
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
-    known = _warm(load_calibration(calibration), temperatures)
+    needs = EYE if tool is not None and tool.removeprefix(_TOOLS) == "cam" else ARM
+    chosen = load_calibration(calibration, Choice(camera, robot, target), needs)
+    known = _warm(chosen, temperatures)
     arm = CalibratedArm.of(known)
     written_to = None if out is None or out == Path("-") else out
     if written_to is not None:

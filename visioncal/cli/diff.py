@@ -8,11 +8,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.compare import Comparison, LensChange, Significance, compare, to_document
-from visioncal.stored import load_calibration
+from visioncal.stored import load_result
 
 # Under a nanometre and a micro-degree lies rounding.
 _DECIMALS = 6
+_LEAST_WIDTH = 110
 _WHOLE_PERCENT, _LEAST_PERCENT = 10.0, 0.01
 
 
@@ -21,13 +23,18 @@ def diff_command(
         Path, typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd).")
     ],
     second: Annotated[Path, typer.Argument(help="The one to compare with it.")],
+    camera: CameraName = None,
+    robot: RobotName = None,
+    target: TargetName = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
 ) -> None:
     """Tell what changed between two calibrations, and what is only noise.
 
     Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
     """
-    comparison = compare(load_calibration(first), load_calibration(second))
+    comparison = compare(
+        load_result(first), load_result(second), camera=camera, robot=robot, target=target
+    )
     if as_json:
         typer.echo(json.dumps(to_document(comparison), indent=2))
         return
@@ -36,6 +43,8 @@ def diff_command(
 
 def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
     console = Console(highlight=False, markup=False, soft_wrap=True)
+    # Of whole cells, names are long: none is cut.
+    console.width = max(console.width, _LEAST_WIDTH)
     for order, path, mount, verdict in zip(
         ("first", "second"), paths, comparison.mounts, comparison.verdicts, strict=True
     ):

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages
 from visioncal.errors import DataError
 from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
@@ -70,10 +71,9 @@ def export_command(
         str | None,
         typer.Option("--hash", help="ur-kinematics: the hash that ur_calibration extracts."),
     ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option("--camera", help="Which camera of an aligned cell, in a format of lenses."),
-    ] = None,
+    camera: CameraName = None,
+    robot: RobotName = None,
+    target: TargetName = None,
     onto: Annotated[
         Path | None,
         typer.Option(
@@ -104,6 +104,8 @@ def export_command(
         calibration_hash,
         kept,
         camera,
+        robot,
+        target,
     )
     written = document(load_exportable(source), to, selection)
     for it in written.warnings:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from visioncal.calibration import Calibration
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.convert_options import (
     JointColumns,
     JointUnit,
@@ -40,6 +41,7 @@ from visioncal.formats.touches import read_nominal, read_touches
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.measured import NO_TOOL, Tool
 from visioncal.frames.naming import transform_name
+from visioncal.session.choosing import ARM, EYE, Choice
 from visioncal.stored import load_placed
 
 
@@ -80,6 +82,9 @@ def fixture_command(
     joint_columns: JointColumns = None,
     joint_unit: JointUnit = "rad",
     robot_model: RobotModel = None,
+    camera: CameraName = None,
+    robot: RobotName = None,
+    target: TargetName = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -91,7 +96,7 @@ def fixture_command(
     with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
     the reason given.
     """
-    place = Place.of(transform_name("fixture", name), calibration, out, force=force)
+    name = transform_name("fixture", name)
     drawing = None if cad is None else read_nominal(cad, cad_unit)
     for_touches = touch_options(
         robot_columns,
@@ -104,16 +109,22 @@ def fixture_command(
     )
     session = image_session(touches, {"--tool": tool, **for_touches})
     if session is not None:
-        frame = frame_by_images(session, place, "fixture", point, drawing, quiet=as_json)
+        choice = Choice(camera, robot, target)
+        place = Place.of(name, calibration, out, Choice(camera, robot), EYE, force=force)
+        frame = frame_by_images(
+            session, place, "fixture", point, drawing, choice=choice, quiet=as_json
+        )
         tell(place, frame, place.keep(frame), as_json=as_json)
         return
     refuse_given({"--point-mm": point}, "touches say where the fixture's origin is")
-    touched_with = _tool(tool, place.calibration)
+    refuse_given({"--camera": camera, "--target": target}, "touches need no camera")
+    place = Place.of(name, calibration, out, Choice(robot=robot), ARM, force=force)
+    touched_with = _tool(tool, place.calibration, robot)
     wishes = touch_wishes(
         robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
     )
     frame = touched_fixture(
-        read_touches(touches, wishes, positions=touched_with is None),
+        read_touches(touches, wishes, robot, positions=touched_with is None),
         touched_with,
         drawing,
         place.calibration,
@@ -123,12 +134,13 @@ def fixture_command(
     tell(place, frame, place.keep(frame), as_json=as_json)
 
 
-def _tool(said: str | None, calibration: Calibration | None) -> Tool | None:
+def _tool(said: str | None, calibration: Calibration | None, robot: str | None) -> Tool | None:
     """Finds the tool that the points were touched with.
 
     Args:
         said: A name, a file, both with a colon between, or `none`; None for the only one.
         calibration: What is known of the cell.
+        robot: Which robot of a whole cell is meant.
 
     Returns:
         The tool; None where the poses are of the tip itself.
@@ -145,9 +157,9 @@ def _tool(said: str | None, calibration: Calibration | None) -> Tool | None:
         return Tool.among(known, "The calibration", said)
     path, _, name = said.rpartition(":")
     if Path(said).exists():
-        return Tool.among(load_placed(Path(said)).frames, said, None)
+        return Tool.among(load_placed(Path(said), robot).frames, said, None)
     if path and Path(path).exists():
-        return Tool.among(load_placed(Path(path)).frames, path, name)
+        return Tool.among(load_placed(Path(path), robot).frames, path, name)
     if known:
         return Tool.among(known, "The calibration", said)
     raise DataError(

@@ -1,6 +1,7 @@
 """What the commands that place a frame share: options, where the frame goes, how it is told."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -10,6 +11,7 @@ from rich.markup import escape
 
 from visioncal.calibration import Calibration, Frame, FrameFile
 from visioncal.calibration.frame import frames_document
+from visioncal.calibration.selecting import placed_name
 from visioncal.cli.console import messages, print_verdict, tell_written
 from visioncal.cli.convert_options import names_in
 from visioncal.errors import DataError
@@ -18,7 +20,8 @@ from visioncal.formats import PoseWishes, Wishes
 from visioncal.joining import rewrite
 from visioncal.outputs import RECORDING, Written
 from visioncal.robot import Robot, load_robot
-from visioncal.stored import load_calibration
+from visioncal.session.choosing import PARTS, Choice, Part
+from visioncal.stored import load_result
 from visioncal.transforms import pose_difference
 
 CalibrationOption: TypeAlias = Annotated[
@@ -56,26 +59,54 @@ class Place:
 
     Attributes:
         name: The transform's name.
-        calibration: What is known of the cell; None for nothing.
+        calibration: What is known of the camera and the robot; None for nothing.
+        result: The result that it was taken out of, of a whole cell or itself.
         folder: The output folder that the frame joins; None where it does not.
         file: The file of frames that it goes into; None likewise.
     """
 
     name: str
     calibration: Calibration | None
+    result: Calibration | None
     folder: Path | None
     file: Path | None
 
     @classmethod
-    def of(cls, name: str, known: Path | None, out: Path | None, *, force: bool) -> "Place":
+    def of(
+        cls,
+        name: str,
+        known: Path | None,
+        out: Path | None,
+        choice: Choice,
+        needs: Sequence[Part],
+        *,
+        force: bool,
+    ) -> "Place":
         """Finds out what is known and where the frame will go, before anything is computed.
+
+        Args:
+            name: The transform's name with one camera and one robot.
+            known: The result that it joins, or that is known.
+            out: A file of frames for it.
+            choice: Which camera and robot of a whole cell are meant.
+            needs: What of them has to be clear.
+            force: Whether a frame of that name is replaced.
 
         Raises:
             DataError: A frame of that name is there, or the place cannot take one.
         """
-        calibration = None if known is None else load_calibration(known)
+        result = None if known is None else load_result(known)
+        calibration = None if result is None else result.chosen(choice, needs)
+        if result is None and choice:
+            raise DataError(
+                "Names of cameras and robots are those of a whole cell, and none is named.",
+                culprits=[f"--{it}" for it in PARTS if choice.of(it)],
+                next_step="Name its output folder with -c, or leave them out.",
+            )
+        if result is not None and result.cell is not None:
+            name = placed_name(result.cell, choice, needs, name)
         folder = None if known is None or out is not None else _folder(known)
-        place = cls(name, calibration, folder, out)
+        place = cls(name, calibration, result, folder, out)
         place._check_names()
         if not force and (there := place._there()) is not None:
             raise DataError(
@@ -89,7 +120,7 @@ class Place:
         """The frames that are there already."""
         if self.file is not None:
             return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
-        return {} if self.calibration is None else dict(self.calibration.frames)
+        return {} if self.result is None else dict(self.result.frames)
 
     def _there(self) -> Path | None:
         """The place that has a frame of this name already."""
@@ -111,10 +142,10 @@ class Place:
         if self.file is not None:
             FrameFile(self._frames() | {self.name: frame}).save(self.file)
             return Written((self.file,))
-        if self.folder is None or self.calibration is None:
+        if self.folder is None or self.result is None:
             return Written(())
-        frames = {**self.calibration.frames, self.name: frame}
-        return rewrite(self.folder, replace(self.calibration, frames=frames))
+        frames = {**self.result.frames, self.name: frame}
+        return rewrite(self.folder, replace(self.result, frames=frames))
 
 
 def _folder(known: Path) -> Path:
@@ -204,7 +235,7 @@ def tell(place: Place, frame: Frame, written: Written, *, as_json: bool) -> None
 
 
 def _tell_before(place: Place, frame: Frame) -> None:
-    before = None if place.calibration is None else place.calibration.frames.get(place.name)
+    before = None if place.result is None else place.result.frames.get(place.name)
     if before is not None:
         mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
         messages().print(

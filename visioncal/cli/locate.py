@@ -12,6 +12,7 @@ from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.calibration import Calibration
+from visioncal.cli.choosing import CameraName, RobotName
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.planes import FORMS, plane_of
@@ -29,7 +30,9 @@ from visioncal.frames.picks import locate_views
 from visioncal.frames.sighting import check_mount, pose_of
 from visioncal.pipeline.known import by_reason
 from visioncal.session import Session, View
-from visioncal.stored import load_calibration
+from visioncal.session.choosing import EYE, Choice
+from visioncal.session.selecting import has_several, select
+from visioncal.stored import load_result
 from visioncal.targets import target_from_document
 from visioncal.types import FloatArray, Target
 
@@ -82,9 +85,11 @@ def locate_command(
         str | None,
         typer.Option(
             help="What to look for, instead of the session's own: a name in targets/, a .toml, or "
-            "in one word as marker_DICT_4X4_50_10_48mm."
+            "in one word as marker_DICT_4X4_50_10_48mm; or one of a whole cell's, as floor."
         ),
     ] = None,
+    camera: CameraName = None,
+    robot: RobotName = None,
     view: Annotated[
         int | None,
         typer.Option(help="Which of the session's views; else all that show the target."),
@@ -109,8 +114,15 @@ def locate_command(
     It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
     reason given.
     """
-    known = _calibration(calibration)
-    session = _session(source)
+    result, session = _result(calibration), _session(source)
+    several = session is not None and has_several(session)
+    if session is not None and several:
+        own = target in session.plates
+        session = select(session, Choice(camera, robot, target if own else None), parted=False)
+        target = None if own else target
+    # Names may be of the session alone.
+    named = several and result.cell is None
+    known = result if named else result.chosen(Choice(camera, robot), EYE)
     if session is not None:
         refuse_given({"--pose": pose}, "the session has the poses of its views")
     else:
@@ -126,7 +138,7 @@ def locate_command(
     else:
         refuse_given({"--plane": plane, "--plane-sigma-mm": plane_sigma}, "it is for --pixel")
         origin_m = 1e-3 * np.array(numbers_in(point or "0,0,0", "--point-mm", "x,y,z"))
-        wanted = None if target is None else _target(target)
+        wanted = None if target is None else _target(target, result)
         if session is not None:
             shown = _chosen(session, view)
             if wanted is not None and any(it.has_corners for it in shown):
@@ -143,14 +155,14 @@ def locate_command(
     _tell(found, as_json=as_json)
 
 
-def _calibration(path: Path | None) -> Calibration:
+def _result(path: Path | None) -> Calibration:
     if path is None:
         raise DataError(
             "locate: the camera's calibration (-c) is needed.",
             culprits=["-c"],
             next_step="Name the output folder of visioncal calibrate.",
         )
-    return load_calibration(path)
+    return load_result(path)
 
 
 def _session(source: Path | None) -> Session | None:
@@ -286,7 +298,9 @@ def _by_image(
     return (_Found(name, {"image": name}, located),)
 
 
-def _target(words: str) -> Target:
+def _target(words: str, result: Calibration) -> Target:
+    if result.cell is not None and words in result.cell.targets:
+        return target_from_document(result.cell.targets[words], words)
     return target_from_document(described_target(words), Path(words).stem)
 
 

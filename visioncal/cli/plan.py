@@ -16,6 +16,7 @@ from visioncal.cli.planned_cell import (
     begun_session,
     box_of,
     cell_of,
+    chosen_part,
     find_source,
     floor_of,
 )
@@ -102,7 +103,7 @@ def plan_command(
         tuple(box_of(it) for it in boxes or ()),
     )
     wanted = purpose_of(purpose, "--for")
-    start = find_source(source)
+    start, words = chosen_part(find_source(source), words)
     wish = None if wish_mm is None and wish_deg is None else Wish(wish_mm, wish_deg)
     with shown_progress(quiet=as_json) as told:
         cell, begun = _begin(start, words, add, stops, told)

@@ -20,7 +20,9 @@ from visioncal.planning.recorded import Begun, Guess, begin, so_far
 from visioncal.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
-from visioncal.stored import load_stored
+from visioncal.session.choosing import ANY, LENS, Choice
+from visioncal.session.selecting import has_several, select
+from visioncal.stored import load_calibration, load_stored
 from visioncal.targets import target_from_document
 from visioncal.transforms import compose
 from visioncal.types import Camera, FloatArray, Mount, Progress, Target
@@ -95,6 +97,25 @@ def find_source(name: str) -> Source:
             culprits=[name[:200]],
             next_step=error.next_step,
         ) from error
+
+
+def chosen_part(source: Source, words: CellWords) -> tuple[Source, CellWords]:
+    """Takes one camera, robot and target out of a source of a whole cell, as the words name them.
+
+    Raises:
+        DataError: There is no such thing, or several are meant.
+    """
+    session, result = source.session, source.calibration
+    whole = result is not None and result.cell is not None
+    if not whole and (session is None or not has_several(session)):
+        return source, words
+    choice = Choice(words.camera, words.robot, words.target)
+    if session is not None and has_several(session):
+        session = select(session, choice)
+    if result is not None:
+        result = result.chosen(choice)
+    rest = replace(words, camera=None, robot=None, target=None)
+    return replace(source, session=session, calibration=result), rest
 
 
 def begun_session(source: Source, words: CellWords, told: Progress) -> Begun:
@@ -240,6 +261,8 @@ def _calibrated(calibration: Calibration, session: Session | None, words: CellWo
         target = _target(words.target)
     elif session is not None and session.target is not None:
         target = session.target
+    elif known := calibration.stages.get("joint_fit", {}).get("targets", {}).get(""):
+        target = target_from_document(known, "target")
     else:
         raise DataError(
             f"calibration {calibration.session_name!r} does not say which board it was made with, "
@@ -301,7 +324,7 @@ def _camera(words: str, resolution: str | None) -> Camera:
         return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
     path = Path(words)
     if path.is_dir() or path.suffix.lower() == ".rrd" or _holds_a_result(path):
-        found = load_stored(path).calibration.camera
+        found = load_calibration(path, ANY, LENS).camera
         if found is None:
             raise DataError(
                 f"--camera: {words} was made from measured poses and knows no camera.",

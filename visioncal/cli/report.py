@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.stored import find_alignment, load_stored
+from visioncal.stored import load_stored
 
 
 def report_command(
@@ -29,14 +29,13 @@ def report_command(
     # Plots take half a second to import, which help need not wait for.
     from visioncal.report import write_report
 
-    cell = find_alignment(calibration)
-    if cell is not None:
+    stored = load_stored(calibration)
+    if stored.calibration.cell is not None:
         from visioncal.report.cells import write_cell_report
 
-        write_cell_report(out, cell)
+        write_cell_report(out, stored.calibration.cell)
         messages().print(f"wrote {escape(str(out))}")
         return
-    stored = load_stored(calibration)
     write_report(out, stored.calibration, stored.session, stored.evidence, stored.note)
     if stored.note:
         messages().print(escape(stored.note))

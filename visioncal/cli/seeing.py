@@ -18,6 +18,8 @@ from visioncal.frames.naming import FrameKind
 from visioncal.frames.nominal import NominalPoints
 from visioncal.frames.seen_frame import seen_frame
 from visioncal.session import Session
+from visioncal.session.choosing import Choice
+from visioncal.session.selecting import has_several, select
 
 PointOption: TypeAlias = Annotated[
     str | None,
@@ -120,6 +122,7 @@ def frame_by_images(
     point_mm: str | None,
     drawing: NominalPoints | None = None,
     *,
+    choice: Choice,
     quiet: bool,
 ) -> Frame:
     """Places a tool or a fixture by a session's images.
@@ -130,12 +133,15 @@ def frame_by_images(
         kind: What it is.
         point_mm: Its origin in the target's frame, as the user wrote it.
         drawing: Where markers on a fixture are; None where the session's target is all.
+        choice: Which camera, robot and target are meant, of the session of a whole cell.
         quiet: Whether progress is not to be shown.
 
     Raises:
         DataError: The images do not show what is needed, or options contradict each other.
     """
     calibration = camera_of(place, session)
+    if has_several(session):
+        session = select(session, choice, parted=False)
     if drawing is not None:
         refuse_given({"--point-mm": point_mm}, "beside --cad the drawing's origin is the frame's")
         return marked_fixture(session, calibration, drawing)

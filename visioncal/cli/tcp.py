@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.convert_options import (
     JointColumns,
     JointUnit,
@@ -37,6 +38,7 @@ from visioncal.cli.seeing import (
 from visioncal.formats.touches import read_touches
 from visioncal.frames.naming import transform_name
 from visioncal.frames.tcp import touched_tool
+from visioncal.session.choosing import ARM, EYE, Choice
 
 
 def tcp_command(
@@ -59,6 +61,9 @@ def tcp_command(
     joint_columns: JointColumns = None,
     joint_unit: JointUnit = "rad",
     robot_model: RobotModel = None,
+    camera: CameraName = None,
+    robot: RobotName = None,
+    target: TargetName = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -69,7 +74,7 @@ def tcp_command(
     gives both, by the camera that -c names. Exit status 2: nothing was written, for the reason
     given.
     """
-    place = Place.of(transform_name("tool", name), calibration, out, force=force)
+    name = transform_name("tool", name)
     for_touches = touch_options(
         robot_columns,
         robot_form,
@@ -81,14 +86,18 @@ def tcp_command(
     )
     session = image_session(touches, for_touches)
     if session is not None:
-        frame = frame_by_images(session, place, "tool", point, quiet=as_json)
+        choice = Choice(camera, robot, target)
+        place = Place.of(name, calibration, out, Choice(camera, robot), EYE, force=force)
+        frame = frame_by_images(session, place, "tool", point, choice=choice, quiet=as_json)
         tell(place, frame, place.keep(frame), as_json=as_json)
         return
+    refuse_given({"--camera": camera, "--target": target}, "touches need no camera")
     refuse_given({"--point-mm": point}, "touches say where the tool's point is")
     wishes = touch_wishes(
         robot_columns, robot_form, robot_unit, robot_inverse, joint_columns, joint_unit
     )
-    rows = read_touches(touches, wishes)
+    place = Place.of(name, calibration, out, Choice(robot=robot), ARM, force=force)
+    rows = read_touches(touches, wishes, robot)
     frame = touched_tool(
         rows,
         place.calibration,

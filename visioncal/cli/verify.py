@@ -8,11 +8,14 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from visioncal.calibration import picked
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages, shown_progress, tell_written
 from visioncal.errors import DataError
 from visioncal.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 from visioncal.session import Session
-from visioncal.stored import load_calibration
+from visioncal.session.choosing import Choice
+from visioncal.stored import load_result
 from visioncal.verification import (
     Check,
     Outcome,
@@ -55,6 +58,9 @@ def verify_command(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help=f"A folder for {REPORT} and {VERIFY}.")
     ] = None,
+    camera: CameraName = None,
+    robot: RobotName = None,
+    target: TargetName = None,
     as_json: Annotated[bool, typer.Option("--json", help=f"Print {VERIFY}.")] = False,
 ) -> None:
     """Tell whether a calibration still holds, and what has changed if it does not.
@@ -70,7 +76,8 @@ def verify_command(
     if output is not None:
         refuse_calibration(output)
     triggers = load_policy(policy)
-    calibration, loaded = load_calibration(against), Session.load(session)
+    choice = Choice(camera, robot, target)
+    loaded, calibration = picked(Session.load(session), load_result(against), choice)
     with shown_progress(quiet=as_json) as progress:
         check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)
     facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)

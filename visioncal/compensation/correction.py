@@ -12,6 +12,7 @@ from visioncal.compensation.arms import CalibratedArm
 from visioncal.errors import DataError
 from visioncal.robot import Loads, Robot
 from visioncal.robot.inverse import Posture
+from visioncal.session.choosing import ARM, Choice
 from visioncal.transforms import compose, invert, nearest_rotation, rotation_angle
 from visioncal.types import FloatArray, Mask
 
@@ -78,6 +79,7 @@ def correct(
     *,
     widest_rad: float = WIDEST_RAD,
     loads: Loads | None = None,
+    robot: str | None = None,
 ) -> Corrected:
     """Computes what to send to the nominal controller so that the real arm reaches targets.
 
@@ -96,12 +98,14 @@ def correct(
             nearest is taken [rad].
         loads: What the flange carries at each target, for an arm whose joints bend
             (`Loads.alike`); its own weight alone where None.
+        robot: Which robot of a whole cell's calibration is meant.
 
     Raises:
         DataError: The calibration has no calibrated arm, or a target or a seed is none.
     """
-    known = calibration
-    arm = known if isinstance(known, CalibratedArm) else CalibratedArm.of(known)
+    arm = calibration
+    if isinstance(arm, Calibration):
+        arm = CalibratedArm.of(arm.chosen(Choice(robot=robot), ARM))
     wanted = _matrices(base_from_flange)
     own = _seeds(q_seed, arm.real, len(wanted))
     chain, inverse = arm.real.chain, arm.inverse

@@ -17,7 +17,7 @@ _NUMBERS = re.compile(
     "|median|most|p95|value|nominal|change|misfit|correlation|placement|o[1-5]|bow_[xy]+|aspect"
 )
 # Tables whose fields users name.
-_NAMED = ("frames", "robots")
+_NAMED = ("frames", "robots", "tree")
 _NOTHING = re.compile(r"(?!)")
 # Squares and products of larger numbers leave what floats hold.
 _LARGEST = 1e60

@@ -34,7 +34,9 @@ class Selection:
         convention: In which form the joints of an arm are tabulated.
         calibration_hash: The `hash` of a UR's own kinematics.
         onto: The document of the reader's own that is to be written onto.
-        camera: Which camera of an aligned cell is meant, in a format of lenses.
+        camera: Which camera of a whole cell is meant, in a format of lenses.
+        robot: Which robot of a whole cell: its part of it is exported as of one camera and robot.
+        target: Which target of a whole cell; likewise.
     """
 
     edge: str | None = None
@@ -47,6 +49,8 @@ class Selection:
     calibration_hash: str | None = None
     onto: str | None = None
     camera: str | None = None
+    robot: str | None = None
+    target: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """The formats that are known, and the way from a result to a document."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from visioncal.calibration import Verdict
+from visioncal.calibration import Alignment, Calibration, Verdict
 from visioncal.dynamics import Identified
 from visioncal.errors import DataError
 from visioncal.exports.arm import ArmFormat, select_arm
@@ -22,6 +22,7 @@ from visioncal.exports.ros import EASY_HANDEYE2, ROS
 from visioncal.exports.sources import Source
 from visioncal.exports.urdf import URDF
 from visioncal.files import did_you_mean
+from visioncal.session.choosing import ARM, EYE, PARTS, Choice
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     ROS,
@@ -86,6 +87,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     form = _find(to)
     if isinstance(source, Identified):
         return Document(write_dynamics(source, to, selection), ())
+    source, selection = _of_whole(source, selection, form)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
         omitted = tuple(f"{it}." for it in arm.omitted)
@@ -99,6 +101,28 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     return Document(
         form.write(content), (*_of_verdict(content.verdict), *([warning] if warning else []))
     )
+
+
+def _of_whole(
+    source: Source, selection: Selection, form: ExportFormat | ArmFormat
+) -> tuple[Source, Selection]:
+    """Takes one robot's part out of a whole cell, where one is named or an arm is asked for."""
+    whole = Calibration.whole(source) if isinstance(source, Alignment) else source
+    if not isinstance(whole, Calibration) or whole.cell is None:
+        if selection.robot is not None or selection.target is not None:
+            raise DataError(
+                "Which robot or target is meant is said of a whole cell alone, and this is none.",
+                culprits=["--robot", "--target"],
+                next_step="Leave it out.",
+            )
+        return source, selection
+    named = selection.robot is not None or selection.target is not None
+    if not named and not isinstance(form, ArmFormat):
+        return whole.cell, selection
+    needs = PARTS if selection.target is not None else EYE
+    choice = Choice(selection.camera, selection.robot, selection.target)
+    chosen = whole.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
+    return chosen, replace(selection, camera=None, robot=None, target=None)
 
 
 def _of_verdict(verdict: Verdict) -> tuple[str, ...]:

@@ -103,7 +103,7 @@ class Placements:
         """
         if self.mount is not None:
             return HAND_EYE[self.mount]
-        if len(self.frames) == 1:
+        if len(self.frames) == 1 and self.cell is None:
             return self.frames[0]
         if self.cell is not None:
             known = list(self.cell.frames)
@@ -196,7 +196,9 @@ def _of_alignment(cell: Alignment, camera: str | None) -> Placements:
     lens = None
     if camera is not None or len(cell.cameras) == 1:
         lens = cell.cameras[_camera(cell, camera)]
-    return Placements(edges, (), "this alignment", None, lens, cell, cell.cameras)
+    frames = {name: _of_frame(it) for name, it in cell.placed.items()}
+    by_name, lenses = {**edges, **frames}, cell.cameras
+    return Placements(by_name, tuple(frames), "this alignment", None, lens, cell, lenses)
 
 
 def _camera(cell: Alignment, camera: str | None) -> str:

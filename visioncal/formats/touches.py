@@ -21,13 +21,16 @@ from visioncal.types import FloatArray
 _NAMES = ("point", "name", "label", "id")
 
 
-def read_touches(path: Path, wishes: Wishes, *, positions: bool = False) -> TouchRows:
+def read_touches(
+    path: Path, wishes: Wishes, robot: str | None = None, *, positions: bool = False
+) -> TouchRows:
     """Reads touches.
 
     Args:
         path: A table with the columns of views.csv, `kind` and `point`; of these, only the pose or
             the joints have to be there. Or a session, whose rows have them.
         wishes: How poses and joints are written, where the columns do not say.
+        robot: Which robot of a whole cell's session is meant.
         positions: Whether positions will do where the table has no rotations: x_m, y_m, z_m, or
             x, y, z with the unit given.
 
@@ -35,7 +38,7 @@ def read_touches(path: Path, wishes: Wishes, *, positions: bool = False) -> Touc
         DataError: It cannot be read, or a row is no pose.
     """
     if path.is_dir() or path.suffix.lower() == ".rrd":
-        return touches_of(Session.load(path))
+        return touches_of(Session.load(path), robot)
     fields = read_fields(path)
     unnamed = unnamed_columns(fields)["robot"]
     named = pose_names(fields, wishes.robot.names, unnamed, ROBOT_KEYS, ())

@@ -12,6 +12,7 @@ from visioncal.frames.chain import Eye, Pose, Stop, checked_point, point_slope
 from visioncal.frames.located import Located
 from visioncal.frames.look import SeenTarget, see
 from visioncal.frames.plane import Plane
+from visioncal.session.choosing import EYE, Choice
 from visioncal.types import Corners, FloatArray, Image, Target
 
 # A ray within this angle of a plane [rad] does not meet it at any place that could be told.
@@ -25,6 +26,8 @@ def locate(
     base_from_flange: Pose | None = None,
     *,
     sigma_px: float | None = None,
+    camera: str | None = None,
+    robot: str | None = None,
 ) -> tuple[Located, ...]:
     """Places features of an image in the base, by the plane that they lie in.
 
@@ -35,6 +38,8 @@ def locate(
         base_from_flange: Where the robot stood at the image, as it reported it; only for a camera
             on the flange.
         sigma_px: Noise of a feature's coordinate [px]; the calibration's corners' where None.
+        camera: Which camera is meant, of a whole cell's calibration.
+        robot: In which robot's base; likewise.
 
     Returns:
         One place a feature. Features of one image share all but the pixels' noise.
@@ -43,7 +48,7 @@ def locate(
         DataError: There is no camera or no pose of the robot, a pixel is outside the image, or its
             ray does not meet the plane in front of the camera.
     """
-    eye = Eye.of(calibration)
+    eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
     noise_px, stop = eye.noise_px(sigma_px), eye.at(base_from_flange)
     px = np.atleast_2d(np.asarray(px, dtype=float))
     rays = _rays(eye, px)
@@ -190,6 +195,8 @@ def locate_target(
     *,
     sigma_px: float | None = None,
     label: str = "image",
+    camera: str | None = None,
+    robot: str | None = None,
 ) -> Located:
     """Places a point of a target that an image shows in the base.
 
@@ -205,12 +212,14 @@ def locate_target(
         point_target_m: (3,) the point in the target's frame [m].
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
         label: What messages call the image.
+        camera: Which camera is meant, of a whole cell's calibration.
+        robot: In which robot's base; likewise.
 
     Raises:
         DataError: There is no camera or no pose of the robot, or the image does not show the
             target.
     """
-    eye = Eye.of(calibration)
+    eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
     stop = eye.at(base_from_flange)
     view = see(eye, seen, target, label, sigma_px)
     point = checked_point(point_target_m, "point_target_m")

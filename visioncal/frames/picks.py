@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, picked
 from visioncal.errors import DataError
 from visioncal.frames.locate import locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.sighting import nothing_fits, sighting, without_label
 from visioncal.session import Session, View
+from visioncal.session.choosing import EYE, Choice
 from visioncal.types import FloatArray, Progress
 
 _ORIGIN = (0.0, 0.0, 0.0)
@@ -36,6 +37,9 @@ def locate_views(
     *,
     among: Sequence[View] | None = None,
     sigma_px: float | None = None,
+    camera: str | None = None,
+    robot: str | None = None,
+    target: str | None = None,
     progress: Progress | None = None,
 ) -> Picks:
     """Places a point of the target in the base, by each view of a session alone.
@@ -49,11 +53,16 @@ def locate_views(
         point_target_m: (3,) the point in the target's frame [m].
         among: Those of its views to look at; all where None.
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
+        camera: Which camera is meant, where session or calibration is of a whole cell.
+        robot: Which robot, in whose base or on whose flange it is placed; likewise.
+        target: Which target of the session; likewise.
         progress: Told after each image.
 
     Raises:
         DataError: No view shows the target and has what else it needs.
     """
+    choice = Choice(camera, robot, target)
+    session, calibration = picked(session, calibration, choice, EYE, parted=False)
     shown = sighting(session, calibration, "base", among=among, progress=progress)
     found: dict[int, Located] = {}
     lost = dict(shown.lost)

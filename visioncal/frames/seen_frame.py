@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration import Calibration, Frame, Observation
+from visioncal.calibration import Calibration, Frame, Observation, picked
 from visioncal.errors import DataError
 from visioncal.estimator.observability import Direction
 from visioncal.estimator.placing import worst_of
@@ -28,6 +28,7 @@ from visioncal.frames.sighting import (
 from visioncal.frames.verdicts import Doubt, verdict_of, weak_directions
 from visioncal.pipeline.known import HELD_BACK, by_reason
 from visioncal.session import Session, View
+from visioncal.session.choosing import EYE, Choice
 from visioncal.types import FloatArray, Progress
 
 # The detail of a frame by which its camera's calibration is known.
@@ -87,6 +88,9 @@ def seen_frame(
     point_target_m: FloatArray | Sequence[float] = _ORIGIN,
     *,
     options: SeenOptions | None = None,
+    camera: str | None = None,
+    robot: str | None = None,
+    target: str | None = None,
     progress: Progress | None = None,
 ) -> Frame:
     """Places a tool or a fixture by the target on it, as the calibrated camera sees it.
@@ -101,6 +105,9 @@ def seen_frame(
         point_target_m: (3,) the frame's origin in the target's frame [m], such as the tool's tip;
             its axes are the target's.
         options: Where doubt begins.
+        camera: Which camera is meant, where session or calibration is of a whole cell.
+        robot: Which robot, in whose base or on whose flange it is placed; likewise.
+        target: Which target of the session; likewise.
         progress: Told of long work.
 
     Returns:
@@ -109,6 +116,8 @@ def seen_frame(
     Raises:
         DataError: No image serves, the target is elsewhere, or the session is of another camera.
     """
+    choice = Choice(camera, robot, target)
+    session, calibration = picked(session, calibration, choice, EYE, parted=False)
     options = options or SeenOptions()
     point = checked_point(point_target_m, "point_target_m")
     eye, parent = Eye.of(calibration), PARENTS[kind]

@@ -12,6 +12,8 @@ from visioncal.files import did_you_mean, some_of
 from visioncal.frames.verdicts import Doubt
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.choosing import ARM, Choice
+from visioncal.session.selecting import select
 from visioncal.session.single import check_one_of_each
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mask
@@ -76,12 +78,18 @@ class TouchRows:
         return replace(self, kinds=kinds)
 
 
-def touches_of(session: Session) -> TouchRows:
+def touches_of(session: Session, robot: str | None = None) -> TouchRows:
     """Takes the rows of a session's views.csv for touches.
 
+    Args:
+        session: Of one robot, or of a whole cell.
+        robot: Which of a whole cell is meant.
+
     Raises:
-        DataError: It is of several robots.
+        DataError: It is of several robots, and none is named, or there is none of that name.
     """
+    if len(session.robots) > 1:
+        session = select(session, Choice(robot=robot), ARM)
     check_one_of_each(session)
     nowhere = np.full((4, 4), np.nan)
     poses, joints = [], []

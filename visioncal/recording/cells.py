@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from visioncal.calibration import Alignment, Sight
+from visioncal.calibration import Alignment, Calibration, Sight, to_document
 from visioncal.errors import DataError
 from visioncal.figures import significant
 from visioncal.files import sha256
@@ -146,7 +146,7 @@ def log_cell(recorder: Recorder, session: Session, found: Alignment) -> None:
         recorder.at(row)
         _log_view(stream, scene, view, sights.get(view.number))
     recorder.keep()
-    text = json.dumps(found.document(), indent=2)
+    text = json.dumps(to_document(Calibration.whole(found)), indent=2)
     components = {"seal": pa.array([sha256(text.encode())], pa.string())}
     stream.log(
         paths.ALIGNMENT,
@@ -174,7 +174,7 @@ def read_alignment(path: Path) -> Alignment | None:
         raise _damaged(path) from error
     if damaged:
         raise _damaged(path)
-    return Alignment.from_json(text, str(path)) if text else None
+    return Calibration.from_json(text, str(path)).cell if text else None
 
 
 def _damaged(path: Path) -> DataError:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, picked
 from visioncal.chance import f_limit
 from visioncal.errors import DataError
 from visioncal.estimator.causes import Belief, Cause, Explained, explain, undone
 from visioncal.session import Session
+from visioncal.session.choosing import Choice
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log, mean_transform
 from visioncal.types import FloatArray, Progress
@@ -94,6 +95,9 @@ def verify(
     session: Session,
     calibration: Calibration,
     *,
+    camera: str | None = None,
+    robot: str | None = None,
+    target: str | None = None,
     board_placed_anew: bool = False,
     progress: Progress | None = None,
 ) -> Check:
@@ -104,6 +108,9 @@ def verify(
     Args:
         session: Five stops or more, with the same board where it was; nothing of it is fitted.
         calibration: The one that is to hold.
+        camera: Which camera is meant, where session or calibration is of a whole cell.
+        robot: Which robot, likewise.
+        target: Which target, likewise.
         board_placed_anew: Whether the board was put elsewhere meanwhile, so that its place tells
             nothing.
         progress: Told of long work.
@@ -111,6 +118,7 @@ def verify(
     Raises:
         DataError: The session is of another cell, or the calibration does not say enough.
     """
+    session, calibration = picked(session, calibration, Choice(camera, robot, target))
     footing = Footing.of(calibration)
     return check(
         see_again(session, footing, progress), footing, board_placed_anew=board_placed_anew

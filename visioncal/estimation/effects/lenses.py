@@ -86,6 +86,13 @@ class Looks:
         return self._here(self._one.shape_of(board))
 
     @property
+    def corners(self) -> tuple[FloatArray, ...]:
+        """The corners (c, 3) of every board, as it is taken to be, in its frame [m]."""
+        one = self._one
+        places = one.positions + one.basis @ self.values[self.boards]
+        return tuple(places[one.corners_of(it)] for it in range(len(one.scene.targets)))
+
+    @property
     def _one(self) -> Problem:
         """Any camera's corners: all see the same boards."""
         return next(iter(self.problems.values()))

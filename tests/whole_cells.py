@@ -1,0 +1,92 @@
+"""A simulated cell of two arms, a fixed camera and one in a hand, recorded as corners."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.session import Session
+from visioncal.session.corners import CornerTable
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    Network,
+    NetworkOptions,
+    RobotAt,
+    charuco_target,
+    checkerboard_target,
+    fine_camera,
+    network_session,
+    simulate_network,
+)
+from visioncal.transforms import invert, log
+
+# Boards whose size is known: else it is most of what a target's place is uncertain by.
+FLOOR = replace(charuco_target(), square_sigma_m=1e-7)
+PLATE = replace(checkerboard_target(), square_sigma_m=1e-7)
+OPTIONS = NetworkOptions(
+    robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
+    cameras=(
+        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=fine_camera()),
+        CameraAt("hand", on="a"),
+    ),
+    boards=(
+        BoardAt("floor", place_m=(0.0, 0.0, 0.05), target=FLOOR),
+        BoardAt("plate_a", on="a", target=FLOOR),
+        BoardAt("plate_b", on="b", target=PLATE),
+    ),
+    stops=26,
+)
+# The stops from here on are kept for what comes after the calibration.
+LATER = 20
+
+
+def recorded(cell: Network) -> Session:
+    """The session of a cell, with its corners in the place of images."""
+    session = network_session(cell, "two arms", seen="names")
+    counts = [len(it.ids) for it in cell.corners]
+    return Session.assemble(
+        session.document,
+        [it for it in session.columns if it != "image"],
+        [[view.cell(it) for it in session.columns if it != "image"] for view in session.views],
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+        corners=CornerTable(
+            np.repeat([it.view for it in cell.corners], counts),
+            np.concatenate([it.ids for it in cell.corners]),
+            np.concatenate([it.px for it in cell.corners]),
+            ("",) * sum(counts),
+        ),
+    )
+
+
+def part(session: Session, first: int, end: int) -> Session:
+    """The rows of some stops, with their corners."""
+    views = tuple(it for it in session.views if it.stop is not None and first <= it.stop < end)
+    numbers = [it.number for it in views]
+    return replace(session, views=views, corner_table=session.corner_table.of_views(numbers))
+
+
+def saved(folder: Path, cell: Network) -> tuple[Path, Path]:
+    """Writes what is to be calibrated, and what comes later."""
+    session = recorded(cell)
+    part(session, 0, LATER).save(folder / "session")
+    part(session, LATER, OPTIONS.stops).save(folder / "later")
+    return folder / "session", folder / "later"
+
+
+def misfit(matrix, covariance, truth):
+    """The squared error of a transform in units of its sigmas: chi-square of six."""
+    error = log(invert(truth) @ matrix)
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def simulated(seed: int = 0) -> Network:
+    return simulate_network(replace(OPTIONS, seed=seed))
+
+
+def truth(cell: Network, first: str, second: str):
+    """Where a frame is in another of the same body: one of them may be a flange or a base."""
+    of_first = np.eye(4) if first.startswith("flange") else cell.transforms[first]
+    return invert(of_first) @ cell.transforms[second]

@@ -1,0 +1,85 @@
+"""Calibrating a session of any cell: of one camera and one robot, or of many."""
+
+from pathlib import Path
+
+from visioncal import pipeline
+from visioncal.alignment.arms import ArmsAsked
+from visioncal.alignment.run import align
+from visioncal.calibration import Calibration
+from visioncal.errors import DataError
+from visioncal.robot import Convention
+from visioncal.session import Session
+from visioncal.session.single import is_whole_cell
+from visioncal.types import Progress, SolverName
+
+# What of a whole cell's arms is estimated at a level.
+_ARMS: dict[str, ArmsAsked] = {
+    "auto": "reported",
+    "hand-eye": "reported",
+    "offsets": "offsets",
+    "kinematics": "kinematics",
+}
+
+
+def calibrate(
+    session: Session | Path | str,
+    *,
+    solver: SolverName = "joint",
+    level: str = "auto",
+    convention: Convention | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrates a session.
+
+    Several threads may do so at once. While one does, BLAS has one thread for each, and OpenCV,
+    too, while targets are looked for; afterwards both have those that they had.
+
+    Args:
+        session: A session, or the path of its folder or recording. One of several cameras or
+            robots is solved as a whole; `Calibration.of` takes one camera, robot and target of it.
+        solver: `joint` for the fit of both edges, or the name of a closed form.
+        level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
+            arm, `offsets` of its joints, its `kinematics`, `elastic` for joints that bend, too, or
+            `thermal` for its drift with temperature, too. Of a whole cell the arms stay as they
+            report themselves, but for `offsets` and `kinematics`.
+        convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
+            `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
+        progress: Told of long work.
+
+    Returns:
+        The result with its verdict.
+
+    Raises:
+        DataError: The input is wrong or shows no target.
+        DegenerateError: The motion leaves a direction of the answer open.
+        ConvergenceError: The intrinsics do not come to rest.
+    """
+    loaded = session if isinstance(session, Session) else Session.load(session)
+    if is_whole_cell(loaded):
+        arms = arms_asked(solver, level, convention)
+        return Calibration.whole(align(loaded, arms=arms, progress=progress))
+    return pipeline.calibrate(
+        loaded, solver=solver, level=level, convention=convention, progress=progress
+    )
+
+
+def arms_asked(solver: SolverName, level: str, convention: Convention | None) -> ArmsAsked:
+    """What is estimated of a whole cell's arms.
+
+    Raises:
+        DataError: A whole cell is not calibrated that way.
+    """
+    given = {
+        "solver": solver if solver != "joint" else "",
+        "level": level if level not in _ARMS else "",
+        "convention": convention or "",
+    }
+    wrong = [f"{name} {it}" for name, it in given.items() if it]
+    if wrong:
+        raise DataError(
+            f"{' and '.join(wrong)} cannot be asked of a whole cell: it has the joint solver, and "
+            f"the levels {', '.join(_ARMS)}.",
+            culprits=[f"--{name}" for name, it in given.items() if it],
+            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
+        )
+    return _ARMS[level]

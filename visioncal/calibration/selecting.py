@@ -1,0 +1,195 @@
+"""The calibration of one camera, one robot and one target out of that of a whole cell."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.calibration.alignment import Alignment
+from visioncal.calibration.edge import Edge
+from visioncal.calibration.frame import Frame
+from visioncal.calibration.parts import CameraResult, RobotResult, Validation, Verdict
+from visioncal.calibration.whole import rms_of, view_results
+from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
+from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
+from visioncal.types import FloatArray
+
+NOT_LEFT_OUT = "none was left out: the residuals of the whole cell's fit"
+
+
+def whole_fields(cell: Alignment) -> dict[str, Any]:
+    """The fields of a calibration that stands for a whole cell."""
+    rms = rms_of(cell.sights)
+    cameras = frames_of_kind(cell.frames, "camera")
+    carried = [bool(robots_between(cell.frames, it, CELL)) for it in cameras]
+    return {
+        "session_name": cell.session_name,
+        "session_sha256": cell.session_sha256,
+        "created": cell.created,
+        "mount": "eye-in-hand" if carried and all(carried) else "eye-to-hand",
+        "edges": cell.edges,
+        "joint_covariance": cell.joint_covariance,
+        "solvers": {},
+        "noise": {},
+        "views": view_results(cell.sights),
+        "rms": rms,
+        "validation": Validation(NOT_LEFT_OUT, rms),
+        "verdict": cell.verdict,
+        "frames": cell.placed,
+        "cell": cell,
+    }
+
+
+def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) -> dict[str, Any]:
+    """The fields of the calibration of one camera, robot and target; see `Calibration.of`.
+
+    Raises:
+        DataError: There is no such thing, several are meant, or no robot parts these.
+    """
+    chosen = _chosen(cell, choice, needs)
+    chain = _chain(cell, chosen)
+    nothing = np.zeros((0, len(cell.joint_covariance)))
+    slopes = np.concatenate([nothing, *(it[1] for it in chain.values())])
+    spread = slopes @ cell.joint_covariance @ slopes.T
+    arm = cell.arms.get(chosen.robot or "robot", RobotResult())
+    sights = [
+        it
+        for it in cell.sights
+        if chosen.camera in ("", it.seer) and chosen.target in ("", it.seen)
+    ]
+    rms = rms_of(sights)
+    return whole_fields(cell) | {
+        "mount": chosen.mount,
+        "edges": {
+            name: Edge(matrix, spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
+            for at, (name, (matrix, _)) in enumerate(chain.items())
+        },
+        "joint_covariance": spread,
+        "noise": _noise(cell, chosen),
+        "views": view_results(sights),
+        "rms": rms,
+        "validation": Validation(NOT_LEFT_OUT, rms),
+        "verdict": _verdict(cell),
+        "camera": _camera(cell.cameras.get(chosen.camera), slopes),
+        "robot": arm.model,
+        "frames": _placed(cell.placed, chosen),
+        "stages": {**arm.stages, **_shapes(cell, chosen), **_joint_fit(cell, chosen, slopes)},
+        "cell": None,
+    }
+
+
+def placed_name(cell: Alignment, choice: Choice, needs: Collection[Part], name: str) -> str:
+    """What a transform of the smaller calibration is called in the whole cell's."""
+    chosen = _chosen(cell, choice, needs)
+    parent, _, child = name.partition("_from_")
+    frames = {"flange": chosen.flange, "base": chosen.base}
+    return f"{frames[parent]}_from_{child}"
+
+
+def _chosen(cell: Alignment, choice: Choice, needs: Collection[Part]) -> Chosen:
+    """What is meant, where all stood last; of what is neither needed nor named, nothing."""
+    before = {it.before for it in cell.moved}
+    frames = {name: on for name, on in cell.frames.items() if name not in before}
+    chosen = choose(frames, choice, needs, label=f"the cell {cell.session_name!r}")
+    kept = {*needs, *(part for part in PARTS if choice.of(part))}
+    return replace(
+        chosen,
+        camera=chosen.camera if "camera" in kept else "",
+        target=chosen.target if "target" in kept else "",
+    )
+
+
+def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Both transforms by name, as far as they are there, each with its slopes by all edges."""
+    in_hand = chosen.mount == "eye-in-hand"
+    of_camera, of_target = ("flange", "base") if in_hand else ("base", "flange")
+    frames = {"flange": chosen.flange, "base": chosen.base}
+    ends = {
+        f"{of_camera}_from_cam": (frames[of_camera], chosen.camera),
+        f"{of_target}_from_target": (frames[of_target], chosen.target),
+    }
+    return {name: cell.way(*pair) for name, pair in ends.items() if pair[1]}
+
+
+def _noise(cell: Alignment, chosen: Chosen) -> dict[str, float]:
+    """The camera's noise and the robot's; together, where poses were measured without corners."""
+    robot, camera = (cell.noise.get(it, {}) for it in (chosen.robot or "robot", chosen.camera))
+    found = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
+    for unit in ("translation_mm", "rotation_deg"):
+        if unit in robot:
+            found[f"robot_{unit}"] = robot[unit]
+        if unit in camera:
+            found[f"combined_{unit}"] = float(np.hypot(camera[unit], robot.get(unit, 0.0)))
+    return found
+
+
+def _camera(result: CameraResult | None, slopes: FloatArray) -> CameraResult | None:
+    if result is None or result.edge_covariance is None:
+        return result
+    return CameraResult(
+        result.camera, result.estimated, result.covariance, result.edge_covariance @ slopes.T
+    )
+
+
+def _verdict(cell: Alignment) -> Verdict:
+    if "arms" not in cell.details:
+        return cell.verdict
+    words = (
+        "The whole cell was fitted with errors of its arms, which this part of it does not have: "
+        "by the poses as they are reported it is off by as much."
+    )
+    status = "check" if cell.verdict.status == "good" else cell.verdict.status
+    return Verdict(status, (words, *cell.verdict.reasons))
+
+
+def _placed(placed: Mapping[str, Frame], chosen: Chosen) -> dict[str, Frame]:
+    """Tools and fixtures of the robot, as they are called of an only one."""
+    found: dict[str, Frame] = {}
+    for short, long in (("flange", chosen.flange), ("base", chosen.base)):
+        begin = f"{long}_from_"
+        found |= {
+            f"{short}_from_{name.removeprefix(begin)}": it
+            for name, it in placed.items()
+            if name.startswith(begin)
+        }
+    return found
+
+
+def _shapes(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+    """What the target was found to be like."""
+    name, stages = thing_name(chosen.target, "target"), cell.stages
+    parts = {"board": stages.get("boards", {}), "rig": stages.get("rigs", {})}
+    return {kind: it[name] for kind, it in parts.items() if name in it}
+
+
+def _joint_fit(cell: Alignment, chosen: Chosen, slopes: FloatArray) -> dict[str, Any]:
+    """What `verify` predicts with: both edges, and lens and board as far as they are free."""
+    fit = cell.stages.get("joint_fit")
+    if fit is None or not (chosen.camera and chosen.target):
+        return {}
+    target = thing_name(chosen.target, "target")
+    camera = thing_name(chosen.camera, "camera")
+    lens_count = 0
+    if (known := cell.cameras.get(chosen.camera)) is not None:
+        lens_count = 4 + len(known.camera.distortion)
+    looks: list[int] = []
+    columns: list[int] = []
+    at = slopes.shape[1]
+    for part, name, first in (("cameras", camera, 0), ("targets", target, lens_count)):
+        for it, places in fit[part].items():
+            if it == name:
+                looks += [first + place for place in places]
+                columns += range(at, at + len(places))
+            at += len(places)
+    full = np.array(fit["covariance"], dtype=float)
+    carried = block_diag(slopes, np.eye(at)[columns][:, slopes.shape[1] :])
+    return {
+        "joint_fit": {
+            "targets": {"": cell.targets[target]} if target in cell.targets else {},
+            "looks": looks,
+            "boards": [""],
+            "covariance": (carried @ full @ carried.T).tolist(),
+        }
+    }
