@@ -134,6 +134,20 @@ def test_a_target_is_placed_on_any_flange_and_in_any_base(
     assert misfit(matrix, covariance, truth(cell, *ends)) < MOST
 
 
+def test_a_fixture_of_one_robot_is_known_in_the_base_of_the_other(cell, place, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("calibration.json", "alignment.json"):
+        (out / name).write_text((place / "out" / name).read_text())
+    names = ("--camera", "hand", "--robot", "a", "--target", "floor", "--name", "jig")
+    done("fixture", place / "later", "-c", out, *names)
+    edge = Calibration.load(out).of("left", "b").frames["base_from_jig"].edge
+    assert misfit(edge.matrix, edge.covariance, truth(cell, "base_b", "target_floor")) < MOST
+    own = Calibration.load(out).of("left", "a").frames["base_from_jig"].edge
+    assert edge.sigma_mm > own.sigma_mm
+    assert "base_a_from_jig" in (out / "report.html").read_text()
+
+
 def test_stops_are_added_to_one_pair(place, tmp_path):
     chosen = ("--camera", "left", "--target", "plate_b", "--candidates", 60)
     out = tmp_path / "plan"

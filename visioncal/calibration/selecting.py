@@ -1,6 +1,6 @@
 """The calibration of one camera, one robot and one target out of that of a whole cell."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from visioncal.calibration.parts import CameraResult, RobotResult, Validation, V
 from visioncal.calibration.whole import rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
+from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
 
 NOT_LEFT_OUT = "none was left out: the residuals of the whole cell's fit"
@@ -74,7 +75,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "verdict": _verdict(cell),
         "camera": _camera(cell.cameras.get(chosen.camera), slopes),
         "robot": arm.model,
-        "frames": _placed(cell.placed, chosen),
+        "frames": _placed(cell, chosen),
         "stages": {**arm.stages, **_shapes(cell, chosen), **_joint_fit(cell, chosen, slopes)},
         "cell": None,
     }
@@ -144,16 +145,26 @@ def _verdict(cell: Alignment) -> Verdict:
     return Verdict(status, (words, *cell.verdict.reasons))
 
 
-def _placed(placed: Mapping[str, Frame], chosen: Chosen) -> dict[str, Frame]:
-    """Tools and fixtures of the robot, as they are called of an only one."""
+def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
+    """Tools and fixtures of the robot, and in its base the fixtures of others beside it.
+
+    Of these, the way between both bases counts as independent of how the fixture was placed.
+    """
     found: dict[str, Frame] = {}
-    for short, long in (("flange", chosen.flange), ("base", chosen.base)):
-        begin = f"{long}_from_"
-        found |= {
-            f"{short}_from_{name.removeprefix(begin)}": it
-            for name, it in placed.items()
-            if name.startswith(begin)
-        }
+    for name, frame in cell.placed.items():
+        parent, _, child = name.partition("_from_")
+        if parent == chosen.flange:
+            found[f"flange_from_{child}"] = frame
+        elif parent == chosen.base:
+            found[f"base_from_{child}"] = frame
+        elif parent.startswith("base") and not robots_between(cell.frames, chosen.base, parent):
+            way, placed = cell.between(chosen.base, parent), frame.edge
+            carry = adjoint(invert(placed.matrix))
+            spread = carry @ way.covariance @ carry.T + placed.covariance
+            if not placed.oriented:
+                spread[:3], spread[:, :3] = 0.0, 0.0
+            edge = Edge(way.matrix @ placed.matrix, spread)
+            found[f"base_from_{child}"] = replace(frame, edge=edge)
     return found
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from visioncal.calibration import Alignment, CameraResult, Sight
+from visioncal.calibration import Alignment, Calibration, CameraResult, Sight
 from visioncal.figures import significant
 from visioncal.files import write_atomically
 from visioncal.recording import cellmap
-from visioncal.report import bars, content, network, svg
+from visioncal.report import bars, content, network, svg, tools
 from visioncal.report.bars import Bar
 from visioncal.report.content import Fact
 from visioncal.version import __version__
@@ -86,6 +86,7 @@ def render_cell(found: Alignment) -> str:
         links=[_link_row(it) for it in cellmap.pairs(found)],
         tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
         edges=cards,
+        frames=tools.frame_cards(Calibration.whole(found)),
         noise=_noise_facts(found),
         arms=_arm_facts(found),
         lenses=[(name, _lens_facts(it)) for name, it in found.cameras.items()],
