@@ -7,9 +7,9 @@ import pytest
 from cells import calibrated
 
 from visioncal.errors import ConvergenceError
+from visioncal.estimation.solve import RATIO_PRIOR
 from visioncal.estimator import joint
 from visioncal.estimator.closure import (
-    RATIO_PRIOR,
     Closure,
     closure_jacobian,
     components_of,

@@ -273,6 +273,8 @@ class Problem:
         least_levels: (s,) below which no sensor's level is; where there are none, any.
         with_repeats: Whether repeated observations of one still frame by another share an error as
             large as that of a single one: what a lens or a print does to one view it does to all.
+        is_combined: Whether nothing is known of the observations' own noise, so that it and that of
+            the only robot are one, of levels to be estimated, in the observed frame.
     """
 
     tree: Tree
@@ -283,6 +285,7 @@ class Problem:
     points: frozenset[str] = frozenset()
     least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
     with_repeats: bool = False
+    is_combined: bool = False
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -382,6 +385,16 @@ class Problem:
         return found, np.concatenate([robots.reshape(-1, none.shape[1]), none])
 
     @cached_property
+    def alone(self) -> Mask:
+        """(n,) which observations share the error of one robot's flange with no other."""
+        of, members = self.units
+        count = np.bincount(of[of >= 0], minlength=len(members))
+        single = (count == 1) & (members >= 0).any(axis=1) & (members[:, 1:] < 0).all(axis=1)
+        found = of >= 0
+        found[found] = single[of[found]]
+        return found
+
+    @cached_property
     def repeats(self) -> tuple[IntArray, ...]:
         """The rows of each pair of frames that no robot parts, where they repeat each other."""
         if not self.with_repeats:
@@ -391,6 +404,8 @@ class Problem:
 
     @cached_property
     def _robot_units(self) -> tuple[IntArray, IntArray]:
+        if self.is_combined:
+            return np.arange(len(self)), np.zeros((len(self), 1), dtype=np.int64)
         count, joined = len(self.robots), []
         first = np.full(len(self), -1, dtype=np.int64)
         for group in self.groups:
@@ -543,6 +558,8 @@ class Problem:
             )
         for rows in self.repeats:
             errors[rows, :, :6] = np.eye(6)
+        if self.is_combined:
+            errors = -np.broadcast_to(np.eye(6), errors.shape)
         return Linear(residuals, tuple(blocks), by_predicted @ errors, self.size)
 
     @cached_property

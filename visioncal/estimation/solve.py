@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
-from visioncal.estimator.closure import RATIO_PRIOR
 from visioncal.estimator.descend import Linearised, descend
 from visioncal.estimator.linalg import covariance_among, damped_step, gram, squared_lengths
-from visioncal.estimator.variance import Components, Knowledge, estimate_sigmas
+from visioncal.estimator.variance import Components, Knowledge, RatioPrior, estimate_sigmas
 from visioncal.types import FloatArray, Mask
 
-_ROUNDS, _SETTLED = 20, 1e-8
+_ROUNDS, _SETTLED = 20, 1e-10
 # Noise levels that change by less have settled, far below what is known of them.
-_LEVELS_SETTLED = 1e-2
+_LEVELS_SETTLED = 1e-4
+# Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
+RATIO_PRIOR = RatioPrior(ratio=0.6, spread=1.5)
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
 # Where they are sought again, it is from so much above where they were.
@@ -94,11 +95,10 @@ def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, 
     Returns:
         The unknowns, and whether they converged.
     """
-    weights = _weights(problem, noise)
-    errors, moving = problem.error_covariance(noise), problem.moving
+    own, errors, moving = problem.covariance(noise), problem.error_covariance(noise), problem.moving
 
     def linearise(at: State) -> Linearised[State]:
-        reduced = reduce(problem, at, problem.linear(at), weights)
+        reduced = reduce(problem, at, problem.linear(at), own)
         information, gradient, cost = _whole(reduced, errors)
         free, slope = information[np.ix_(moving, moving)], gradient[moving]
 
@@ -112,40 +112,56 @@ def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, 
     return descend(state, linearise, _SETTLED)
 
 
-def reduce(problem: Problem, state: State, linear: Linear, weights: FloatArray) -> Reduced:
-    """Eliminates the flanges' errors (Schur complement by unit).
+def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArray) -> Reduced:
+    """Eliminates the flanges' errors, unit by unit.
+
+    An observation that alone is a unit says what its flange's error is; of several, it is a Schur
+    complement.
 
     Args:
         problem: The problem.
         state: Where it was linearised.
         linear: The residuals there.
-        weights: (n, 6, 6) inverse covariances of the observations' own noise.
+        covariance: (n, 6, 6) of the observations' own noise.
     """
     of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
-    total = np.zeros((size + 1, size + 1))
-    own, cross = np.zeros((len(members), width, width)), np.zeros((len(members), width, size + 1))
+    total, alone = np.zeros((size + 1, size + 1)), problem.alone
+    own, inverse, blind = np.zeros((3, len(members), width, width))
+    cross, answer = np.zeros((2, len(members), width, size + 1))
     for block in linear.blocks:
         # Residuals are the last column.
         columns = np.append(block.columns, size)
         every = np.concatenate([block.slopes, linear.residuals[block.rows, :, None]], axis=2)
-        weighted = weights[block.rows] @ every
-        total[np.ix_(columns, columns)] += gram(every, weighted)
-        if of[block.rows[0]] < 0:
+        single = alone[block.rows]
+        if single.any():
+            rows = block.rows[single]
+            turned = np.linalg.inv(linear.by_errors[rows, :, :6])
+            answer[np.ix_(of[rows], np.arange(6), columns)] = turned @ every[single]
+            known = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
+            inverse[of[rows], :6, :6] = known
+            inverse[of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
+        rows, every = block.rows[~single], every[~single]
+        if not len(rows):
             continue
-        order = np.argsort(of[block.rows], kind="stable")
-        units, first = np.unique(of[block.rows[order]], return_index=True)
-        by_errors = linear.by_errors[block.rows[order]]
+        weights = np.linalg.inv(covariance[rows])
+        weighted = weights @ every
+        total[np.ix_(columns, columns)] += gram(every, weighted)
+        if of[rows[0]] < 0:
+            continue
+        order = np.argsort(of[rows], kind="stable")
+        units, first = np.unique(of[rows[order]], return_index=True)
+        by_errors = linear.by_errors[rows[order]]
         slopes = np.swapaxes(by_errors, 1, 2)
-        pairs = slopes @ weights[block.rows[order]] @ by_errors
-        own[units] += np.add.reduceat(pairs, first)
+        own[units] += np.add.reduceat(slopes @ weights[order] @ by_errors, first)
         of_both = np.ix_(units, np.arange(width), columns)
         cross[of_both] += np.add.reduceat(slopes @ weighted[order], first)
-    inverse, blind = _pseudo_inverse(own)
-    answer = inverse @ cross
-    total = total - gram(cross, answer)
-    known = problem.knowledge(state)
+    joined = np.setdiff1d(np.arange(len(members)), of[alone])
+    inverse[joined], blind[joined] = _pseudo_inverse(own[joined])
+    answer[joined] = inverse[joined] @ cross[joined]
     # A residual is what the flange's error made of it: the error itself has the other sign.
+    total = total - gram(cross[joined], answer[joined])
+    known = problem.knowledge(state)
     return Reduced(
         total[:-1, :-1] + known.information,
         total[:-1, -1] + known.pull,
@@ -179,19 +195,28 @@ def _whole(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray
     )
 
 
-def _weights(problem: Problem, noise: Noise) -> FloatArray:
-    return np.asarray(np.linalg.inv(problem.covariance(noise)))
+def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArray:
+    """Fisher information (p, p) on the unknowns, where all chains close exactly.
+
+    At the measured poses their noise would pass for information about directions that the motion
+    leaves open.
+    """
+    return normal_equations(problem, state, noise, ideal=True)[0]
 
 
-def normal_equations(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Information (p, p) and gradient (p,) of half the whitened squared error."""
-    return _equations(problem, state, noise, problem.linear(state))
-
-
-def _equations(
-    problem: Problem, state: State, noise: Noise, linear: Linear
+def normal_equations(
+    problem: Problem, state: State, noise: Noise, *, ideal: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    reduced = reduce(problem, state, linear, _weights(problem, noise))
+    """Information (p, p) and gradient (p,) of half the whitened squared error.
+
+    Args:
+        problem: The observations.
+        state: Where.
+        noise: Its levels.
+        ideal: See `Problem.linear`.
+    """
+    linear = problem.linear(state, ideal=ideal)
+    reduced = reduce(problem, state, linear, problem.covariance(noise))
     return _whole(reduced, problem.error_covariance(noise))[:2]
 
 
@@ -208,8 +233,7 @@ def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
 
     It is that of the result: held values count with what is known of them.
     """
-    linear = problem.linear(solution.state, ideal=True)
-    information, _ = _equations(problem, solution.state, solution.noise, linear)
+    information = fisher_information(problem, solution.state, solution.noise)
     return covariance_among(information, problem.counted)
 
 
@@ -228,7 +252,8 @@ def estimate_noise(
         from_above: Whether robots' levels are to be sought from above what the residuals show,
             since they may be anything: a start that is too low may stay there.
     """
-    noise = replace(noise, robots=_robots(problem, state, noise, from_above=from_above))
+    robots, _ = robot_levels(problem, state, noise, from_above=from_above)
+    noise = replace(noise, robots=robots)
     if not len(noise.sensors):
         return noise
     squares, left = posterior(problem, state, noise)
@@ -244,11 +269,72 @@ def estimate_noise(
     return replace(noise, sensors=sensors)
 
 
-def _robots(problem: Problem, state: State, noise: Noise, *, from_above: bool) -> FloatArray:
+def robot_levels(
+    problem: Problem, state: State, noise: Noise, *, from_above: bool
+) -> tuple[FloatArray, float]:
+    """Estimates the robots' levels (r, 2); see `estimate_noise`.
+
+    Returns:
+        The levels, and the negative restricted log-likelihood there.
+    """
+    if not len(problem.units[1]):
+        return noise.robots, 0.0
+    likelihood = robot_likelihood(problem, state, noise)
+    start = np.maximum(_ABOVE * noise.robots, _ABOVE_NOTHING)
+    if from_above:
+        start = np.maximum(likelihood.rms, _START_SIGMA) * np.ones_like(noise.robots)
+    start = np.where(likelihood.seen[:, None], start, noise.robots)
+    return likelihood.most_likely(start, np.repeat(likelihood.seen, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class RobotLikelihood:
+    """The restricted likelihood of the robots' levels.
+
+    Attributes:
+        reduced: What each unit says of its flanges' errors.
+        components: What makes up the covariance of that.
+        known: What is known of the unknowns that move without these errors.
+        moving: (p,) the unknowns that move.
+        seen: (r,) which robots have been observed.
+    """
+
+    reduced: Reduced
+    components: Components
+    known: Knowledge
+    moving: Mask
+    seen: Mask
+
+    @property
+    def rms(self) -> FloatArray:
+        """(2,) root mean square of the errors' rotation [rad] and translation [m]."""
+        squares = self.reduced.errors.reshape(-1, 2, 3) ** 2
+        return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
+
+    def most_likely(self, start: FloatArray, free: Mask) -> tuple[FloatArray, float]:
+        """The most likely levels, and the negative logarithm of their likelihood.
+
+        Args:
+            start: (r, 2) the levels to start from.
+            free: (2 r,) which of them are sought, robot by robot.
+        """
+        seen = np.flatnonzero(self.seen).tolist()
+        sigmas, value = estimate_sigmas(
+            self.reduced.errors,
+            self.reduced.slopes[:, :, self.moving],
+            self.components,
+            self.known,
+            start.ravel(),
+            replace(RATIO_PRIOR, places=tuple((2 * it, 2 * it + 1) for it in seen)),
+            free,
+        )
+        return sigmas.reshape(start.shape), value
+
+
+def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
+    """The likelihood of the robots' levels, those of the sensors being known."""
     _, members = problem.units
-    if not len(members):
-        return noise.robots
-    reduced = reduce(problem, state, problem.linear(state), _weights(problem, noise))
+    reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
     count, width = len(problem.robots), members.shape[1]
     parts = np.zeros((2 * count, len(members), 6 * width, 6 * width))
     for robot in range(count):
@@ -256,27 +342,17 @@ def _robots(problem: Problem, state: State, noise: Noise, *, from_above: bool) -
         for axis in range(3):
             at = 6 * slots + axis
             parts[2 * robot, rows, at, at] = parts[2 * robot + 1, rows, at + 3, at + 3] = 1.0
-    seen = np.array([(members == it).any() for it in range(count)])
-    places = tuple((2 * it, 2 * it + 1) for it in np.flatnonzero(seen).tolist())
-    start = np.maximum(_ABOVE * noise.robots.ravel(), _ABOVE_NOTHING)
-    if from_above:
-        squares = np.mean(reduced.errors.reshape(-1, 2, 3) ** 2, axis=(0, 2))
-        start = np.tile(np.maximum(np.sqrt(squares), _START_SIGMA), count)
-    moving = problem.moving
-    known = reduced.covariance.copy()
+    moving, known = problem.moving, reduced.covariance.copy()
     if problem.repeats:
         first = len(members) - len(problem.repeats)
         known[first:] += problem.error_covariance(noise)[first:]
-    sigmas, _ = estimate_sigmas(
-        reduced.errors,
-        reduced.slopes[:, :, moving],
+    return RobotLikelihood(
+        reduced,
         Components(known, parts),
         Knowledge(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
-        np.where(np.repeat(seen, 2), start, noise.robots.ravel()),
-        replace(RATIO_PRIOR, places=places),
-        np.repeat(seen, 2),
+        moving,
+        np.array([(members == it).any() for it in range(count)]),
     )
-    return sigmas.reshape(count, 2)
 
 
 def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
@@ -286,9 +362,9 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
         (n,) squared residuals in units of their own noise, and (n,) the redundancy of each: how
         many of its directions were left over to judge by, of which those squares are an estimate.
     """
-    weights = _weights(problem, noise)
-    linear = problem.linear(state)
-    reduced = reduce(problem, state, linear, weights)
+    own = problem.covariance(noise)
+    weights, linear = np.linalg.inv(own), problem.linear(state)
+    reduced = reduce(problem, state, linear, own)
     errors = problem.error_covariance(noise)
     known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units
@@ -356,7 +432,7 @@ def equations_from(
         Each stop with what it and all after it say: what is known besides does not count.
     """
     state, noise = solution.state, solution.noise
-    weights = _weights(problem, noise)
+    weights = np.linalg.inv(problem.covariance(noise))
     linear = problem.linear(state)
     stops, of = problem.observations.stops, problem.units[0]
     every = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)

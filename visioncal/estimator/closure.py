@@ -21,40 +21,35 @@ with the same values, that is the bundle adjustment of corners, lens, board and 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step, gram
+from visioncal.estimation.problem import Effect, FramePrior, Observations, Problem, State
+from visioncal.estimation.problem import Noise as Levels
+from visioncal.estimation.solve import (
+    fisher_information,
+    fit_problem,
+    fitted_covariance,
+    robot_levels,
+    solve_problem,
+    starting_noise,
+)
+from visioncal.estimation.solve import (
+    normal_equations as information_and_gradient,
+)
+from visioncal.estimation.tree import Branch, Tree
+from visioncal.estimator.linalg import covariance
 from visioncal.estimator.measured import Measured
 from visioncal.estimator.shared import Shared
-from visioncal.estimator.variance import (
-    Components,
-    Knowledge,
-    RatioPrior,
-    estimate_sigmas,
-)
-from visioncal.transforms import (
-    adjoint,
-    exp,
-    inverse_right_jacobian,
-    invert,
-    log,
-    mean_transform,
-    rotation_angle,
-)
+from visioncal.estimator.variance import Components, Knowledge
+from visioncal.transforms import adjoint, exp, invert, log, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
 
-_ROUNDS = 20
-_SETTLED = 1e-10
 # Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
 _CHOSEN = 1e12
 # Variances of a direction that a pose leaves open are above this [rad^2].
 _OPEN = 0.05
-# Noise levels are started from above: at least here [rad and m].
-_START_SIGMAS = np.array([5e-4, 5e-4])
-# Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
-RATIO_PRIOR = RatioPrior(ratio=0.6, spread=1.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +77,50 @@ class Closure:
 
     def __len__(self) -> int:
         return len(self.robot)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The frames and the views as the estimation has them."""
+        camera, target = ("flange", "base") if self.mount == "eye-in-hand" else ("base", "flange")
+        poses = self.robot if self.mount == "eye-in-hand" else invert(self.robot)
+        unknown = {"cam": Branch(camera), "target": Branch(target)}
+        tree = Tree("base", {"flange": Branch("base", robot="robot"), **unknown})
+        known, shared, count = self.camera_covariance, self.shared, len(self)
+        observations = Observations(
+            ("cam",) * count,
+            ("target",) * count,
+            np.arange(count),
+            np.full(count, -1),
+            self.camera,
+            np.zeros((count, 6, 6)) if known is None else known,
+            np.ones(count, dtype=bool),
+        )
+        effects: tuple[Effect, ...] = ()
+        if shared is not None:
+            known_of = Knowledge(shared.information, shared.pull)
+            effects = (
+                Effect(
+                    "shared",
+                    self.unchanged,
+                    known_of,
+                    shared.anchor > 0.0,
+                    shared.by_camera,
+                    {"robot": shared.by_flange},
+                ),
+            )
+        hangs = {0: (camera, "cam"), 1: (target, "target")}
+        return Problem(
+            tree,
+            {"robot": poses},
+            observations,
+            effects,
+            tuple(
+                FramePrior(*hangs[it.edge], it.axes, it.values_m, it.sigma_m)
+                for it in self.measured
+            ),
+            frozenset() if self.guess is None else frozenset({"target"}),
+            is_combined=known is None,
+        )
 
     @property
     def unchanged(self) -> FloatArray:
@@ -192,6 +231,11 @@ class Noise:
     sigma_m: float
 
     @property
+    def levels(self) -> Levels:
+        """As the estimation has them."""
+        return Levels(self.sigmas[None], np.zeros(0))
+
+    @property
     def sigmas(self) -> FloatArray:
         """Both as (2,): rotation, translation."""
         return np.array([self.sigma_rad, self.sigma_m])
@@ -204,6 +248,11 @@ class Edges:
     x: FloatArray
     z: FloatArray
     shared: FloatArray
+
+    @property
+    def state(self) -> State:
+        """As the estimation has them."""
+        return State(np.stack([self.x, self.z]), self.shared)
 
     def moved(self, step: FloatArray) -> "Edges":
         """Returns the unknowns after a (12 + k,) step, on the right of both edges."""
@@ -243,13 +292,8 @@ def fit_closure(data: Closure, edges: Edges) -> ClosureFit:
     Returns:
         The unknowns and the noise.
     """
-    noise, settled = estimate_noise(data, edges), False
-    for _ in range(_ROUNDS):
-        edges, settled = solve_closure(data, edges, noise)
-        before, noise = noise, estimate_noise(data, edges)
-        if np.allclose(before.sigmas, noise.sigmas, rtol=1e-4):
-            break
-    return ClosureFit(edges, noise, settled)
+    found = fit_problem(data.problem, edges.state)
+    return ClosureFit(_edges(found.state), _noise(found.noise), found.settled)
 
 
 def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, bool]:
@@ -258,51 +302,19 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
     Returns:
         The unknowns, and whether they came to rest.
     """
-    # Held at the start: weights that follow the edges would reward edges with large noise.
-    weights = _weights(data, edges.z, noise)
-
-    def linearise(at: Edges) -> Linearised[Edges]:
-        residuals, jacobian = _linear(data, at)
-        weighted, known = weights @ jacobian, knowledge_of(data, at)
-        information = gram(jacobian, weighted) + known.information
-        gradient = gram(weighted, residuals) + known.pull
-        cost = np.einsum("mi,mij,mj->", residuals, weights, residuals)
-        cost += sum(it.cost(at.x, at.z) for it in data.measured)
-        if data.shared is not None:
-            cost += at.shared @ (data.shared.pull + known.pull[12:])
-        return Linearised(
-            at,
-            float(cost),
-            lambda damping: at.moved(damped_step(information, gradient, damping)),
-        )
-
-    return descend(edges, linearise, _SETTLED)
+    state, settled = solve_problem(data.problem, edges.state, noise.levels)
+    return _edges(state), settled
 
 
 def closure_jacobian(data: Closure, edges: Edges) -> FloatArray:
     """Derivatives (m, 6, 12 + k) of the residuals by the unknowns' steps: x, z, shared."""
-    return _linear(data, edges)[1]
-
-
-def _linear(data: Closure, edges: Edges) -> tuple[FloatArray, FloatArray]:
-    """Residuals (m, 6) and their derivatives (m, 6, 12 + k)."""
-    seen = data.under(edges.shared)
-    error = invert(edges.z) @ seen.placed(edges.x)
-    residuals = log(error)
-    log_slope = inverse_right_jacobian(residuals)
-    blocks = [log_slope @ adjoint(invert(seen.camera)), -log_slope @ adjoint(invert(error))]
-    if data.shared is not None:
-        # The change is so small that the order of its steps does not matter.
-        flange = flange_to_residual(seen, edges) @ data.shared.by_flange
-        blocks.append(log_slope @ (data.shared.by_camera + flange))
-    return residuals, np.concatenate(blocks, axis=2)
+    return data.problem.linear(edges.state).jacobian
 
 
 def flange_to_residual(data: Closure, edges: Edges) -> FloatArray:
-    """How a small motion of each view's flange moves its residual, (m, 6, 6), at a closed chain."""
-    if data.mount == "eye-in-hand":
-        return adjoint(invert(edges.x @ data.camera))
-    return -adjoint(invert(data.placed(edges.x)))
+    """How a small motion of each view's flange moves its residual, (m, 6, 6)."""
+    loose = replace(data.problem, is_combined=False)
+    return loose.linear(edges.state).by_errors
 
 
 def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
@@ -311,12 +323,8 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     It is taken where the chain closes exactly: at the measured poses their noise would pass for
     information about directions that the motion leaves open.
     """
-    slopes, camera, robot = weighted_slopes(data, edges, noise)
-    information = gram(slopes, (camera + robot) @ slopes)
-    information += _of_edges(data, edges, len(information))
-    if data.shared is not None:
-        information[12:, 12:] += data.shared.information
-    return np.asarray(information)
+    found = fisher_information(data.problem, edges.state, noise.levels)
+    return np.asarray(found + np.diag(np.where(data.problem.counted, 0.0, _CHOSEN)))
 
 
 def held_shift(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
@@ -325,25 +333,22 @@ def held_shift(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
     What is held is wrong by what is open about it, and by how far the data pull at it: beside the
     covariance, which counts the former, the square of this shift is the error of holding.
     """
-    shift = np.zeros(12 + len(edges.shared))
-    if data.shared is None or not data.shared.anchor.any():
+    problem, shift = data.problem, np.zeros(12 + len(edges.shared))
+    held = problem.counted & ~problem.moving
+    if not held.any():
         return shift
-    held = data.shared.anchor > 0.0
-    still = replace(edges, shared=np.where(held, 0.0, edges.shared))
+    still = replace(edges, shared=np.where(held[12:], 0.0, edges.shared))
     pull = normal_equations(data, still, noise)[1]
-    shift[12:][held] = pull[12:][held]
+    shift[held] = pull[held]
     return np.asarray(-covariance(closure_information(data, edges, noise)) @ shift)
 
 
 def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Information (12 + k, 12 + k) and gradient (12 + k,) of half the whitened squared error."""
-    residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    known = knowledge_of(data, edges)
-    weighted = np.linalg.solve(spread, jacobian)
-    return (
-        gram(jacobian, weighted) + known.information,
-        gram(weighted, residuals) + known.pull,
-    )
+    problem = data.problem
+    information, gradient = information_and_gradient(problem, edges.state, noise.levels)
+    scale = np.maximum(np.diag(information), 1.0)
+    return information + np.diag(np.where(problem.moving, 0.0, _CHOSEN * scale)), gradient
 
 
 def left_out_residuals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
@@ -352,7 +357,7 @@ def left_out_residuals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
     By the identity of Cook and Weisberg (1982, section 2.2), with the noise as it is.
     """
     residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    fitted = covariance(normal_equations(data, edges, noise)[0])
+    fitted = fitted_covariance(data.problem, edges.state, noise.levels)
     taken = jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
     return np.asarray((spread @ covariance(spread - taken) @ residuals[:, :, None])[:, :, 0])
 
@@ -366,10 +371,8 @@ def weighted_slopes(
         (m, 6, 12 + k) inverse covariance of each residual times its derivatives, and the (m, 6, 6)
         covariances that the camera and the robot contribute to the residual.
     """
-    jacobian, components = _where_it_closes(data, edges)
-    total = components.total(noise.sigmas)
-    slopes = np.asarray(np.linalg.solve(total, jacobian), dtype=float)
-    return slopes, components.known, total - components.known
+    jacobian, camera, total = _where_it_closes(data, edges, noise)
+    return np.asarray(np.linalg.solve(total, jacobian), dtype=float), camera, total - camera
 
 
 def whitened_slopes(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
@@ -378,24 +381,26 @@ def whitened_slopes(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
     Their squares, summed over the views, are all of `closure_information` but what is known of the
     shared unknowns without the robot.
     """
-    jacobian, components = _where_it_closes(data, edges)
-    roots = np.linalg.cholesky(components.total(noise.sigmas))
-    return np.asarray(np.linalg.solve(roots, jacobian))
+    jacobian, _, total = _where_it_closes(data, edges, noise)
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(total), jacobian))
 
 
-def _where_it_closes(data: Closure, edges: Edges) -> tuple[FloatArray, Components]:
-    """Derivatives of the residuals, and what makes up their covariances, at exact poses."""
-    ideal = replace(data, camera=data.predicted_camera(edges.x, edges.z))
-    jacobian = closure_jacobian(ideal, replace(edges, shared=data.unchanged))
-    return jacobian, components_of(data, edges.z)
+def _where_it_closes(
+    data: Closure, edges: Edges, noise: Noise
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives of residuals at exact poses, and covariances: the camera's, and all."""
+    problem = data.problem
+    linear = problem.linear(State(edges.state.edges, problem.start_values), ideal=True)
+    camera = problem.covariance(noise.levels)
+    return linear.jacobian, camera, problem.total_covariance(linear, noise.levels)
 
 
 def residual_blocks(
     data: Closure, edges: Edges, noise: Noise
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (m, 6), their derivatives (m, 6, 12 + k) and their covariances (m, 6, 6)."""
-    spread = components_of(data, edges.z).total(noise.sigmas)
-    return _residuals(data, edges), closure_jacobian(data, edges), spread
+    linear = data.problem.linear(edges.state)
+    return linear.residuals, linear.jacobian, data.problem.total_covariance(linear, noise.levels)
 
 
 def estimate_noise(data: Closure, edges: Edges) -> Noise:
@@ -405,42 +410,14 @@ def estimate_noise(data: Closure, edges: Edges) -> Noise:
 
 def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
     """The noise's most likely levels, and their negative restricted log-likelihood."""
-    residuals = _residuals(data, edges)
-    rms = np.sqrt([np.mean(residuals[:, :3] ** 2), np.mean(residuals[:, 3:] ** 2)])
-    sigmas, value = estimate_sigmas(
-        residuals,
-        closure_jacobian(data, edges),
-        components_of(data, edges.z),
-        knowledge_of(data, edges),
-        np.maximum(rms, _START_SIGMAS),
-        RATIO_PRIOR,
-    )
-    return Noise(float(sigmas[0]), float(sigmas[1])), value
+    problem = data.problem
+    levels, value = robot_levels(problem, edges.state, starting_noise(problem), from_above=True)
+    return _noise(replace(starting_noise(problem), robots=levels)), value
 
 
 def knowledge_of(data: Closure, edges: Edges) -> Knowledge:
     """What is known of the unknowns without the robot: of edges and of what is shared."""
-    size = 12 + len(edges.shared)
-    information, pull = _of_edges(data, edges, size), np.zeros(size)
-    for it in data.measured:
-        pull += it.pull(edges.x, edges.z, size)
-    if data.shared is not None:
-        information[12:, 12:] = data.shared.information + np.diag(data.shared.anchor)
-        pull[12:] = data.shared.pull + information[12:, 12:] @ edges.shared
-    return Knowledge(information, pull)
-
-
-def _of_edges(data: Closure, edges: Edges, size: int) -> FloatArray:
-    """Information (size, size) on the edges without any view: what was measured or is chosen.
-
-    A matter of choice is the target's rotation, where places alone were read.
-    """
-    information = np.zeros((size, size))
-    for it in data.measured:
-        information += it.information(edges.x, edges.z, size)
-    if data.guess is not None:
-        information[6:9, 6:9] += _CHOSEN * np.eye(3)
-    return information
+    return data.problem.knowledge(edges.state)
 
 
 def components_of(data: Closure, z: FloatArray) -> Components:
@@ -458,10 +435,9 @@ def components_of(data: Closure, z: FloatArray) -> Components:
     return Components(data.camera_covariance, parts)
 
 
-def _weights(data: Closure, z: FloatArray, noise: Noise) -> FloatArray:
-    """Inverse covariances (m, 6, 6) of the residuals."""
-    return np.asarray(np.linalg.inv(components_of(data, z).total(noise.sigmas)))
+def _edges(state: State) -> Edges:
+    return Edges(state.edges[0], state.edges[1], state.values)
 
 
-def _residuals(data: Closure, edges: Edges) -> FloatArray:
-    return log(invert(edges.z) @ data.under(edges.shared).placed(edges.x))
+def _noise(noise: Levels) -> Noise:
+    return Noise(float(noise.robots[0, 0]), float(noise.robots[0, 1]))

@@ -4,17 +4,9 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.estimator.closure import (
-    RATIO_PRIOR,
-    Closure,
-    Edges,
-    Noise,
-    components_of,
-    knowledge_of,
-    noise_likelihood,
-    residual_blocks,
-)
-from visioncal.estimator.variance import estimate_sigmas, profile_interval
+from visioncal.estimation.solve import robot_likelihood
+from visioncal.estimator.closure import Closure, Edges, Noise, noise_likelihood
+from visioncal.estimator.variance import profile_interval
 from visioncal.types import FloatArray
 
 
@@ -31,15 +23,14 @@ def noise_intervals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
         zero where the residuals do not speak against no noise at all, and a high of fifty times the
         level where they do not speak against that.
     """
-    residuals, jacobian, _ = residual_blocks(data, edges, noise)
-    components, known = components_of(data, edges.z), knowledge_of(data, edges)
+    problem = data.problem
+    likelihood = robot_likelihood(problem, edges.state, noise.levels)
     lowest = noise_likelihood(data, edges)[1]
 
     def profile(level: int, logarithm: float) -> float:
         start, others = noise.sigmas.copy(), np.arange(2) != level
         start[level] = np.exp(logarithm)
-        fitted = estimate_sigmas(residuals, jacobian, components, known, start, RATIO_PRIOR, others)
-        return fitted[1]
+        return likelihood.most_likely(start[None], others)[1]
 
     return np.array(
         [

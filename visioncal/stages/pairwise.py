@@ -23,6 +23,8 @@ _NULL_RATIO, _WORST_M = 1e-8, 0.1
 _AGREE_M = 0.02
 # Noise by which pairs are weighed against each other [rad, m].
 _USUAL = Noise(5e-4, 5e-4)
+# ... and so little is the camera's beside it [rad and m].
+_EXACT = 1e-6
 
 
 def some(candidates: Candidates, rows: IntArray) -> Candidates:
@@ -84,7 +86,8 @@ def hand_eye(
     if trimmed > _AGREE_M * half:
         return None
     picked = candidates.poses[chosen, picks[chosen]]
-    data = Closure(mount, robot[chosen], picked, np.zeros((len(chosen), 6, 6)))
+    exact = np.tile(_EXACT**2 * np.eye(6), (len(chosen), 1, 1))
+    data = Closure(mount, robot[chosen], picked, exact)
     information = closure_information(data, Edges(*edges, np.zeros(0)), _USUAL)
     if spectrum(information).ratio < _NULL_RATIO:
         return None
