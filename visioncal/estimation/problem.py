@@ -558,9 +558,10 @@ class Problem:
             )
         for rows in self.repeats:
             errors[rows, :, :6] = np.eye(6)
+        by_errors = by_predicted @ errors
         if self.is_combined:
-            errors = -np.broadcast_to(np.eye(6), errors.shape)
-        return Linear(residuals, tuple(blocks), by_predicted @ errors, self.size)
+            by_errors = np.broadcast_to(np.eye(6), errors.shape)
+        return Linear(residuals, tuple(blocks), by_errors, self.size)
 
     @cached_property
     def _moved_groups(self) -> tuple[tuple[IntArray, FloatArray], ...]:

@@ -96,9 +96,12 @@ def solve_problem(problem: Problem, state: State, noise: Noise) -> tuple[State, 
         The unknowns, and whether they converged.
     """
     own, errors, moving = problem.covariance(noise), problem.error_covariance(noise), problem.moving
+    # Held at the start: weights that follow the unknowns would reward those with large noise.
+    by_errors = problem.linear(state, ideal=True).by_errors
 
     def linearise(at: State) -> Linearised[State]:
-        reduced = reduce(problem, at, problem.linear(at), own)
+        linear = replace(problem.linear(at), by_errors=by_errors)
+        reduced = reduce(problem, at, linear, own)
         information, gradient, cost = _whole(reduced, errors)
         free, slope = information[np.ix_(moving, moving)], gradient[moving]
 
@@ -138,8 +141,8 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
             rows = block.rows[single]
             turned = np.linalg.inv(linear.by_errors[rows, :, :6])
             answer[np.ix_(of[rows], np.arange(6), columns)] = turned @ every[single]
-            known = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
-            inverse[of[rows], :6, :6] = known
+            spread = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
+            inverse[of[rows], :6, :6] = spread
             inverse[of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
         rows, every = block.rows[~single], every[~single]
         if not len(rows):
