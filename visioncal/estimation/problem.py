@@ -386,11 +386,11 @@ class Problem:
 
     @cached_property
     def alone(self) -> Mask:
-        """(n,) which observations share the error of one robot's flange with no other."""
+        """(n,) which poses share the error of one robot's flange with no other observation."""
         of, members = self.units
         count = np.bincount(of[of >= 0], minlength=len(members))
         single = (count == 1) & (members >= 0).any(axis=1) & (members[:, 1:] < 0).all(axis=1)
-        found = of >= 0
+        found = (of >= 0) & self.observations.has_rotation
         found[found] = single[of[found]]
         return found
 
@@ -404,7 +404,7 @@ class Problem:
 
     @cached_property
     def _robot_units(self) -> tuple[IntArray, IntArray]:
-        if self.is_combined:
+        if self.is_combined:  # every observation is a unit of its own
             return np.arange(len(self)), np.zeros((len(self), 1), dtype=np.int64)
         count, joined = len(self.robots), []
         first = np.full(len(self), -1, dtype=np.int64)

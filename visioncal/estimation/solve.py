@@ -13,7 +13,7 @@ from visioncal.types import FloatArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-10
 # Noise levels that change by less have settled, far below what is known of them.
-_LEVELS_SETTLED = 1e-4
+_LEVELS_SETTLED = 1e-3
 # Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
 RATIO_PRIOR = RatioPrior(ratio=0.6, spread=1.5)
 # Robots' noise levels are started from above: at least here [rad and m].
