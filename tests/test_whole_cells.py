@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import visioncal
-from whole_cells import LATER, misfit, part, recorded, saved, simulated, truth
+from whole_cells import FLOOR, LATER, misfit, part, recorded, saved, simulated, truth
 
 import visioncal as package
 from visioncal.calibration import Alignment, Calibration, RobotResult, to_document
 from visioncal.errors import DataError
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.simulation import BoardAt, NetworkOptions, RobotAt, simulate_network
 from visioncal.stored import load_result
 from visioncal.transforms import invert, log
 from visioncal.verification import verify
@@ -105,6 +106,27 @@ def test_one_camera_robot_and_target_are_as_near_as_their_covariance_says(
     ends = (f"cam_{camera}", f"target_{target}")
     mine = [it.view for it in found.cell.sights if (it.seer, it.seen) == ends]
     assert [it.view for it in one.views] == mine
+
+
+def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_path):
+    options = NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=12
+    )
+    several = recorded(simulate_network(options))
+    plain = {it: several.document[it] for it in ("schema", "name", "cameras")}
+    columns = [it for it in several.columns if it not in ("robot", "target")]
+    session = Session.assemble(
+        {**plain, "mount": "eye-to-hand", "robot": {"model": "ur5e"}, "target": FLOOR.name},
+        columns,
+        [[view.cell(it) for it in columns] for view in several.views],
+        several.images,
+        corners=several.corner_table,
+    )
+    package.calibrate(session).save(tmp_path / "calibration.json")
+    found = Calibration.load(tmp_path)
+    assert set(to_document(found)["robots"]) == {"robot"}
+    assert found.of("left", "robot", "target").joint_covariance.shape == (12, 12)
+    assert len(found.of("right").views) == len(session.of("right").views)
 
 
 def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):

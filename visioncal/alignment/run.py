@@ -30,7 +30,7 @@ from visioncal.alignment.looking import Looked, look_around
 from visioncal.alignment.priors import prior_components
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
-from visioncal.alignment.written import corner_residuals, fit_sections, pose_noise
+from visioncal.alignment.written import corner_residuals, fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
@@ -230,8 +230,6 @@ def _noise(solved: Solved) -> dict[str, dict[str, float]]:
     )
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=True):
         found[frame] = {**found.get(frame, {}), "level": level}
-    for frame, levels in pose_noise(solved).items():
-        found[frame] |= levels
     return found
 
 

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.alignment.reading import nominal_spread
-from visioncal.alignment.solving import Solved, is_sensed, sensors_of
+from visioncal.alignment.solving import Solved
 from visioncal.estimator.appearance import BOARD_NAMES, shape_slices
 from visioncal.estimator.corners import reproject
 from visioncal.session import Session
@@ -34,26 +33,6 @@ def corner_residuals(solved: Solved) -> dict[int, tuple[int, float]]:
         counted = zip(stack.views, stack.counts.tolist(), np.sqrt(squares).tolist(), strict=True)
         found |= {view: (count, px) for view, count, px in counted}
     return found
-
-
-def pose_noise(solved: Solved) -> dict[str, dict[str, float]]:
-    """Noise of the poses that cameras measured without corners, per axis, by frame."""
-    sigma = np.sqrt(np.diag(nominal_spread()))
-    frames = sensors_of(solved.cell, solved.poses)
-    levels = dict(zip(frames, solved.agreed.fit.noise.sensors.tolist(), strict=False))
-    measured = {
-        row.seer
-        for row, view in zip(solved.cell.rows, solved.poses, strict=True)
-        if row.seer.startswith("cam") and is_sensed(row.seer, view)
-    }
-    return {
-        frame: {
-            "translation_mm": 1e3 * levels[frame] * float(sigma[3]),
-            "rotation_deg": float(np.rad2deg(levels[frame] * sigma[0])),
-        }
-        for frame in frames
-        if frame in measured
-    }
 
 
 def fit_sections(

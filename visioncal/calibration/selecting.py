@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from visioncal.calibration.alignment import Alignment
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame
-from visioncal.calibration.parts import CameraResult, RobotResult, Validation, Verdict
+from visioncal.calibration.parts import CameraResult, Rms, RobotResult, Validation, Verdict
 from visioncal.calibration.whole import rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
@@ -68,7 +68,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
             for at, (name, (matrix, _)) in enumerate(chain.items())
         },
         "joint_covariance": spread,
-        "noise": _noise(cell, chosen),
+        "noise": _noise(cell, chosen, rms),
         "views": view_results(sights),
         "rms": rms,
         "validation": Validation(NOT_LEFT_OUT, rms),
@@ -114,15 +114,21 @@ def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, Float
     return {name: cell.way(*pair) for name, pair in ends.items() if pair[1]}
 
 
-def _noise(cell: Alignment, chosen: Chosen) -> dict[str, float]:
-    """The camera's noise and the robot's; together, where poses were measured without corners."""
+def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
+    """The noise of corners and of the robot.
+
+    Of poses that were measured without corners, that of camera and robot together is as this pair
+    scatters: the camera's own level is a mean over all that it sees, near and far.
+    """
     robot, camera = (cell.noise.get(it, {}) for it in (chosen.robot or "robot", chosen.camera))
     found = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
-    for unit in ("translation_mm", "rotation_deg"):
-        if unit in robot:
-            found[f"robot_{unit}"] = robot[unit]
-        if unit in camera:
-            found[f"combined_{unit}"] = float(np.hypot(camera[unit], robot.get(unit, 0.0)))
+    names = ("translation_mm", "rotation_deg")
+    found |= {f"robot_{name}": robot[name] for name in names if name in robot}
+    if chosen.camera and chosen.target and "pixel_px" not in camera:
+        each = (rms.mm, rms.deg or 0.0)
+        found |= {
+            f"combined_{name}": it / np.sqrt(3.0) for name, it in zip(names, each, strict=True)
+        }
     return found
 
 

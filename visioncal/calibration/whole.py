@@ -161,11 +161,9 @@ def _view_document(cell: Alignment, sight: Sight) -> dict[str, Any]:
     both = {sight.seer, sight.seen} <= cell.frames.keys()
     robots = robots_between(cell.frames, sight.seer, sight.seen) if both else ()
     figures = {name: it for name, it in vars(sight).items() if name not in ("seer", "seen")}
-    return present(
-        figures
-        | {seer: thing_name(sight.seer, seer), seen: thing_name(sight.seen, seen)}
-        | {"robots": [it or "robot" for it in robots]}
-    )
+    named = {seer: thing_name(sight.seer, seer), seen: thing_name(sight.seen, seen)}
+    of = {"view": sight.view, "stop": sight.stop, **named}
+    return present(of | {"robots": [it or "robot" for it in robots]} | figures)
 
 
 def _sight(tree: Mapping[str, str], document: Mapping[str, Any]) -> Sight:

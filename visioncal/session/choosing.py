@@ -115,8 +115,8 @@ _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "
 
 def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
     """The frame of what is named."""
-    for frame in (name, frame_name(_KINDS[part], name)):
-        if frame in known:
+    for frame in known:
+        if name in (frame, thing_name(frame, part)):
             return frame
     names = [thing_name(it, part) for it in known]
     raise DataError(
