@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
-from visioncal.estimator.linalg import covariance
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
+from visioncal.estimation.linalg import covariance
 from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.tell import ArmData
 from visioncal.transforms import exp, invert

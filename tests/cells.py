@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.estimator.boards import place
+from visioncal.estimation.boards import place
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import numbered_through
 from visioncal.pipeline.steps import STAGES

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import expm
 
-from visioncal.estimator.features import FeatureTouches
-from visioncal.estimator.pointpairs import PointPairs
+from visioncal.estimation.features import FeatureTouches
+from visioncal.estimation.pointpairs import PointPairs
 from visioncal.transforms import skew
 from visioncal.types import FloatArray
 

@@ -8,9 +8,9 @@ from cells import calibrated, error_of, known_of
 from scipy.stats import chi2
 
 from visioncal.camera import intrinsics
-from visioncal.estimator.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
-from visioncal.estimator.corners import CornerStack
-from visioncal.estimator.poses import reproject
+from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.poses import reproject
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.targets import corner_positions
 from visioncal.transforms import invert, log

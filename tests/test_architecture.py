@@ -30,7 +30,6 @@ LAYERS = (
     ("printing",),
     ("finders",),
     ("solvers",),
-    ("estimator",),
     ("estimation",),
     ("session",),
     ("evidence",),

@@ -7,7 +7,7 @@ import pytest
 from cells import calibrated, error_of
 
 import visioncal
-from visioncal.estimator.arm import LEVER_M, link_basis, pose_basis
+from visioncal.estimation.arm import LEVER_M, link_basis, pose_basis
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.transforms import compose, exp, invert, log

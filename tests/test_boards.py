@@ -9,9 +9,9 @@ from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.boards import Boards, place
-from visioncal.estimator.closure import Noise, closure_information
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.boards import Boards, place
+from visioncal.estimation.closure import Noise, closure_information
+from visioncal.estimation.workspace import postures
 from visioncal.frames.sighting import sighting
 from visioncal.outputs import write_outputs
 from visioncal.pipeline.guessing import guess_session

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.estimator.causes import Belief, Cause, _at, explain, undone
-from visioncal.estimator.closure import Closure, Edges, Noise
+from visioncal.estimation.causes import Belief, Cause, _at, explain, undone
+from visioncal.estimation.closure import Closure, Edges, Noise
 from visioncal.transforms import adjoint, exp, invert, log
 
 NOISE = Noise(1e-4, 1e-4)

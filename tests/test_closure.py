@@ -7,9 +7,8 @@ import pytest
 from cells import calibrated
 
 from visioncal.errors import ConvergenceError
-from visioncal.estimation.solve import RATIO_PRIOR
-from visioncal.estimator import joint
-from visioncal.estimator.closure import (
+from visioncal.estimation import joint
+from visioncal.estimation.closure import (
     Closure,
     closure_jacobian,
     components_of,
@@ -20,8 +19,9 @@ from visioncal.estimator.closure import (
     residual_blocks,
     solve_closure,
 )
-from visioncal.estimator.shared import Shared
-from visioncal.estimator.variance import Components, Knowledge, _likelihood, estimate_sigmas
+from visioncal.estimation.shared import Shared
+from visioncal.estimation.solve import RATIO_PRIOR
+from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)

@@ -7,8 +7,8 @@ import pytest
 from cells import calibrated, error_of
 
 from visioncal.errors import DegenerateError
-from visioncal.estimator.closure import Closure, ClosureFit, Edges, fit_closure, solve_closure
-from visioncal.estimator.consensus import agreeing_views, surprises, whole_units
+from visioncal.estimation.closure import Closure, ClosureFit, Edges, fit_closure, solve_closure
+from visioncal.estimation.consensus import agreeing_views, surprises, whole_units
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 from visioncal.stages.agree import agree
 from visioncal.transforms import exp, invert
@@ -38,7 +38,7 @@ def test_just_the_wrong_views_are_left_out(world, wrong):
 def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch):
     fits = []
     monkeypatch.setattr(
-        "visioncal.estimator.consensus.fit_closure",
+        "visioncal.estimation.consensus.fit_closure",
         lambda data, edges: fits.append(len(data)) or fit_closure(data, edges),
     )
     cell = simulate(replace(WORLDS["fine, given"], views=600, seed=3))

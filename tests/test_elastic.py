@@ -13,8 +13,8 @@ from test_kinematics import GOOD, WRONG_LINKS, error_m
 import visioncal
 from visioncal.compensation.correction import correct
 from visioncal.errors import DataError
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.workspace import postures
 from visioncal.exports import document
 from visioncal.pipeline.result import result_of
 from visioncal.planning.information import stop_factors

@@ -9,8 +9,8 @@ from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.features import FeatureProblem, fit_features
-from visioncal.estimator.groups import fit_groups
+from visioncal.estimation.features import FeatureProblem, fit_features
+from visioncal.estimation.groups import fit_groups
 
 NOISE_M = 1e-4
 ONE_EACH = ("origin", "x", "xy")

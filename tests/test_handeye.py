@@ -9,8 +9,8 @@ from cells import calibrated, error_of
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
-from visioncal.estimator.boards import Boards
-from visioncal.estimator.closure import (
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.closure import (
     Closure,
     Edges,
     Noise,
@@ -19,8 +19,8 @@ from visioncal.estimator.closure import (
     fit_closure,
     solve_closure,
 )
-from visioncal.estimator.linalg import covariance, damped_step, spectrum
-from visioncal.estimator.shared import Shared
+from visioncal.estimation.linalg import covariance, damped_step, spectrum
+from visioncal.estimation.shared import Shared
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, exact, measured_poses, simulate
 from visioncal.solvers import SOLVERS

@@ -17,9 +17,9 @@ from tracked import (
 
 import visioncal
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.closure import Closure, Edges
-from visioncal.estimator.positions import Mounting, Places, fit_mounting, supplied_poses
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.closure import Closure, Edges
+from visioncal.estimation.positions import Mounting, Places, fit_mounting, supplied_poses
+from visioncal.estimation.workspace import postures
 from visioncal.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation.arms import forward

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimator.workspace import pose_slopes, postures
+from visioncal.estimation.workspace import pose_slopes, postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows
 from visioncal.pipeline.result import result_of

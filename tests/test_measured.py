@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DegenerateError
-from visioncal.estimator.closure import Edges
-from visioncal.estimator.measured import Measured
+from visioncal.estimation.closure import Edges
+from visioncal.estimation.measured import Measured
 from visioncal.pipeline import calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES

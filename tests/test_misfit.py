@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 
-from visioncal.estimator.budget import covariance_by_source, point_covariance
-from visioncal.estimator.closure import closure_information
-from visioncal.estimator.intervals import noise_intervals
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.misfit import drift, neighbours
+from visioncal.estimation.budget import covariance_by_source, point_covariance
+from visioncal.estimation.closure import closure_information
+from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.misfit import drift, neighbours
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.stages.diagnose import _radius95
 from visioncal.transforms import exp

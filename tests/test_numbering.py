@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from parts import placed, some_drawing, some_frame
 
-from visioncal.estimator import numbering as module
-from visioncal.estimator.numbering import find_numbering
+from visioncal.estimation import numbering as module
+from visioncal.estimation.numbering import find_numbering
 
 NOISE_M = 1e-4
 NAMES = [f"P{at}" for at in range(40)]

@@ -21,10 +21,10 @@ from touched import (
 )
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.closure import Noise
-from visioncal.estimator.pivot import fit_pivot
-from visioncal.estimator.readings import readings_that_close
-from visioncal.estimator.touching import Placed, Touches, TouchProblem
+from visioncal.estimation.closure import Noise
+from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.readings import readings_that_close
+from visioncal.estimation.touching import Placed, Touches, TouchProblem
 from visioncal.transforms import compose, exp, invert
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

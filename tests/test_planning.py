@@ -9,8 +9,8 @@ from cells import calibrated
 from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.errors import DataError
-from visioncal.estimator.closure import Edges, Noise, closure_information
-from visioncal.estimator.linalg import covariance, covariance_root
+from visioncal.estimation.closure import Edges, Noise, closure_information
+from visioncal.estimation.linalg import covariance, covariance_root
 from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Box
 from visioncal.planning.design import chosen, shortfall

@@ -142,8 +142,8 @@ def test_a_turn_of_all_views_alike_is_only_a_change_of_the_targets_frame():
 
 
 def test_a_start_far_off_finds_the_same_poses():
-    from visioncal.estimator.corners import CornerStack
-    from visioncal.estimator.poses import fit_poses
+    from visioncal.estimation.corners import CornerStack
+    from visioncal.estimation.poses import fit_poses
 
     cell = simulate(CellOptions(views=6, seed=5, pixel_sigma_px=0.1))
     stack = CornerStack.of(corners_of(cell), corner_positions(cell.options.target))

@@ -20,9 +20,9 @@ from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.groups import fit_groups
-from visioncal.estimator.pointfit import Placed, PointProblem, fit_points
-from visioncal.estimator.procrustes import align
+from visioncal.estimation.groups import fit_groups
+from visioncal.estimation.pointfit import Placed, PointProblem, fit_points
+from visioncal.estimation.procrustes import align
 
 NOISE_M = 1e-4
 # Three points in the xy plane, two of them on a line with the origin.

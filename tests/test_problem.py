@@ -17,7 +17,7 @@ from visioncal.estimation.solve import (
     posterior,
     solve_problem,
 )
-from visioncal.estimator.variance import Knowledge
+from visioncal.estimation.variance import Knowledge
 from visioncal.stages.choose import Candidates
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import tie

@@ -11,12 +11,12 @@ from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimator.closure import Closure, closure_information
-from visioncal.estimator.indices import Indices, singular_values
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.parameters import free_parameters, parameter_moves
-from visioncal.estimator.shared import Shared
-from visioncal.estimator.workspace import postures, tool_slopes
+from visioncal.estimation.closure import Closure, closure_information
+from visioncal.estimation.indices import Indices, singular_values
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.parameters import free_parameters, parameter_moves
+from visioncal.estimation.shared import Shared
+from visioncal.estimation.workspace import postures, tool_slopes
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.result import result_of
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
@@ -372,6 +372,6 @@ def test_a_missing_direction_is_in_the_verdict():
     assert not any("that can be told of this arm" in it for it in rich.verdict.reasons)
 
 
-def test_an_unknown_convention_is_refused(tmp_path):
+def test_an_unknown_convention_is_refused(rendered):
     with pytest.raises(DataError, match="'craig' is not one of standard, modified, hayati"):
-        visioncal.calibrate(tmp_path, convention="craig")
+        visioncal.calibrate(rendered, convention="craig")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from visioncal.estimator.clock import clock_closure
-from visioncal.estimator.closure import Edges, closure_jacobian
-from visioncal.estimator.trajectory import Samples, Trajectory
-from visioncal.estimator.turned import Frames
+from visioncal.estimation.clock import clock_closure
+from visioncal.estimation.closure import Edges, closure_jacobian
+from visioncal.estimation.trajectory import Samples, Trajectory
+from visioncal.estimation.turned import Frames
 from visioncal.transforms import exp, invert, log
 from visioncal.types import FloatArray
 

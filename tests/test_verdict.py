@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from visioncal.calibration import Rms, ViewResult
-from visioncal.estimator.closure import Edges, Noise
-from visioncal.estimator.observability import Direction
+from visioncal.estimation.closure import Edges, Noise
+from visioncal.estimation.observability import Direction
 from visioncal.figures import figure
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration import Calibration
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.workspace import postures
 from visioncal.pipeline import calibrate
 from visioncal.robot import load_robot
 from visioncal.session import Session

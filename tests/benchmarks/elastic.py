@@ -18,7 +18,7 @@ from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded,
 from results import WORDS, few, first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.workspace import postures
 from visioncal.robot import Loads, load_robot
 from visioncal.simulation import CellOptions, simulate
 from visioncal.stages.elastic import deflection_words

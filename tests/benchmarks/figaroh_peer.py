@@ -20,11 +20,11 @@ from results import few, first, need, wished, write_section
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 import visioncal
-from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
-from visioncal.estimator.kinematics import LEVELS, fit_level
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import Closure, Edges, Noise, solve_closure
+from visioncal.estimation.kinematics import LEVELS, fit_level
+from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
 from visioncal.solvers import SOLVERS

@@ -31,9 +31,9 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from visioncal.errors import DataError
-from visioncal.estimator.features import fit_features
-from visioncal.estimator.pointfit import fit_points
-from visioncal.estimator.pointpairs import PointPairs
+from visioncal.estimation.features import fit_features
+from visioncal.estimation.pointfit import fit_points
+from visioncal.estimation.pointpairs import PointPairs
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray
 

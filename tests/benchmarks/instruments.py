@@ -21,9 +21,9 @@ from tracked import (
     solved_of,
 )
 
-from visioncal.estimator.closure import Edges, fit_closure
-from visioncal.estimator.positions import fit_mounting
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.closure import Edges, fit_closure
+from visioncal.estimation.positions import fit_mounting
+from visioncal.estimation.workspace import postures
 from visioncal.pipeline.known import Known
 from visioncal.session import Session
 from visioncal.simulation.arms import forward

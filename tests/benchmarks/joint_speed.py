@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from results import few, need, write_section
 
-from visioncal.estimator.closure import Closure, Edges, Noise, solve_closure
-from visioncal.estimator.corners import CornerStack, reproject
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.poses import fit_poses
+from visioncal.estimation.closure import Closure, Edges, Noise, solve_closure
+from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.poses import fit_poses
 from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
 from visioncal.targets import corner_positions
 from visioncal.threads import one_blas_thread

@@ -19,8 +19,8 @@ from cells import calibrated, known_of
 from results import first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.estimator.closure import Edges, Noise, solve_closure
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.closure import Edges, Noise, solve_closure
+from visioncal.estimation.workspace import postures
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.simulation import Cell, CellOptions, simulate

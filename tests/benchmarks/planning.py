@@ -19,7 +19,7 @@ from test_candidates import cell_of, whole
 from test_kinematics import WRONG_LINKS, error_m
 
 from visioncal.errors import DataError
-from visioncal.estimator.closure import Noise
+from visioncal.estimation.closure import Noise
 from visioncal.pipeline.known import Known
 from visioncal.planning.candidates import candidates
 from visioncal.planning.design import chosen

@@ -10,10 +10,10 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from visioncal.alignment.cell import Cell, robot_key
+from visioncal.estimation.joint import chance_limit
 from visioncal.estimation.problem import Effect, Noise, Problem, State
 from visioncal.estimation.solve import normal_equations, score_gain
-from visioncal.estimator.joint import chance_limit
-from visioncal.estimator.variance import Knowledge
+from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray

@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.alignment.cell import Cell, robot_key
 from visioncal.errors import VisioncalError
 from visioncal.estimation.problem import Effect
-from visioncal.estimator.variance import Knowledge
+from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.tables import ClockTable

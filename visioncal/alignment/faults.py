@@ -9,9 +9,9 @@ import numpy as np
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
 from visioncal.chance import chi2_limit
+from visioncal.estimation.closure import deviations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import by_noise_alone
-from visioncal.estimator.closure import deviations
 from visioncal.figures import figure
 from visioncal.transforms import mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask

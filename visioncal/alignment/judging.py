@@ -10,7 +10,7 @@ from visioncal.alignment.faults import moved_words
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Edge, Moved, Untied, Verdict, VerdictStatus
 from visioncal.errors import DegenerateError
-from visioncal.estimator.observability import (
+from visioncal.estimation.observability import (
     SIGMA_LIMIT_M,
     SIGMA_LIMIT_RAD,
     Direction,

@@ -8,6 +8,8 @@ import numpy as np
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
+from visioncal.estimation.joint import Problem as CameraCorners
+from visioncal.estimation.joint import Scene, chance_limit
 from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import (
@@ -16,8 +18,6 @@ from visioncal.estimation.solve import (
     normal_equations,
     score_gain,
 )
-from visioncal.estimator.joint import Problem as CameraCorners
-from visioncal.estimator.joint import Scene, chance_limit
 from visioncal.stages.pnp import ViewPoses
 from visioncal.types import Corners, IntArray, Mask
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from visioncal.alignment.solving import Solved
-from visioncal.estimator.appearance import BOARD_NAMES, shape_slices
-from visioncal.estimator.corners import reproject
+from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
+from visioncal.estimation.corners import reproject
 from visioncal.session import Session
 from visioncal.session.frames import thing_name
 from visioncal.types import FloatArray

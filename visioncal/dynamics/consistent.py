@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from visioncal.dynamics.base import BaseModel
-from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step
+from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.linalg import covariance, damped_step
 from visioncal.robot import Inertias, LogCholesky
 from visioncal.types import FloatArray, Mask
 

@@ -16,8 +16,8 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
-from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step, gram
+from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.linalg import covariance, damped_step, gram
 from visioncal.types import FloatArray, IntArray
 
 # Where the search begins, and what it stays within [rad/s].

@@ -8,7 +8,7 @@ from visioncal.dynamics.base import BaseModel, random_motion
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.regression import Block
 from visioncal.errors import DegenerateError
-from visioncal.estimator.linalg import spectrum
+from visioncal.estimation.linalg import spectrum
 from visioncal.files import some_of
 from visioncal.types import FloatArray
 

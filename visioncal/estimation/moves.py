@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
+from visioncal.estimation.linalg import covariance, spectrum
 from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import (
     Solution,
@@ -18,7 +19,6 @@ from visioncal.estimation.solve import (
     equations_from,
     fitted_covariance,
 )
-from visioncal.estimator.linalg import covariance, spectrum
 from visioncal.transforms import adjoint, exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
+from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.moves import (
     Move,
     better_stop,
@@ -24,6 +25,7 @@ from visioncal.estimation.moves import (
     slight_move,
     unmoved,
 )
+from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import (
     Solution,
@@ -32,8 +34,6 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
-from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mask
 

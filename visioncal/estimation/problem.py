@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from visioncal.estimation.tree import Step, Tree
-from visioncal.estimator.variance import Knowledge
+from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
 

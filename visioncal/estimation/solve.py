@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.linalg import covariance_among, damped_step, gram, squared_lengths
 from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
-from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance_among, damped_step, gram, squared_lengths
-from visioncal.estimator.variance import Components, Knowledge, RatioPrior, estimate_sigmas
+from visioncal.estimation.variance import Components, Knowledge, RatioPrior, estimate_sigmas
 from visioncal.types import FloatArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-10

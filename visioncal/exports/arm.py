@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration, Verdict
 from visioncal.errors import DataError
-from visioncal.estimator.workspace import postures
+from visioncal.estimation.workspace import postures
 from visioncal.exports.content import Selection
 from visioncal.exports.format import Takes
 from visioncal.exports.sources import Source

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.trajectory import LONGEST_GAP_S, Trajectory
-from visioncal.estimator.turned import WIDEST_OFFSET_S, Frames, Match, turning_matches
+from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
+from visioncal.estimation.turned import WIDEST_OFFSET_S, Frames, Match, turning_matches
 from visioncal.stages.motion import slow_and_new
 from visioncal.stages.offset import LEAST_CORRELATION
 from visioncal.types import FloatArray, IntArray

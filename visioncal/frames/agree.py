@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
-from visioncal.estimator.linalg import covariance, squared_lengths
+from visioncal.estimation.linalg import covariance, squared_lengths
 from visioncal.frames.sight import Place
 from visioncal.transforms import exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask

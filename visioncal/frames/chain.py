@@ -14,8 +14,8 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimator.arm import pose_basis
-from visioncal.estimator.observability import edge_names
+from visioncal.estimation.arm import pose_basis
+from visioncal.estimation.observability import edge_names
 from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import Camera, FloatArray, Mount
 
@@ -142,7 +142,7 @@ class Eye:
     def arm_basis(self, base_from_flange: FloatArray) -> FloatArray:
         """(6, p) how the flange errs with the arm's posture, by p independent errors of size one.
 
-        By the shape of any arm's errors (`estimator.arm.pose_basis`), as independent of those that
+        By the shape of any arm's errors (`estimation.arm.pose_basis`), as independent of those that
         the calibration met: the camera's transform has taken a part of them up, and nothing says
         which. Without such errors p is zero.
         """

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration import Frame
-from visioncal.estimator.pointfit import PointFit, fit_points
-from visioncal.estimator.pointpairs import PointPairs
+from visioncal.estimation.pointfit import PointFit, fit_points
+from visioncal.estimation.pointpairs import PointPairs
 from visioncal.figures import figure
 from visioncal.frames.fitted import Fitted, Setting, fixture_frame, reasons_of
 from visioncal.frames.measured import MeasuredPoints

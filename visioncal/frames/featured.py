@@ -6,14 +6,14 @@ from typing import cast
 import numpy as np
 
 from visioncal.calibration import Frame
-from visioncal.estimator.features import (
+from visioncal.estimation.features import (
     FEATURE_KINDS,
     FeatureFit,
     FeatureKind,
     FeatureTouches,
     fit_features,
 )
-from visioncal.estimator.placing import TOUCH_NOISE_M
+from visioncal.estimation.placing import TOUCH_NOISE_M
 from visioncal.frames.fitted import Fitted, Setting, fixture_frame, reasons_of
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.frames.verdicts import Doubt

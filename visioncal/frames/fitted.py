@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration import Edge, Frame, Observation
-from visioncal.estimator.agreement import Agreement
-from visioncal.estimator.groups import State
-from visioncal.estimator.observability import Direction
-from visioncal.estimator.placing import worst_of
+from visioncal.estimation.agreement import Agreement
+from visioncal.estimation.groups import State
+from visioncal.estimation.observability import Direction
+from visioncal.estimation.placing import worst_of
 from visioncal.figures import figure
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.frames.verdicts import (

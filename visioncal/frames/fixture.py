@@ -2,7 +2,7 @@
 
 from visioncal.calibration import Calibration, Frame
 from visioncal.errors import DataError
-from visioncal.estimator.features import FEATURE_KINDS
+from visioncal.estimation.features import FEATURE_KINDS
 from visioncal.files import some_of
 from visioncal.frames.drawn import drawn_fixture
 from visioncal.frames.featured import featured_fixture

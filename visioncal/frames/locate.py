@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.calibration import Calibration
 from visioncal.camera import normalise, project_with_jacobian
 from visioncal.errors import DataError
-from visioncal.estimator.observability import SIGMA_LIMIT_M
+from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.frames.chain import Eye, Pose, Stop, checked_point, point_slope
 from visioncal.frames.located import Located
 from visioncal.frames.look import SeenTarget, see

@@ -6,17 +6,17 @@ import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.errors import DataError
-from visioncal.estimator.appearance import (
+from visioncal.estimation.appearance import (
     SCALE,
     Appearance,
     Compressed,
     compress,
     shape_basis,
 )
-from visioncal.estimator.corners import CornerStack
-from visioncal.estimator.gating import gate
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.planar import determines_pose
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.gating import gate
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.planar import determines_pose
 from visioncal.finders import NotFound, find_target
 from visioncal.finders.imaging import blur_at_corners, why_hard_to_see
 from visioncal.frames.chain import Eye

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration, Frame
 from visioncal.errors import DataError
-from visioncal.estimator.pointpairs import FEWEST_POINTS
+from visioncal.estimation.pointpairs import FEWEST_POINTS
 from visioncal.files import some_of
 from visioncal.finders.marker import marker_ids
 from visioncal.frames.chain import Eye

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.pointpairs import PointPairs
+from visioncal.estimation.pointpairs import PointPairs
 from visioncal.files import did_you_mean, some_of
 from visioncal.types import FloatArray
 

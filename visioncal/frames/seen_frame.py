@@ -9,8 +9,8 @@ import numpy as np
 
 from visioncal.calibration import Calibration, Frame, Observation, picked
 from visioncal.errors import DataError
-from visioncal.estimator.observability import Direction
-from visioncal.estimator.placing import worst_of
+from visioncal.estimation.observability import Direction
+from visioncal.estimation.placing import worst_of
 from visioncal.figures import figure
 from visioncal.frames.chain import Eye, checked_point
 from visioncal.frames.look import SeenTarget, see

@@ -9,9 +9,9 @@ import numpy as np
 
 from visioncal.calibration import Calibration, Edge, Frame, Observation
 from visioncal.errors import DataError, DegenerateError, VisioncalError
-from visioncal.estimator.pivot import PivotFit, fit_pivot
-from visioncal.estimator.readings import readings_that_close
-from visioncal.estimator.touching import Touches, TouchKind
+from visioncal.estimation.pivot import PivotFit, fit_pivot
+from visioncal.estimation.readings import readings_that_close
+from visioncal.estimation.touching import Touches, TouchKind
 from visioncal.figures import figure
 from visioncal.frames.touches import (
     TouchRows,

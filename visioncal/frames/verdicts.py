@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration import Verdict, VerdictStatus
-from visioncal.estimator.observability import Direction
+from visioncal.estimation.observability import Direction
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.types import Mask

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.armmodel import BACKLASH
-from visioncal.estimator.told import EDGES
+from visioncal.estimation.armmodel import BACKLASH
+from visioncal.estimation.told import EDGES
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.estimator.armmodel import ArmModel, blocks_of
-from visioncal.estimator.closure import distances
+from visioncal.estimation.armmodel import ArmModel, blocks_of
+from visioncal.estimation.closure import distances
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree

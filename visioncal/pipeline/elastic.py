@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.armmodel import COMPLIANCE, WEIGHT
+from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT
 from visioncal.pipeline.known import Known
 from visioncal.stages import backlash, elastic
 from visioncal.stages.backlash import plays_of

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.arm import misfit_slopes
-from visioncal.estimator.armmodel import ArmModel
+from visioncal.estimation.arm import misfit_slopes
+from visioncal.estimation.armmodel import ArmModel
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
 from visioncal.types import FloatArray, IntArray

@@ -9,13 +9,13 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration import CameraResult, Rms, Verdict
-from visioncal.estimator.appearance import Free
-from visioncal.estimator.arm import ArmErrors, link_basis, pose_basis
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.boards import Boards
-from visioncal.estimator.closure import Closure, Noise
-from visioncal.estimator.joint import Scene
-from visioncal.estimator.measured import Measured
+from visioncal.estimation.appearance import Free
+from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.closure import Closure, Noise
+from visioncal.estimation.joint import Scene
+from visioncal.estimation.measured import Measured
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits

@@ -9,10 +9,10 @@ import numpy as np
 
 from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult, Validation
 from visioncal.errors import DataError, VisioncalError
-from visioncal.estimator.appearance import BOARD_NAMES, Free, shape_slices
-from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.boards import Placed, place
-from visioncal.estimator.observability import edge_names
+from visioncal.estimation.appearance import BOARD_NAMES, Free, shape_slices
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.boards import Placed, place
+from visioncal.estimation.observability import edge_names
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.arm import kinematics_document
 from visioncal.pipeline.elastic import elastic_document

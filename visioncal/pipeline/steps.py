@@ -11,9 +11,9 @@ import numpy as np
 
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
-from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.joint import Arm
-from visioncal.estimator.observability import directions, refuse_too_few
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.joint import Arm
+from visioncal.estimation.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.choosing import arm_told, with_views_back
 from visioncal.pipeline.elastic import check_loads, with_springs

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.arm import find_arm_errors
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import Edges, flange_to_residual, residual_blocks
+from visioncal.estimation.arm import find_arm_errors
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import Edges, flange_to_residual, residual_blocks
 from visioncal.pipeline.known import Known
 from visioncal.robot import Robot
 from visioncal.stages.thermal import (

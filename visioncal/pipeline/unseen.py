@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.closure import Closure, Edges, distances
+from visioncal.estimation.closure import Closure, Edges, distances
 from visioncal.pipeline.known import Known
 from visioncal.stages.kinematics import Kinematics
 from visioncal.types import FloatArray

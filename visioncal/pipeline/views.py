@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration import Rms, ViewResult
-from visioncal.estimator.closure import distances
+from visioncal.estimation.closure import distances
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import HELD_BACK, Known, rms_of
 from visioncal.pipeline.layout import own_numbers

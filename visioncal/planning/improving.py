@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimator.armmodel import block_size
+from visioncal.estimation.armmodel import block_size
 from visioncal.figures import figure
 from visioncal.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.planning.cell import Box, PlanCell

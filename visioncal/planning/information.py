@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from visioncal.camera import project
 from visioncal.errors import DataError
-from visioncal.estimator.appearance import (
+from visioncal.estimation.appearance import (
     SCALE,
     Appearance,
     Free,
@@ -20,13 +20,13 @@ from visioncal.estimator.appearance import (
     compress,
     shape_basis,
 )
-from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.armmodel import COMPLIANCE, ArmModel, block_size
-from visioncal.estimator.closure import Closure, Edges, Noise, whitened_slopes
-from visioncal.estimator.corners import CornerStack, floored_sigma_px
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.shared import Shared
-from visioncal.estimator.workspace import pose_slopes, postures, tool_slopes
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
+from visioncal.estimation.closure import Closure, Edges, Noise, whitened_slopes
+from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.shared import Shared
+from visioncal.estimation.workspace import pose_slopes, postures, tool_slopes
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot

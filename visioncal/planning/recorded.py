@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import (
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import (
     Closure,
     Edges,
     Noise,
@@ -14,7 +14,7 @@ from visioncal.estimator.closure import (
     fit_closure,
     normal_equations,
 )
-from visioncal.estimator.linalg import covariance
+from visioncal.estimation.linalg import covariance
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.cell import Box, Limits, PlanCell

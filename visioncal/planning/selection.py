@@ -20,7 +20,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from visioncal.estimator.linalg import covariance_root
+from visioncal.estimation.linalg import covariance_root
 from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.information import World
 from visioncal.types import FloatArray

@@ -4,7 +4,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimator.closure import Noise
+from visioncal.estimation.closure import Noise
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.robot import Robot
 from visioncal.types import Target

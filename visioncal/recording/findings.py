@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimator.appearance import BOARD_NAMES, board_basis
+from visioncal.estimation.appearance import BOARD_NAMES, board_basis
 from visioncal.session import Session
 from visioncal.targets import corner_positions
 from visioncal.types import FloatArray, Target

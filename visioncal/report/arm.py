@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from visioncal.estimator.arm import SIGNIFICANT
+from visioncal.estimation.arm import SIGNIFICANT
 from visioncal.figures import significant
 from visioncal.recording.armtext import ParameterRow, parameter_row
 from visioncal.recording.kinematics import NOMINAL, Kinematics, Level, joint_words

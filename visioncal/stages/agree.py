@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.boards import Boards
-from visioncal.estimator.closure import Closure, Edges, distances
-from visioncal.estimator.consensus import LEAST_VIEWS, agreeing_views, whole_units
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.closure import Closure, Edges, distances
+from visioncal.estimation.consensus import LEAST_VIEWS, agreeing_views, whole_units
 from visioncal.figures import figure
 from visioncal.threads import one_blas_thread
 from visioncal.types import IntArray, Mask, Mount, Rejection

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.armmodel import BACKLASH, ArmModel
+from visioncal.estimation.armmodel import BACKLASH, ArmModel
 from visioncal.figures import figure
 from visioncal.stages.handeye import HandEyeResult
 

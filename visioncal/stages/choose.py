@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 
 from visioncal.errors import DegenerateError
-from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.closure import Edges
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.closure import Edges
 from visioncal.solvers import SOLVERS
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import rotations

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.clock import ClockFit, clear_fit, fit_offset
-from visioncal.estimator.turned import Frames, Match, turning_matches
+from visioncal.estimation.clock import ClockFit, clear_fit, fit_offset
+from visioncal.estimation.turned import Frames, Match, turning_matches
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.stages.motion import Motion, at_rest, is_open, motion_of, slow_and_new

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.planar import determines_pose
+from visioncal.estimation.planar import determines_pose
 from visioncal.finders import NotFound, find_target, fitting_layouts
 from visioncal.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.finders.headers import MOST_PIXELS, claimed_size

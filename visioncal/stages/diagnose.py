@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.chance import chi2_limit
-from visioncal.estimator.appearance import Free
-from visioncal.estimator.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
-from visioncal.estimator.boards import Boards
-from visioncal.estimator.budget import covariance_by_source, point_covariance
-from visioncal.estimator.closure import Closure, fit_closure
-from visioncal.estimator.intervals import noise_intervals
-from visioncal.estimator.misfit import Drift, Neighbours, drift, neighbours
-from visioncal.estimator.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.estimation.appearance import Free
+from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.budget import covariance_by_source, point_covariance
+from visioncal.estimation.closure import Closure, fit_closure
+from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
+from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray

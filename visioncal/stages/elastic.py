@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.armmodel import COMPLIANCE, ArmModel
-from visioncal.estimator.bending import (
+from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
+from visioncal.estimation.bending import (
     Factor,
     bends_seen,
     compliance_unit,
     flange_bends,
     payload_factor,
 )
-from visioncal.estimator.closure import Closure
+from visioncal.estimation.closure import Closure
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.robot import Loads, Robot

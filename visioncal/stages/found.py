@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.chance import chi2_limit
-from visioncal.estimator.appearance import MOST_LOOSE
-from visioncal.estimator.closure import held_shift
-from visioncal.estimator.corners import CornerStack
-from visioncal.estimator.joint import (
+from visioncal.estimation.appearance import MOST_LOOSE
+from visioncal.estimation.closure import held_shift
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.joint import (
     Arm,
     MeasuredScale,
     Problem,

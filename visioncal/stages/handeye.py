@@ -6,9 +6,9 @@ from typing import get_args
 import numpy as np
 
 from visioncal.errors import ConvergenceError
-from visioncal.estimator.arm import ArmErrors, misfit_covariance
-from visioncal.estimator.boards import Boards
-from visioncal.estimator.closure import (
+from visioncal.estimation.arm import ArmErrors, misfit_covariance
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.closure import (
     Closure,
     ClosureFit,
     Edges,
@@ -19,8 +19,8 @@ from visioncal.estimator.closure import (
     held_shift,
     solve_closure,
 )
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.observability import (
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.observability import (
     Direction,
     check_observability,
     directions,

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from visioncal.errors import ConvergenceError, DataError, DegenerateError
-from visioncal.estimator.bundle import BundleFit, fit_bundle
-from visioncal.estimator.corners import CornerStack, mean_square_by_view
-from visioncal.estimator.gating import gate
-from visioncal.estimator.planar import planar_poses
-from visioncal.estimator.poses import fit_poses
+from visioncal.estimation.bundle import BundleFit, fit_bundle
+from visioncal.estimation.corners import CornerStack, mean_square_by_view
+from visioncal.estimation.gating import gate
+from visioncal.estimation.planar import planar_poses
+from visioncal.estimation.poses import fit_poses
 from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
 from visioncal.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
-from visioncal.estimator.closure import Noise
+from visioncal.estimation.closure import Noise
 from visioncal.figures import figure
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import HandEyeResult

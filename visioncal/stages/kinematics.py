@@ -8,9 +8,9 @@ import numpy as np
 
 from visioncal.calibration import Rms
 from visioncal.errors import DataError
-from visioncal.estimator.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimator.closure import Closure, Edges, noise_likelihood
-from visioncal.estimator.kinematics import LEVELS, LevelFit, fit_level, resized
+from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
+from visioncal.estimation.closure import Closure, Edges, noise_likelihood
+from visioncal.estimation.kinematics import LEVELS, LevelFit, fit_level, resized
 from visioncal.figures import figure
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray

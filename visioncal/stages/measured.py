@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimator.measured import Measured
-from visioncal.estimator.observability import SIGMA_LIMIT_M, edge_names
+from visioncal.estimation.measured import Measured
+from visioncal.estimation.observability import SIGMA_LIMIT_M, edge_names
 from visioncal.figures import figure
 from visioncal.session import Session
 from visioncal.session.tables import PriorTable

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.errors import DataError
-from visioncal.estimator.trajectory import Samples, Trajectory
+from visioncal.estimation.trajectory import Samples, Trajectory
 from visioncal.robot import Robot
 from visioncal.session import Session, Stream, View
 from visioncal.session.columns import POSE

@@ -7,9 +7,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.clock import ClockFit, clock_shared
-from visioncal.estimator.shared import Shared
-from visioncal.estimator.turned import Match
+from visioncal.estimation.clock import ClockFit, clock_shared
+from visioncal.estimation.shared import Shared
+from visioncal.estimation.turned import Match
 from visioncal.figures import figure
 from visioncal.session import View
 from visioncal.stages.motion import Motion

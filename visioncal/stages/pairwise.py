@@ -5,9 +5,9 @@ from itertools import product
 
 import numpy as np
 
-from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.closure import Closure, Edges, Noise, closure_information
-from visioncal.estimator.linalg import covariance, spectrum
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
+from visioncal.estimation.linalg import covariance, spectrum
 from visioncal.solvers import SOLVERS
 from visioncal.stages.choose import Candidates, distances_to
 from visioncal.transforms import invert, mean_transform, rotation_angle

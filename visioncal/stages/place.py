@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DegenerateError
-from visioncal.estimator.arm import LEVER_M
-from visioncal.estimator.closure import Closure, Edges, distances
-from visioncal.estimator.consensus import agreeing_views
-from visioncal.estimator.observability import FEWEST_VIEWS
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.closure import Closure, Edges, distances
+from visioncal.estimation.consensus import agreeing_views
+from visioncal.estimation.observability import FEWEST_VIEWS
 from visioncal.stages.choose import (
     CLEAR_RATIO,
     Candidates,

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from visioncal.estimator.positions import Places, find_mounting
-from visioncal.estimator.procrustes import align, apply, spreads
+from visioncal.estimation.positions import Places, find_mounting
+from visioncal.estimation.procrustes import align, apply, spreads
 from visioncal.stages.sighted import Growth, Pair, Relation
 from visioncal.transforms import compose, invert
 from visioncal.types import FloatArray

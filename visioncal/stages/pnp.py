@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimator.corners import (
+from visioncal.estimation.corners import (
     CornerStack,
     floored_sigma_px,
     mean_square_by_view,
     reproject,
 )
-from visioncal.estimator.gating import gate
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.planar import planar_poses
-from visioncal.estimator.poses import PoseFit, fit_poses
+from visioncal.estimation.gating import gate
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.planar import planar_poses
+from visioncal.estimation.poses import PoseFit, fit_poses
 from visioncal.session import Session
 from visioncal.targets import first_corners, numbered_positions, rotation_transforms
 from visioncal.threads import one_blas_thread

@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.closure import Closure, Edges
-from visioncal.estimator.positions import (
+from visioncal.estimation.closure import Closure, Edges
+from visioncal.estimation.positions import (
     Mounting,
     Places,
     find_mounting,

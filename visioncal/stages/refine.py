@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimator.appearance import (
+from visioncal.estimation.appearance import (
     Appearance,
     Compressed,
     Free,
     boards_basis,
     compress,
 )
-from visioncal.estimator.arm import ArmErrors, find_arm_errors
-from visioncal.estimator.closure import Closure, Edges, fit_closure, left_out_residuals
-from visioncal.estimator.corners import CornerStack, floored_sigma_px
-from visioncal.estimator.joint import (
+from visioncal.estimation.arm import ArmErrors, find_arm_errors
+from visioncal.estimation.closure import Closure, Edges, fit_closure, left_out_residuals
+from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.joint import (
     Arm,
     MeasuredScale,
     Problem,
@@ -30,8 +30,8 @@ from visioncal.estimator.joint import (
     seen_at,
     settle,
 )
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.observability import worst_directions
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.observability import worst_directions
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import numbered_positions

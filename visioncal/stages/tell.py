@@ -5,17 +5,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import Closure
-from visioncal.estimator.indices import Indices
-from visioncal.estimator.lacking import Move, joints_to_move
-from visioncal.estimator.parameters import (
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import Closure
+from visioncal.estimation.indices import Indices
+from visioncal.estimation.lacking import Move, joints_to_move
+from visioncal.estimation.parameters import (
     Parameter,
     free_parameters,
     parameter_moves,
     parameter_slopes,
 )
-from visioncal.estimator.told import (
+from visioncal.estimation.told import (
     EDGES,
     WHOLE_POSE,
     Slopes,
@@ -26,7 +26,7 @@ from visioncal.estimator.told import (
     stop_slopes,
     what_is_told,
 )
-from visioncal.estimator.untold import (
+from visioncal.estimation.untold import (
     dominant_words,
     imitated,
     joint_words,
@@ -34,8 +34,8 @@ from visioncal.estimator.untold import (
     null_of,
     null_words,
 )
-from visioncal.estimator.workspace import chain_slopes, pose_slopes, postures, tool_slopes
-from visioncal.estimator.worth import stop_worth
+from visioncal.estimation.workspace import chain_slopes, pose_slopes, postures, tool_slopes
+from visioncal.estimation.worth import stop_worth
 from visioncal.figures import figure
 from visioncal.robot import (
     Convention,

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimator.arm import SIGNIFICANT
+from visioncal.estimation.arm import SIGNIFICANT
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.thermal import ThermalFit

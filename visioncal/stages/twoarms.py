@@ -9,7 +9,7 @@ the bases all around.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimator.arm import LEVER_M
+from visioncal.estimation.arm import LEVER_M
 from visioncal.solvers import SOLVERS
 from visioncal.stages.choose import Candidates
 from visioncal.transforms import compose, invert, rotation_angle

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.camera import project
-from visioncal.estimator.appearance import Free
-from visioncal.estimator.boards import Boards
-from visioncal.estimator.closure import Closure, Edges, distances
+from visioncal.estimation.appearance import Free
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.closure import Closure, Edges, distances
 from visioncal.stages.handeye import HandEyeResult, refit
 from visioncal.threads import one_blas_thread
 from visioncal.types import Camera, Corners, FloatArray, IntArray, SolverName

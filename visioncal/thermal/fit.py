@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.estimator.closure import (
+from visioncal.estimation.closure import (
     Closure,
     Edges,
     Noise,
@@ -23,9 +23,9 @@ from visioncal.estimator.closure import (
     normal_equations,
     residual_blocks,
 )
-from visioncal.estimator.descend import Linearised, descend
-from visioncal.estimator.linalg import covariance, damped_step
-from visioncal.estimator.shared import Shared
+from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.linalg import covariance, damped_step
+from visioncal.estimation.shared import Shared
 from visioncal.robot import Robot
 from visioncal.thermal.heating import Heating, Inputs, Kind
 from visioncal.thermal.model import ThermalModel

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.causes import TURN_PER_M, Cause
-from visioncal.estimator.observability import FEWEST_VIEWS
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.causes import TURN_PER_M, Cause
+from visioncal.estimation.observability import FEWEST_VIEWS
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert, log
 from visioncal.types import FloatArray

@@ -9,7 +9,7 @@ from scipy.special import fdtrc
 from visioncal.calibration import Calibration, picked
 from visioncal.chance import f_limit
 from visioncal.errors import DataError
-from visioncal.estimator.causes import Belief, Cause, Explained, explain, undone
+from visioncal.estimation.causes import Belief, Cause, Explained, explain, undone
 from visioncal.session import Session
 from visioncal.session.choosing import Choice
 from visioncal.threads import one_blas_thread

@@ -9,16 +9,16 @@ import numpy as np
 from visioncal.calibration import Calibration
 from visioncal.calibration.edge import read_covariance
 from visioncal.errors import DataError
-from visioncal.estimator.appearance import (
+from visioncal.estimation.appearance import (
     BOARD_NAMES,
     Appearance,
     Free,
     board_prior,
     boards_basis,
 )
-from visioncal.estimator.armmodel import ArmModel
-from visioncal.estimator.closure import Edges, Noise
-from visioncal.estimator.observability import edge_names
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import Edges, Noise
+from visioncal.estimation.observability import edge_names
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document

@@ -8,9 +8,9 @@ import numpy as np
 
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
-from visioncal.estimator.arm import ArmErrors
-from visioncal.estimator.closure import Closure
-from visioncal.estimator.corners import CornerStack, reproject
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.closure import Closure
+from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.frames.sighting import check_mount, check_resolution
 from visioncal.pipeline import STAGES
 from visioncal.pipeline.known import Known

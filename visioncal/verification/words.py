@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimator.observability import axis_words
-from visioncal.estimator.untold import joint_words, listed
+from visioncal.estimation.observability import axis_words
+from visioncal.estimation.untold import joint_words, listed
 from visioncal.figures import figure
 from visioncal.targets import corner_positions
 from visioncal.transforms import exp, inverse_right_jacobian, skew

@@ -11,12 +11,12 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.estimation.appearance import Appearance, Compressed, compress
+from visioncal.estimation.corners import floored_sigma_px
+from visioncal.estimation.joint import Problem
+from visioncal.estimation.linalg import covariance
 from visioncal.estimation.problem import Effect
-from visioncal.estimator.appearance import Appearance, Compressed, compress
-from visioncal.estimator.corners import floored_sigma_px
-from visioncal.estimator.joint import Problem
-from visioncal.estimator.linalg import covariance
-from visioncal.estimator.variance import Knowledge
+from visioncal.estimation.variance import Knowledge
 from visioncal.types import Camera, FloatArray, IntArray
 
 # The effect's name in a problem.

@@ -1,0 +1,240 @@
+"""What all views share besides the edges: the lens, and the board as it really is.
+
+A printed board is stretched, longer one way than the other, and bent. In the target's frame, a
+corner p lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + z(x, y)`, z being a polynomial of second
+and third order. What of it is an offset or a tilt belongs to the board's pose and is taken out, so
+that the target's frame is that of the plane which fits the corners best.
+
+The points of a rig are where its table has them, or near there, each by what it is known to.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.poses import fit_poses
+from visioncal.estimation.shared import Shared
+from visioncal.targets import corner_positions
+from visioncal.types import Camera, FloatArray, IntArray, Mask, Target
+
+SCALE, ASPECT = 0, 1
+BOARD_NAMES = (
+    "scale",
+    "aspect",
+    *(f"bow_{it}" for it in (["xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy"])),
+)
+# Exponents of the polynomial's terms.
+_POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+
+# What is known of any printed board: its sides differ by 0.1 % or so, and it is bent by a hundredth
+# of its size at the most.
+_ASPECT_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-2
+# A rig of more points is taken for exact: each adds three unknowns that all views share.
+MOST_LOOSE = 100
+# So many times what is known keeps a value in its place against any residuals.
+_ANCHOR = 1e12
+
+
+def board_basis(positions: FloatArray) -> FloatArray:
+    """Derivatives of the corners' places by the board's shape.
+
+    Args:
+        positions: (c, 3) corners of the flat board, in the target's frame [m].
+
+    Returns:
+        (c, 3, 9) in the order of `BOARD_NAMES`; bows are in metres at the board's edge.
+    """
+    middle = (positions.min(axis=0) + positions.max(axis=0)) / 2
+    half = float(np.ptp(positions, axis=0).max()) / 2
+    u, v = ((positions - middle) / half)[:, :2].T
+    basis = np.zeros((len(positions), 3, len(BOARD_NAMES)))
+    basis[:, :, SCALE] = positions
+    basis[:, 0, ASPECT], basis[:, 1, ASPECT] = -positions[:, 0] / 2, positions[:, 1] / 2
+    bows = np.stack([u**a * v**b for a, b in _POWERS], axis=1)
+    plane = np.stack([np.ones_like(u), u, v], axis=1)
+    basis[:, 2, 2:] = bows - plane @ np.linalg.lstsq(plane, bows, rcond=None)[0]
+    return basis
+
+
+def shape_basis(target: Target) -> FloatArray:
+    """Derivatives (c, 3, s) of a target's corners by its shape.
+
+    A printed board's are those of `board_basis`, of an exact rig there are none, and of another one
+    the places of its points are the shape.
+    """
+    positions = corner_positions(target)
+    if target.kind != "points":
+        return board_basis(positions)
+    size = len(board_prior(target))
+    return np.eye(3 * len(positions))[:, :size].reshape(len(positions), 3, size)
+
+
+def boards_basis(targets: Sequence[Target]) -> FloatArray:
+    """Derivatives of several targets' corners by all of their shapes, (c, 3, s)."""
+    parts = [shape_basis(it) for it in targets]
+    flat = block_diag(*(it.reshape(3 * len(it), it.shape[2]) for it in parts))
+    return np.asarray(flat.reshape(len(flat) // 3, 3, flat.shape[1]))
+
+
+def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]:
+    """Where each target's shape stands among all of them, the first one's at `first`."""
+    ends = first + np.cumsum([0, *(len(board_prior(it)) for it in targets)])
+    return tuple(slice(*it) for it in pairwise(ends.tolist()))
+
+
+def board_prior(target: Target) -> FloatArray:
+    """Standard deviations (s,) of the target's shape, as they are known beforehand."""
+    if target.kind == "points":
+        sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= MOST_LOOSE else ()
+        return np.repeat(sigmas, 3).astype(float)
+    positions = corner_positions(target)
+    half = float(np.ptp(positions, axis=0).max()) / 2
+    bows = np.full(len(_POWERS), _BOW_SIGMA_SHARE * half)
+    return np.array([target.square_sigma_m / target.square_m, _ASPECT_SIGMA, *bows])
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """A camera and a board as they really are.
+
+    Attributes:
+        camera: The intrinsics.
+        board: (s,) the shapes of all targets, printed ones in the order of `BOARD_NAMES`; zero for
+            the stated ones.
+    """
+
+    camera: Camera
+    board: FloatArray
+
+    @property
+    def values(self) -> FloatArray:
+        """(k + s,) the intrinsics and the boards' shapes."""
+        return np.concatenate([intrinsics(self.camera), self.board])
+
+    def moved(self, step: FloatArray) -> "Appearance":
+        """Returns the appearance after a (k + s,) step."""
+        values = self.values + step
+        lens = len(values) - len(self.board)
+        return Appearance(with_intrinsics(self.camera, values[:lens]), values[lens:])
+
+
+@dataclass(frozen=True, eq=False)
+class Free:
+    """Which unknowns of an appearance are free, and what is known of them without the robot.
+
+    Attributes:
+        appearance: The values that the views' poses were made with.
+        basis: (c, 3, s) of `boards_basis`, by corner number.
+        positions: (c, 3) corners of the flat boards, each in its own frame [m].
+        columns: (k,) the free ones' places among the appearance's values.
+        anchored: (k,) mask of those that stay where they are, and count in the covariance only.
+        information: (k, k) on them, from the corners and from what is known beforehand.
+        pull: (k,) half the gradient of what is known, at their present values.
+    """
+
+    appearance: Appearance
+    basis: FloatArray
+    positions: FloatArray
+    columns: IntArray
+    anchored: Mask
+    information: FloatArray
+    pull: FloatArray
+
+    def shared(self, shift: FloatArray) -> Shared:
+        """Puts it as the chain takes it, with the (m, 6, k) shifts of its views."""
+        anchor = np.where(self.anchored, _ANCHOR * np.diag(self.information), 0.0)
+        return Shared(self.information, self.pull, anchor, shift, np.zeros_like(shift))
+
+    @property
+    def lens_count(self) -> int:
+        """How many of the appearance's values are the lens's: they come first."""
+        return len(self.appearance.values) - len(self.appearance.board)
+
+    @property
+    def lens_is_free(self) -> bool:
+        """Whether the fit moves the intrinsics: all of them or none."""
+        return bool((~self.anchored & (self.columns < self.lens_count)).any())
+
+    def after(self, change: FloatArray) -> "Appearance":
+        """The appearance after a (k + p,) change of the free unknowns and of p others."""
+        step = np.zeros(len(self.appearance.values))
+        step[self.columns] = np.where(self.anchored, 0.0, change[: len(self.columns)])
+        return self.appearance.moved(step)
+
+    def corners_after(self, change: FloatArray) -> FloatArray:
+        """Where the (c, 3) corners lie on the target after a (k,) change [m]."""
+        return np.asarray(self.positions + self.basis @ self.after(change).board)
+
+
+@dataclass(frozen=True, eq=False)
+class Compressed:
+    """What the corners say, view by view, of poses and appearance: nothing else is needed of them.
+
+    Information is for corners of 1 px noise.
+
+    Attributes:
+        cam_from_target: (v, 4, 4) the poses that fit best under the appearance.
+        information: (v, 6, 6) on each pose's right perturbation.
+        by_shared: (v, 6, k) how each pose moves with the appearance.
+        shared_information: (k, k) on the appearance, the poses being free.
+        shared_pull: (k,) half the gradient of the squared error by the appearance.
+        residuals: (n, 2) [px].
+    """
+
+    cam_from_target: FloatArray
+    information: FloatArray
+    by_shared: FloatArray
+    shared_information: FloatArray
+    shared_pull: FloatArray
+    residuals: FloatArray
+
+
+def compress(
+    stack: CornerStack,
+    basis: FloatArray,
+    appearance: Appearance,
+    starts: FloatArray,
+    scales: IntArray | None = None,
+) -> Compressed:
+    """Compresses corners to normal equations in each view's pose and the shared appearance.
+
+    Args:
+        stack: The corners of v views, at their places on the flat boards.
+        basis: (c, 3, s) of `boards_basis`, by corner number.
+        appearance: Where to linearise.
+        starts: (v, 4, 4) `cam_from_target` to start from.
+        scales: Places of the boards' scales among the appearance's values, which views alone do
+            not tell.
+    """
+    shape = basis[stack.ids]
+    bent = stack.with_points(stack.points + shape @ appearance.board)
+    fit = fit_poses(bent, appearance.camera, starts)
+    now = reproject(bent, appearance.camera, fit.cam_from_target)
+    by_board = now.by_pose[:, :, 3:] @ shape
+    by_shared = np.concatenate([now.by_intrinsics, by_board], axis=2)
+    between = stack.products_by_view(now.by_pose, by_shared)
+    answer = -covariance(fit.information) @ between
+    # What is left once the poses have followed, squared: never less than none, and as exact as the
+    # square of their error. A difference of two squares would magnify it a millionfold.
+    left = by_shared + now.by_pose @ answer[stack.view_of]
+    flat = left.reshape(-1, left.shape[2])
+    information = flat.T @ flat
+    pull = flat.T @ now.residuals.reshape(-1)
+    # A larger board farther away looks the same: what is left is rounding.
+    if scales is not None:
+        information[scales] = information[:, scales] = 0.0
+        pull[scales] = 0.0
+    return Compressed(
+        fit.cam_from_target,
+        fit.information,
+        answer,
+        information,
+        pull,
+        now.residuals,
+    )

@@ -1,0 +1,443 @@
+"""Closing the chain of frames: both unknown edges from the poses of all views.
+
+Every view says `robot * x * camera = z`, up to noise, with its residual
+`log(z^-1 * robot * x * camera)` in the target's frame:
+
+    eye-in-hand   robot = base_from_flange, x = flange_from_cam, z = base_from_target
+    eye-to-hand   robot = flange_from_base, x = base_from_cam,   z = flange_from_target
+
+The noise of a residual is that of the camera's pose, which is known from its corners, and one small
+error of the flange, whose two levels are estimated (Strobl and Hirzinger 2006; Ulrich and Hillemann
+2021). Where nothing is known of the camera's poses, both are estimated as one.
+
+A measuring instrument that reads a probe on the flange is a camera that stands still, and the probe
+its target. Where it reads points alone, the chain's rotation is told by nothing but the points: the
+target's frame is then parallel to the flange by choice.
+
+Lens and board move all camera poses together. What is open about them are unknowns beside the
+edges, with the corners' information on them: to first order, and exactly where the poses were made
+with the same values, that is the bundle adjustment of corners, lens, board and edges in one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.measured import Measured
+from visioncal.estimation.problem import Effect, FramePrior, Observations, Problem, State
+from visioncal.estimation.problem import Noise as Levels
+from visioncal.estimation.shared import Shared
+from visioncal.estimation.solve import (
+    fisher_information,
+    fit_problem,
+    fitted_covariance,
+    robot_levels,
+    solve_problem,
+    starting_noise,
+)
+from visioncal.estimation.solve import (
+    normal_equations as information_and_gradient,
+)
+from visioncal.estimation.tree import Branch, Tree
+from visioncal.estimation.variance import Components, Knowledge
+from visioncal.transforms import adjoint, exp, invert, log, mean_transform, rotation_angle
+from visioncal.types import FloatArray, IntArray, Mask, Mount
+
+# Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
+_CHOSEN = 1e12
+# Variances of a direction that a pose leaves open are above this [rad^2].
+_OPEN = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """The poses of m views.
+
+    Attributes:
+        mount: Which of the two trees it is.
+        robot: (m, 4, 4) the known part of the chain that is the robot's.
+        camera: (m, 4, 4) `cam_from_target`.
+        camera_covariance: (m, 6, 6) of the camera's right perturbations; None where unknown.
+        shared: What moves all camera poses together; None where they are held.
+        guess: The edges near which rotations were supplied, where places are all that was measured;
+            None where the poses themselves were.
+        measured: What is known of the edges besides.
+    """
+
+    mount: Mount
+    robot: FloatArray
+    camera: FloatArray
+    camera_covariance: FloatArray | None = None
+    shared: Shared | None = None
+    guess: "Edges | None" = None
+    measured: tuple[Measured, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.robot)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The frames and the views as the estimation has them."""
+        camera, target = ("flange", "base") if self.mount == "eye-in-hand" else ("base", "flange")
+        poses = self.robot if self.mount == "eye-in-hand" else invert(self.robot)
+        unknown = {"cam": Branch(camera), "target": Branch(target)}
+        tree = Tree("base", {"flange": Branch("base", robot="robot"), **unknown})
+        known, shared, count = self.camera_covariance, self.shared, len(self)
+        observations = Observations(
+            ("cam",) * count,
+            ("target",) * count,
+            np.arange(count),
+            np.full(count, -1),
+            self.camera,
+            np.zeros((count, 6, 6)) if known is None else known,
+            np.ones(count, dtype=bool),
+        )
+        effects: tuple[Effect, ...] = ()
+        if shared is not None:
+            known_of = Knowledge(shared.information, shared.pull)
+            effects = (
+                Effect(
+                    "shared",
+                    self.unchanged,
+                    known_of,
+                    shared.anchor > 0.0,
+                    shared.by_camera,
+                    {"robot": shared.by_flange},
+                ),
+            )
+        hangs = {0: (camera, "cam"), 1: (target, "target")}
+        return Problem(
+            tree,
+            {"robot": poses},
+            observations,
+            effects,
+            tuple(
+                FramePrior(*hangs[it.edge], it.axes, it.values_m, it.sigma_m)
+                for it in self.measured
+            ),
+            frozenset() if self.guess is None else frozenset({"target"}),
+            is_combined=known is None,
+        )
+
+    @property
+    def unchanged(self) -> FloatArray:
+        """(k,) no change of what is shared; k = 0 where it is held."""
+        return np.zeros(0 if self.shared is None else len(self.shared.information))
+
+    def subset(self, chosen: Mask) -> "Closure":
+        """Returns the views of an (m,) mask."""
+        known, shared = self.camera_covariance, self.shared
+        return replace(
+            self,
+            robot=self.robot[chosen],
+            camera=self.camera[chosen],
+            camera_covariance=None if known is None else known[chosen],
+            shared=None if shared is None else shared.subset(chosen),
+        )
+
+    @property
+    def told(self) -> IntArray:
+        """(m,) how many directions each view's pose tells: six, or fewer where places were read."""
+        if self.guess is None or self.camera_covariance is None:
+            return np.full(len(self), 6)
+        return np.asarray(np.sum(np.linalg.eigvalsh(self.camera_covariance) < _OPEN, axis=1))
+
+    def with_more(self, more: Shared) -> "Closure":
+        """Returns the views with more unknowns that they share, behind those that are there."""
+        return replace(self, shared=more if self.shared is None else self.shared.joined(more))
+
+    def with_first(self, count: int) -> "Closure":
+        """Returns the views with the first of the unknowns that they share, and no others."""
+        return replace(self, shared=None if self.shared is None else self.shared.only(slice(count)))
+
+    def merged(self, stops: IntArray) -> "Closure":
+        """Makes one view of all that were taken at one stop of the robot.
+
+        They share the robot's error, and count once. Their camera poses are averaged with their
+        information, and by how much they disagree they tell of what is shared: nothing is lost.
+        Where the information is unknown, they are averaged evenly.
+
+        Args:
+            stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
+        """
+        if len(np.unique(stops)) == len(stops):
+            return self
+        return _joined([self.subset(stops == stop) for stop in range(stops.max() + 1)])
+
+    def under(self, change: FloatArray) -> "Closure":
+        """Returns the views as they look when what is shared changes by (k,)."""
+        if self.shared is None or not len(change):
+            return self
+        flange = exp(self.shared.by_flange @ change)
+        if self.mount == "eye-in-hand":
+            robot = self.robot @ flange
+        else:
+            robot = invert(invert(self.robot) @ flange)
+        return replace(self, robot=robot, camera=self.camera @ exp(self.shared.by_camera @ change))
+
+    def placed(self, x: FloatArray) -> FloatArray:
+        """Where each view places the target: (m, 4, 4) `robot * x * camera`."""
+        return self.robot @ x @ self.camera
+
+    def predicted_camera(self, x: FloatArray, z: FloatArray) -> FloatArray:
+        """The (m, 4, 4) `cam_from_target` that the edges and the robot predict."""
+        return invert(self.robot @ x) @ z
+
+
+def _joined(groups: Sequence[Closure]) -> Closure:
+    robot, camera, spreads, shifts, arms = [], [], [], [], []
+    shared = groups[0].shared
+    for group in groups:
+        first = group.camera[0]
+        known = group.camera_covariance
+        information = np.tile(np.eye(6), (len(group), 1, 1)) if known is None else covariance(known)
+        spread = covariance(information.sum(axis=0))
+        shares = spread @ information
+        away = log(invert(first) @ group.camera)
+        robot.append(group.robot[0])
+        mean = np.einsum("mij,mj->i", shares, away)
+        camera.append(first @ exp(mean))
+        spreads.append(spread)
+        if group.shared is None or shared is None:
+            continue
+        shift = np.einsum("mij,mjk->ik", shares, group.shared.by_camera)
+        shifts.append(shift)
+        arms.append(group.shared.by_flange[0])
+        if known is not None and len(group) > 1:
+            shared = shared.told(information, group.shared.by_camera - shift, away - mean)
+    return replace(
+        groups[0],
+        robot=np.array(robot),
+        camera=np.array(camera),
+        camera_covariance=None if groups[0].camera_covariance is None else np.array(spreads),
+        shared=None
+        if shared is None
+        else replace(shared, by_camera=np.array(shifts), by_flange=np.array(arms)),
+    )
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations per axis, of rotation [rad] and of translation [m].
+
+    Of the flange where the noise of the camera's poses is known, else of both together, as the
+    target's pose shows them.
+    """
+
+    sigma_rad: float
+    sigma_m: float
+
+    @property
+    def levels(self) -> Levels:
+        """As the estimation has them."""
+        return Levels(self.sigmas[None], np.zeros(0))
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Both as (2,): rotation, translation."""
+        return np.array([self.sigma_rad, self.sigma_m])
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The unknowns: both edges (4, 4), and the change (k,) of what all views share."""
+
+    x: FloatArray
+    z: FloatArray
+    shared: FloatArray
+
+    @property
+    def state(self) -> State:
+        """As the estimation has them."""
+        return State(np.stack([self.x, self.z]), self.shared)
+
+    def moved(self, step: FloatArray) -> "Edges":
+        """Returns the unknowns after a (12 + k,) step, on the right of both edges."""
+        by = exp(step[:12].reshape(2, 6))
+        return Edges(self.x @ by[0], self.z @ by[1], self.shared + step[12:])
+
+
+@dataclass(frozen=True, eq=False)
+class ClosureFit:
+    """The unknowns, the noise that their residuals show, and whether the fit settled."""
+
+    edges: Edges
+    noise: Noise
+    settled: bool = True
+
+
+def deviations(placed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Deviation of each view's target from the mean of all: (m,) [m] and (m,) [rad]."""
+    return distances(placed, mean_transform(placed))
+
+
+def distances(placed: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distance of each view's target from a place, or from its own: (m,) [m] and (m,) [rad]."""
+    return (
+        np.linalg.norm(placed[:, :3, 3] - z[..., :3, 3], axis=1),
+        rotation_angle(invert(z) @ placed),
+    )
+
+
+def fit_closure(data: Closure, edges: Edges) -> ClosureFit:
+    """Minimises the whitened residuals, estimating the noise's levels too.
+
+    Args:
+        data: The views.
+        edges: Where to start.
+
+    Returns:
+        The unknowns and the noise.
+    """
+    found = fit_problem(data.problem, edges.state)
+    return ClosureFit(_edges(found.state), _noise(found.noise), found.settled)
+
+
+def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, bool]:
+    """Minimises the residuals whitened by a known noise.
+
+    Returns:
+        The unknowns, and whether they came to rest.
+    """
+    state, settled = solve_problem(data.problem, edges.state, noise.levels)
+    return _edges(state), settled
+
+
+def closure_jacobian(data: Closure, edges: Edges) -> FloatArray:
+    """Derivatives (m, 6, 12 + k) of the residuals by the unknowns' steps: x, z, shared."""
+    return data.problem.linear(edges.state).jacobian
+
+
+def flange_to_residual(data: Closure, edges: Edges) -> FloatArray:
+    """How a small motion of each view's flange moves its residual, (m, 6, 6)."""
+    loose = replace(data.problem, is_combined=False)
+    return loose.linear(edges.state).by_errors
+
+
+def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """Fisher information (12 + k, 12 + k) on the unknowns.
+
+    It is taken where the chain closes exactly: at the measured poses their noise would pass for
+    information about directions that the motion leaves open.
+    """
+    found = fisher_information(data.problem, edges.state, noise.levels)
+    return np.asarray(found + np.diag(np.where(data.problem.counted, 0.0, _CHOSEN)))
+
+
+def held_shift(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """How far the answer (12 + k,) would move if what is anchored moved as well, to first order.
+
+    What is held is wrong by what is open about it, and by how far the data pull at it: beside the
+    covariance, which counts the former, the square of this shift is the error of holding.
+    """
+    problem, shift = data.problem, np.zeros(12 + len(edges.shared))
+    held = problem.counted & ~problem.moving
+    if not held.any():
+        return shift
+    still = replace(edges, shared=np.where(held[12:], 0.0, edges.shared))
+    pull = normal_equations(data, still, noise)[1]
+    shift[held] = pull[held]
+    return np.asarray(-covariance(closure_information(data, edges, noise)) @ shift)
+
+
+def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Information (12 + k, 12 + k) and gradient (12 + k,) of half the whitened squared error."""
+    problem = data.problem
+    information, gradient = information_and_gradient(problem, edges.state, noise.levels)
+    scale = np.maximum(np.diag(information), 1.0)
+    return information + np.diag(np.where(problem.moving, 0.0, _CHOSEN * scale)), gradient
+
+
+def left_out_residuals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """Residuals (m, 6) of each view from a fit without it, to first order.
+
+    By the identity of Cook and Weisberg (1982, section 2.2), with the noise as it is.
+    """
+    residuals, jacobian, spread = residual_blocks(data, edges, noise)
+    fitted = fitted_covariance(data.problem, edges.state, noise.levels)
+    taken = jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
+    return np.asarray((spread @ covariance(spread - taken) @ residuals[:, :, None])[:, :, 0])
+
+
+def weighted_slopes(
+    data: Closure, edges: Edges, noise: Noise
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What makes up the score, where the chain closes exactly.
+
+    Returns:
+        (m, 6, 12 + k) inverse covariance of each residual times its derivatives, and the (m, 6, 6)
+        covariances that the camera and the robot contribute to the residual.
+    """
+    jacobian, camera, total = _where_it_closes(data, edges, noise)
+    return np.asarray(np.linalg.solve(total, jacobian), dtype=float), camera, total - camera
+
+
+def whitened_slopes(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
+    """Derivatives (m, 6, 12 + k) of residuals of unit covariance, where the chain closes exactly.
+
+    Their squares, summed over the views, are all of `closure_information` but what is known of the
+    shared unknowns without the robot.
+    """
+    jacobian, _, total = _where_it_closes(data, edges, noise)
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(total), jacobian))
+
+
+def _where_it_closes(
+    data: Closure, edges: Edges, noise: Noise
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives of residuals at exact poses, and covariances: the camera's, and all."""
+    problem = data.problem
+    linear = problem.linear(State(edges.state.edges, problem.start_values), ideal=True)
+    camera = problem.covariance(noise.levels)
+    return linear.jacobian, camera, problem.total_covariance(linear, noise.levels)
+
+
+def residual_blocks(
+    data: Closure, edges: Edges, noise: Noise
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (m, 6), their derivatives (m, 6, 12 + k) and their covariances (m, 6, 6)."""
+    linear = data.problem.linear(edges.state)
+    return linear.residuals, linear.jacobian, data.problem.total_covariance(linear, noise.levels)
+
+
+def estimate_noise(data: Closure, edges: Edges) -> Noise:
+    """Estimates the noise's levels from the residuals at some edges."""
+    return noise_likelihood(data, edges)[0]
+
+
+def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
+    """The noise's most likely levels, and their negative restricted log-likelihood."""
+    problem = data.problem
+    levels, value = robot_levels(problem, edges.state, starting_noise(problem), from_above=True)
+    return _noise(replace(starting_noise(problem), robots=levels)), value
+
+
+def knowledge_of(data: Closure, edges: Edges) -> Knowledge:
+    """What is known of the unknowns without the robot: of edges and of what is shared."""
+    return data.problem.knowledge(edges.state)
+
+
+def components_of(data: Closure, z: FloatArray) -> Components:
+    """How the camera's known noise and the two levels make up the residuals' covariance."""
+    levels = np.zeros((2, 6, 6))
+    levels[0, :3, :3] = levels[1, 3:, 3:] = np.eye(3)
+    if data.camera_covariance is None:
+        return Components(
+            np.zeros((len(data), 6, 6)), np.repeat(levels[:, None], len(data), axis=1)
+        )
+    # The flange's error, seen in the target's frame; the camera's is there already.
+    flange_from_target = invert(data.robot) @ z if data.mount == "eye-in-hand" else z[None]
+    carried = np.broadcast_to(adjoint(invert(flange_from_target)), (len(data), 6, 6))
+    parts = carried @ levels[:, None] @ np.swapaxes(carried, 1, 2)
+    return Components(data.camera_covariance, parts)
+
+
+def _edges(state: State) -> Edges:
+    return Edges(state.edges[0], state.edges[1], state.values)
+
+
+def _noise(noise: Levels) -> Noise:
+    return Noise(float(noise.robots[0, 0]), float(noise.robots[0, 1]))

@@ -1,0 +1,250 @@
+"""Least squares over small groups of residuals, each of which is right or wrong as a whole.
+
+A group is one touch of a tool or one measured point: a few residuals [m] that share one error. The
+covariance of a group is what is known of it beforehand, plus one unknown level of noise per axis:
+`known + sigma^2 I`, with sigma by restricted maximum likelihood.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from math import comb
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.linalg import covariance, damped_step, gram, spectrum
+from visioncal.estimation.variance import (
+    LEAST_SIGMA,
+    Components,
+    Knowledge,
+    estimate_sigmas,
+    profile_interval,
+)
+from visioncal.types import FloatArray, IntArray, Mask
+
+State = TypeVar("State")
+
+# With 40 % of the groups wrong, all 60 sets of three contain a wrong one with probability 3e-7.
+_SETS = 60
+_ROUNDS = 10
+_SETTLED = 1e-10
+# Under this scaled eigenvalue ratio the groups do not determine a direction.
+_OPEN_RATIO = 1e-10
+# Noise levels are started from above: at least here [m].
+_START_SIGMA = 5e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """A problem at one state: m groups of up to d residuals, which p unknowns explain.
+
+    Attributes:
+        residuals: (m, d) [m], zero where not observed.
+        jacobian: (m, d, p) their derivatives by the unknowns' steps, zero where not observed.
+        observed: (m, d) mask of the residuals that there are: groups may be smaller than d.
+        known: (m, d, d) covariance that is known beforehand [m^2]; zeros where nothing is.
+    """
+
+    residuals: FloatArray
+    jacobian: FloatArray
+    observed: Mask
+    known: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.residuals)
+
+    def subset(self, chosen: Mask) -> "Groups":
+        """Returns the groups of an (m,) mask."""
+        return Groups(
+            self.residuals[chosen],
+            self.jacobian[chosen],
+            self.observed[chosen],
+            self.known[chosen],
+        )
+
+    def spread(self, sigma: float) -> FloatArray:
+        """Covariances (m, d, d) at a level of noise [m]; one where nothing was observed."""
+        return self._components().total(np.array([sigma]))
+
+    def _components(self) -> Components:
+        both = self.observed[:, :, None] & self.observed[:, None, :]
+        absent = np.eye(self.observed.shape[1]) * ~self.observed[:, None, :]
+        level = np.eye(self.observed.shape[1]) * self.observed[:, None, :]
+        return Components(np.where(both, self.known, 0.0) + absent, level[None])
+
+    def level(self, start: float, *, free: bool = True) -> tuple[float, float]:
+        """The most likely noise [m] and its negative log-likelihood; those of the start if held."""
+        size = self.jacobian.shape[2]
+        sigmas, value = estimate_sigmas(
+            self.residuals,
+            self.jacobian,
+            self._components(),
+            Knowledge(np.zeros((size, size)), np.zeros(size)),
+            np.array([start]),
+            free=np.array([free]),
+        )
+        return float(sigmas[0]), value
+
+    def information(self, sigma: float) -> FloatArray:
+        """Fisher information (p, p) on the unknowns at a level of noise [m]."""
+        weighted = np.linalg.solve(self.spread(sigma), self.jacobian)
+        return gram(self.jacobian, weighted)
+
+    @property
+    def freedom(self) -> int:
+        """How many more residuals were observed than directions of the unknowns determined."""
+        values = spectrum(gram(self.jacobian, self.jacobian)).values
+        return int(self.observed.sum() - np.sum(values > _OPEN_RATIO * values[-1]))
+
+
+class GroupProblem(Protocol[State]):
+    """What is to be fitted: the unknowns are a state, and steps of (p,) numbers move it."""
+
+    def guesses(self) -> Iterable[State]:
+        """Gives starts: the first from all groups, more from small sets (see `small_sets`).
+
+        Each must lie near the answer where its set is sound; others may be anywhere.
+        """
+        ...
+
+    def linearise(self, state: State) -> Groups:
+        """Gives the residuals of all m groups at a state, and their derivatives."""
+        ...
+
+    def move(self, state: State, step: FloatArray) -> State:
+        """Takes a (p,) step from a state."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class GroupFit(Generic[State]):
+    """The answer from some groups.
+
+    Attributes:
+        state: The most likely unknowns.
+        covariance: (p, p) of their steps; a direction that the groups leave open has a large but
+            finite variance.
+        sigma: Most likely noise of one residual [m], beyond what is known beforehand. Where the
+            groups have no freedom left it is the expected one.
+        freedom: How many more residuals were used than unknowns determined.
+        groups: All groups at rest, used or not.
+        used: (m,) mask of the groups that it was made from.
+        settled: Whether the state came to rest.
+    """
+
+    state: State
+    covariance: FloatArray
+    sigma: float
+    freedom: int
+    groups: Groups
+    used: Mask
+    settled: bool
+
+    @property
+    def gains(self) -> FloatArray:
+        """(m, p, d) how the unknowns' step moves with each group's residuals; zero if unused.
+
+        By these an error that several groups share, and that their weights do not know of, is
+        carried to the answer.
+        """
+        weights = np.linalg.inv(self.groups.spread(self.sigma))
+        weighted = np.where(self.used[:, None, None], weights @ self.groups.jacobian, 0.0)
+        return np.asarray(-self.covariance @ np.swapaxes(weighted, 1, 2))
+
+    @cached_property
+    def sigma_95(self) -> tuple[float, float]:
+        """95 % interval of sigma [m] by the profile likelihood; (0, inf) without any freedom."""
+        if self.freedom < 1:
+            return 0.0, float("inf")
+        inside = self.groups.subset(self.used)
+
+        def profile(logarithm: float) -> float:
+            return inside.level(float(np.exp(logarithm)), free=False)[1]
+
+        return profile_interval(
+            profile, self.sigma, profile(float(np.log(max(self.sigma, LEAST_SIGMA))))
+        )
+
+
+def small_sets(count: int, size: int) -> Iterator[IntArray]:
+    """Gives sets of `size` of `count` groups: all that there are, or sixty by chance."""
+    if comb(count, size) <= _SETS:
+        yield from (np.array(rows) for rows in combinations(range(count), size))
+        return
+    rng = np.random.default_rng(0)
+    yield from (np.sort(rng.choice(count, size, replace=False)) for _ in range(_SETS))
+
+
+def fit_groups(
+    problem: GroupProblem[State],
+    used: Mask | None = None,
+    start: State | None = None,
+    expected_sigma: float = 0.0,
+) -> GroupFit[State]:
+    """Fits the unknowns and the noise's level to some groups.
+
+    Args:
+        problem: What is to be fitted.
+        used: (m,) mask of the groups to use; all where None.
+        start: Where to start; the problem's first guess where None.
+        expected_sigma: Level of noise that is taken where the groups leave no freedom to tell [m].
+    """
+    state = next(iter(problem.guesses())) if start is None else start
+    groups = problem.linearise(state)
+    chosen = np.ones(len(groups), dtype=bool) if used is None else used
+    sigma, settled = _rms(groups.subset(chosen)), False
+    for _ in range(_ROUNDS):
+        # Held at the start: weights that follow the state would reward states with large noise.
+        weights = np.asarray(np.linalg.inv(groups.spread(sigma)), dtype=float)
+        state, settled = descended(problem, state, chosen, weights)
+        groups = problem.linearise(state)
+        before, sigma = sigma, groups.subset(chosen).level(max(sigma, LEAST_SIGMA))[0]
+        if np.isclose(before, sigma, rtol=1e-4):
+            break
+    return _finished(state, groups, chosen, sigma, expected_sigma, settled=settled)
+
+
+def _finished(
+    state: State,
+    groups: Groups,
+    chosen: Mask,
+    sigma: float,
+    expected_sigma: float,
+    *,
+    settled: bool,
+) -> GroupFit[State]:
+    inside = groups.subset(chosen)
+    freedom = inside.freedom
+    if freedom < 1:
+        sigma = max(expected_sigma, LEAST_SIGMA)
+    spread = covariance(inside.information(sigma))
+    return GroupFit(state, spread, sigma, freedom, groups, chosen, settled)
+
+
+def _rms(groups: Groups) -> float:
+    square = float(np.sum(groups.residuals**2)) / max(int(groups.observed.sum()), 1)
+    return max(float(np.sqrt(square)), _START_SIGMA)
+
+
+def descended(
+    problem: GroupProblem[State], start: State, chosen: Mask, weights: FloatArray
+) -> tuple[State, bool]:
+    """Minimises the residuals of some groups at (m, d, d) weights."""
+    weights = np.where(chosen[:, None, None], weights, 0.0)
+
+    def linearise(at: State) -> Linearised[State]:
+        groups = problem.linearise(at)
+        weighted = weights @ groups.jacobian
+        information = gram(groups.jacobian, weighted)
+        gradient = gram(weighted, groups.residuals)
+        cost = np.einsum("mi,mij,mj->", groups.residuals, weights, groups.residuals)
+        return Linearised(
+            at,
+            float(cost),
+            lambda damping: problem.move(at, damped_step(information, gradient, damping)),
+        )
+
+    return descend(start, linearise, _SETTLED)

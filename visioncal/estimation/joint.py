@@ -1,0 +1,485 @@
+"""The joint fit of corners, lens, board and both edges: its unknowns, and its linearisation.
+
+Each view's corners are compressed to its pose and to how that moves with lens and board; the chain
+of frames is closed over all stops with what is left open of these. Linearising anew at the answer,
+until it stays, is Gauss-Newton's method on the whole problem.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.chance import chi2_limit
+from visioncal.errors import ConvergenceError
+from visioncal.estimation.appearance import (
+    BOARD_NAMES,
+    Appearance,
+    Compressed,
+    Free,
+    board_prior,
+    boards_basis,
+    compress,
+    shape_slices,
+)
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.boards import Boards
+from visioncal.estimation.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
+from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.measured import Measured
+from visioncal.targets import first_corners, numbered_positions
+from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
+
+# Freeing unknowns must gain more than noise does in one session of ten thousand.
+_FALSE_ALARM = 1e-4
+# Corners must be left over to judge by: so many residuals for each unknown.
+_SPARE = 10
+# Values that move by less than this share of their sigma have settled.
+_SETTLED, _ROUNDS = 0.02, 8
+# A step after which corners fit worse by this factor is too long; so often is it halved.
+_FOLLOWS, _HALVINGS = 2.0, 12
+# What is stated is contradicted by so many standard deviations.
+_CONTRADICTION = 3.0
+# Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
+# may well be so much larger.
+_UNEVEN = 2.0
+# Given intrinsics that are set free are known to so much without the session: the focal length and
+# the centre as shares of the focal length, and the distortion's coefficients.
+_FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is looked at, and with what.
+
+    Attributes:
+        mount: Where the camera is.
+        targets: What was printed, as stated; the corners of several are numbered through.
+        camera: The intrinsics.
+        estimated: Whether they were estimated from these corners.
+        mode: What to do with given ones: `hold`, `refine` or `auto`.
+        matrix_sigma_px: What given fx, fy, cx, cy are known to; None where that is not said.
+        names: What several targets are called.
+    """
+
+    mount: Mount
+    targets: tuple[Target, ...]
+    camera: Camera
+    estimated: bool
+    mode: str = "auto"
+    matrix_sigma_px: float | None = None
+    names: tuple[str, ...] = ("",)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """The robot's side of the chain.
+
+    Attributes:
+        robot: (m, 4, 4) the robot's part of the chain, one a view.
+        stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
+        basis: (m, 6, p) how its errors move each view's flange.
+        of_links: Whether these are errors of its own links.
+        boards: What the views show, where there are several boards.
+        errors: Their size, where they are free.
+        measured: What is known of the edges besides.
+    """
+
+    robot: FloatArray
+    stops: IntArray
+    basis: FloatArray
+    of_links: bool
+    boards: Boards
+    errors: ArmErrors | None = None
+    measured: tuple[Measured, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The corners of m views with what is known of the scene beforehand.
+
+    Attributes:
+        scene: The scene.
+        stack: The corners.
+        positions: (c, 3) corners of the flat boards, each in its own frame [m].
+        basis: (c, 3, s) of `boards_basis`.
+        prior_sigma: (k + s,) what lens and boards are known to; inf where nothing is known.
+        contested: Whether given intrinsics are held although the corners speak against them.
+    """
+
+    scene: Scene
+    stack: CornerStack
+    positions: FloatArray
+    basis: FloatArray
+    prior_sigma: FloatArray
+    contested: bool = False
+
+    @classmethod
+    def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "Problem":
+        """Puts the problem together from the corners by view."""
+        positions = numbered_positions(scene.targets)
+        priors = [board_prior(it) for it in scene.targets]
+        return cls(
+            scene,
+            CornerStack.of(corners, positions),
+            positions,
+            boards_basis(scene.targets),
+            np.concatenate([_lens_prior(scene), *priors]),
+        )
+
+    def without_prior(self, columns: IntArray) -> "Problem":
+        """The same problem, some values of which nobody has stated."""
+        sigma = self.prior_sigma.copy()
+        sigma[columns] = np.inf
+        return replace(self, prior_sigma=sigma)
+
+    @property
+    def stated(self) -> Appearance:
+        """Lens and board as they are given or were estimated before."""
+        return Appearance(self.scene.camera, np.zeros(self.basis.shape[2]))
+
+    @property
+    def lens(self) -> IntArray:
+        """Places of the intrinsics among the values; they come first."""
+        return np.arange(len(self.prior_sigma) - self.basis.shape[2])
+
+    @property
+    def printed(self) -> list[int]:
+        """Which targets are printed: those that have a scale, and may be bent."""
+        return [at for at, it in enumerate(self.scene.targets) if it.kind != "points"]
+
+    @property
+    def scale(self) -> IntArray:
+        """Places of the printed boards' scales."""
+        return self._joined(self.scale_of(board) for board in self.printed)
+
+    @property
+    def shape(self) -> IntArray:
+        """Places of the printed boards' aspects and bends."""
+        return self._joined(self.shape_of(board) for board in self.printed)
+
+    @property
+    def points(self) -> IntArray:
+        """Places of the rigs' points, as far as these are not exact."""
+        rigs = set(range(len(self.scene.targets))) - set(self.printed)
+        return self._joined(self.points_of(rig) for rig in sorted(rigs))
+
+    def scale_of(self, board: int) -> IntArray:
+        """Place (1,) of one printed board's scale."""
+        return self.points_of(board)[:1]
+
+    def shape_of(self, board: int) -> IntArray:
+        """Places (8,) of one printed board's aspect and bend."""
+        return self.points_of(board)[1:]
+
+    def points_of(self, target: int) -> IntArray:
+        """Places of all that is unknown of where one target's corners lie on it."""
+        mine = shape_slices(self.scene.targets, len(self.lens))[target]
+        return np.arange(mine.start, mine.stop)
+
+    def _joined(self, places: Iterable[IntArray]) -> IntArray:
+        return np.concatenate([self.lens[:0], *places])
+
+    def corners_of(self, board: int) -> slice:
+        """The rows of one board's corners in `positions`."""
+        starts = [*first_corners(self.scene.targets).tolist(), len(self.positions)]
+        return slice(starts[board], starts[board + 1])
+
+    @property
+    def has_spare_corners(self) -> bool:
+        """Whether the views show more corners than it takes to free lens and board."""
+        residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
+        return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
+
+    def unknowns(self, compressed: Compressed, moving: IntArray) -> int:
+        """How many unknowns the corners have told, the poses among them.
+
+        Where a rig's points are known well beforehand, corners tell little of them, and residuals
+        are no smaller for their sake.
+        """
+        rigs = np.intersect1d(self.points, moving)
+        sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
+        told = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
+        share = told / (told + floored_sigma_px(sigma_px) ** 2)
+        exact = len(moving) - len(rigs)
+        return 6 * len(compressed.information) + exact + round(float(share.sum()))
+
+    def sigma_px(self, compressed: Compressed, moving: IntArray) -> float:
+        """Noise of a corner's coordinate [px]; see `CornerStack.sigma_px`."""
+        return self.stack.sigma_px(compressed.residuals, self.unknowns(compressed, moving))
+
+    @property
+    def first(self) -> IntArray:
+        """What is free from the start."""
+        if self.scene.estimated:
+            return np.union1d(self.lens, self.points)
+        if self.scene.mode == "refine" and self.has_spare_corners:
+            return np.concatenate([self.lens, np.union1d(self.shape, self.points)])
+        return self.points
+
+    @property
+    def counted(self) -> IntArray:
+        """What is open and counts in the covariance, whether it is free or not."""
+        if self.scene.estimated or self.contested:
+            return np.concatenate([self.lens, np.union1d(self.scale, self.points)])
+        stated = self.scene.matrix_sigma_px is not None
+        lens = self.lens[:4] if stated else self.lens[:0]
+        return np.concatenate([lens, np.union1d(self.scale, self.points)])
+
+
+def _lens_prior(scene: Scene) -> FloatArray:
+    camera = scene.camera
+    if scene.estimated:
+        return np.full(4 + len(camera.distortion), np.inf)
+    matrix = np.full(4, _FOCAL_SHARE * float(camera.matrix[:2].max()))
+    if scene.matrix_sigma_px is not None:
+        matrix = np.full(4, scene.matrix_sigma_px)
+    return np.concatenate([matrix, np.full(len(camera.distortion), _DISTORTION_SIGMA)])
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit begins: lens and board, (m, 4, 4) poses of the target, and both edges."""
+
+    appearance: Appearance
+    poses: FloatArray
+    edges: Edges
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The corners' word on poses and appearance, where it was linearised."""
+
+    compressed: Compressed
+    free: Free
+    sigma_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The fit at rest: the linearisation, the chain's data, and what came out."""
+
+    seen: Seen
+    data: Closure
+    fit: ClosureFit
+
+    def again(self) -> Start:
+        """The answer as the start of the next fit."""
+        after = self.seen.free.after(self.fit.edges.shared)
+        return Start(after, self.seen.compressed.cam_from_target, self.fit.edges)
+
+    @property
+    def moving(self) -> IntArray:
+        """Places of the values that the fit moves."""
+        return self.seen.free.columns[~self.seen.free.anchored]
+
+
+def settle(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+    """Linearises and fits in turn, until the values stay where they are.
+
+    Raises:
+        ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
+    """
+    try:
+        # Numbers that run away overflow before they fail.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _settled(problem, arm, moving, start)
+    except np.linalg.LinAlgError as error:
+        raise ConvergenceError(
+            "hand-eye: no frames explain both the robot's poses and what the camera saw: the fit "
+            "runs away. The likeliest cause is poses of other views than the images.",
+            culprits=["poses", "images"],
+            next_step="Look at which image belongs to which pose; visioncal convert --guess tries "
+            "other readings of the poses.",
+        ) from error
+
+
+def _settled(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+    state = _fitted(problem, arm, moving, start)
+    for _ in range(_ROUNDS):
+        spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])
+        looks = len(state.seen.free.columns)
+        sigma = np.sqrt(np.diag(spread)[12 : 12 + looks])
+        if np.all(np.abs(state.fit.edges.shared[:looks]) <= _SETTLED * sigma):
+            break
+        state = _fit(problem, arm, _stepped(problem, moving, state), state.fit.edges)
+    return state
+
+
+def _fitted(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+    seen = seen_at(problem, moving, start.appearance, start.poses)
+    return _fit(problem, arm, seen, start.edges)
+
+
+def _stepped(problem: Problem, moving: IntArray, state: State) -> Seen:
+    """Linearises where the fit came to rest, or on the way there as far as the corners follow.
+
+    Far from the answer, as where a lens was stated for images of another size, the whole step
+    leads to lenses that see nothing.
+    """
+    limit = _FOLLOWS * floored_sigma_px(state.seen.sigma_px)
+    change, poses = state.fit.edges.shared, state.seen.compressed.cam_from_target
+    for _ in range(_HALVINGS):
+        seen = seen_at(problem, moving, state.seen.free.after(change), poses)
+        if seen.sigma_px <= limit:
+            return seen
+        change = change / 2
+    return state.seen
+
+
+def _fit(problem: Problem, arm: Arm, seen: Seen, start: Edges) -> State:
+    data = _chain(problem, arm, seen, seen.free)
+    at_rest = Edges(start.x, start.z, data.unchanged)
+    return State(seen, data, fit_closure(data, at_rest))
+
+
+def seen_at(problem: Problem, moving: IntArray, appearance: Appearance, poses: FloatArray) -> Seen:
+    """Linearises the corners.
+
+    Args:
+        problem: The corners.
+        moving: Places of the values that a fit will move.
+        appearance: Lens and board to linearise at.
+        poses: (m, 4, 4) `cam_from_target` to start from.
+    """
+    compressed = compress(problem.stack, problem.basis, appearance, poses, problem.scale)
+    sigma_px = problem.sigma_px(compressed, moving)
+    free = _known_beforehand(problem, moving, appearance, compressed, sigma_px)
+    return Seen(compressed, free, sigma_px)
+
+
+def _known_beforehand(
+    problem: Problem,
+    moving: IntArray,
+    appearance: Appearance,
+    compressed: Compressed,
+    sigma_px: float,
+) -> Free:
+    """What the corners and the priors say of the free values."""
+    columns = np.union1d(moving, problem.counted)
+    weight = 1.0 / floored_sigma_px(sigma_px) ** 2
+    prior = 1.0 / problem.prior_sigma[columns] ** 2
+    away = (appearance.values - problem.stated.values)[columns]
+    information = weight * compressed.shared_information[np.ix_(columns, columns)] + np.diag(prior)
+    pull = weight * compressed.shared_pull[columns] + prior * away
+    return Free(
+        appearance,
+        problem.basis,
+        problem.positions,
+        columns,
+        ~np.isin(columns, moving),
+        information,
+        pull,
+    )
+
+
+def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
+    data = Closure(
+        problem.scene.mount,
+        arm.robot,
+        seen.compressed.cam_from_target,
+        floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
+        free.shared(seen.compressed.by_shared[:, :, free.columns]),
+        measured=arm.measured,
+    )
+    data = arm.boards.brought(data)
+    if arm.errors is not None:
+        data = data.with_more(arm.errors.shared())
+    return data.merged(arm.stops)
+
+
+@dataclass(frozen=True)
+class MeasuredScale:
+    """What the chain alone says of a board's scale, as if no size had been stated.
+
+    Attributes:
+        board: Which board.
+        scale: By which share the board is larger than stated.
+        sigma: Its standard deviation.
+        stated_sigma: What the stated size is known to.
+    """
+
+    board: int
+    scale: float
+    sigma: float
+    stated_sigma: float
+
+    @property
+    def is_another(self) -> bool:
+        """Whether it differs from the stated one by more than chance."""
+        return (self.scale / self.sigma) ** 2 > chance_limit(1)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it differs by more than both uncertainties explain."""
+        return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
+
+
+def measured_scale(problem: Problem, arm: Arm, state: State, board: int = 0) -> MeasuredScale:
+    """Measures a board's size by the robot's motion."""
+    place = problem.scale_of(board)
+    data, at_change = _with_free(
+        problem, arm, state, np.union1d(state.moving, place), ignored=place
+    )
+    information, gradient = normal_equations(data, at_change, state.fit.noise)
+    spread = covariance(information)
+    at = 12 + int(np.searchsorted(state.seen.free.columns, place[0]))
+    now = float(state.seen.free.after(state.fit.edges.shared).values[place[0]])
+    uneven = _UNEVEN if arm.errors is not None and arm.of_links else 1.0
+    return MeasuredScale(
+        board,
+        now - float(spread[at] @ gradient),
+        uneven * float(np.sqrt(spread[at, at])),
+        problem.scene.targets[board].square_sigma_m / problem.scene.targets[board].square_m,
+    )
+
+
+def moved_surprise(problem: Problem, state: State, places: IntArray) -> float:
+    """Squared distance of some values from the stated ones, in units of their covariance.
+
+    Args:
+        problem: The corners.
+        state: A fit that moves these values among others.
+        places: (k,) where they stand among the values.
+    """
+    spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])
+    at = 12 + np.searchsorted(state.seen.free.columns, places)
+    away = (state.again().appearance.values - problem.stated.values)[places]
+    return float(away @ np.linalg.solve(spread[np.ix_(at, at)], away))
+
+
+def contradicted_lens(problem: Problem, state: State) -> bool:
+    """Whether given intrinsics are farther off than what they are known to explains."""
+    away = state.again().appearance.values - problem.stated.values
+    return bool(np.any(np.abs(away)[problem.lens] > _CONTRADICTION * _lens_prior(problem.scene)))
+
+
+def chance_limit(freedom: int) -> float:
+    """What a squared error may fall by chance when so many more values are free (chi-square)."""
+    return float(chi2_limit(_FALSE_ALARM, freedom))
+
+
+def gain(problem: Problem, arm: Arm, state: State, moving: IntArray) -> float:
+    """How much the whitened squared error falls when more values are free (Rao's score test)."""
+    data, at = _with_free(problem, arm, state, moving)
+    information, gradient = normal_equations(data, at, state.fit.noise)
+    return float(gradient @ covariance(information) @ gradient)
+
+
+def _with_free(
+    problem: Problem,
+    arm: Arm,
+    state: State,
+    moving: IntArray,
+    ignored: IntArray | None = None,
+) -> tuple[Closure, Edges]:
+    """The chain at the same state with other values free, and without the prior of some."""
+    seen = state.seen
+    stated = problem if ignored is None else problem.without_prior(ignored)
+    free = _known_beforehand(stated, moving, seen.free.appearance, seen.compressed, seen.sigma_px)
+    looks, rest = np.split(state.fit.edges.shared, [len(seen.free.columns)])
+    change = np.zeros(len(free.columns))
+    change[np.searchsorted(free.columns, seen.free.columns)] = looks
+    edges = Edges(state.fit.edges.x, state.fit.edges.z, np.concatenate([change, rest]))
+    return _chain(problem, arm, seen, free), edges

@@ -1,0 +1,205 @@
+"""Which measured point is which of the drawing: exchanged and shifted numbers, told by geometry.
+
+Distances between points do not depend on where the part stands. Where the points as they are
+numbered do not fit the drawing, and in another order they fit far better, the order is wrong. A
+pattern that looks the same from several sides fits in several orders: then geometry cannot tell.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from math import perm
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from visioncal.chance import f_limit
+from visioncal.estimation.placing import LEAST_NOISE_M
+from visioncal.estimation.procrustes import align, apply, misfit
+from visioncal.types import FloatArray, IntArray
+
+# So many orders are all tried: seven points of seven.
+_EXHAUSTIVE = 5040
+# Triples of drawn points that are laid on one triangle of measured ones, pairs before them, and
+# places of the drawing that are looked at more closely.
+_TRIPLES, _PAIRS, _PLACES = 500, 1000, 60
+# Triangles of measured points that are looked for in the drawing: one of them may hold a wrong
+# point.
+_TRIANGLES = 2
+# A wrong order is claimed in one sound set of a thousand, at most; and an order is said to fit as
+# well as the best where noise would make the difference in one case of a hundred.
+_FALSE_ALARM, _AS_GOOD = 1e-3, 1e-2
+# Of 13 and more points the orders are so many that the test, corrected for their number, would ask
+# for the impossible; those that noise could favour move a few points only.
+_MOST_TRIED = 10**9
+
+
+@dataclass(frozen=True, eq=False)
+class Numbering:
+    """The order in which measured points fit a drawing.
+
+    Attributes:
+        assignment: (n,) which drawn point each measured one is: `arange(n)` where the order is
+            the stated one. Of several that fit equally well it is the one that moves the fewest.
+        rms_m: Root mean square distance of the points in that order [m].
+        stated_rms_m: The same in the stated order [m].
+        is_wrong: Whether the stated order fits so much worse that noise does not explain it.
+        equally_good: How many orders fit as well as the best one; 1 where it is unique. Of large
+            sets not all orders are tried, and this is the least number.
+    """
+
+    assignment: IntArray
+    rms_m: float
+    stated_rms_m: float
+    is_wrong: bool
+    equally_good: int
+
+    @property
+    def is_unique(self) -> bool:
+        """Whether geometry tells the order."""
+        return self.equally_good == 1
+
+    @property
+    def moved(self) -> IntArray:
+        """The measured points that are others than stated."""
+        return np.flatnonzero(self.assignment != np.arange(len(self.assignment)))
+
+    def words(self, labels: Sequence[str]) -> str:
+        """Says what is wrong with the order: `P3 and P7 are exchanged`.
+
+        Args:
+            labels: (m,) names of the drawn points; the first n are the stated ones.
+
+        Returns:
+            The words; empty where the order is the stated one.
+        """
+        moved, count, drawn = self.moved, len(self.assignment), len(labels)
+        if not len(moved):
+            return ""
+        if len(moved) == 2 and set(moved) == set(self.assignment[moved]):
+            return f"{labels[moved[0]]} and {labels[moved[1]]} are exchanged"
+        pairs = [f"{labels[at]} is {labels[self.assignment[at]]}" for at in moved]
+        listing = ", ".join(pairs)
+        if count == drawn and np.array_equal(self.assignment, np.arange(count)[::-1]):
+            return f"the order is reversed: {listing}"
+        steps = np.unique((self.assignment - np.arange(count))[moved] % drawn)
+        if len(steps) == 1:
+            by = int(steps[0]) if steps[0] <= drawn // 2 else int(steps[0]) - drawn
+            what = "all numbers are" if len(moved) == count else "numbers are"
+            return f"{what} shifted by {by}: {listing}"
+        return f"points are exchanged: {listing}"
+
+
+def find_numbering(
+    measured: FloatArray, nominal: FloatArray, noise_m: float = LEAST_NOISE_M
+) -> Numbering:
+    """Looks for the order in which measured points fit a drawing.
+
+    All orders are tried where they are few. Else two large triangles of measured points are looked
+    for in the drawing by their sides, and each place where one fits gives the other points to
+    their nearest ones (Kuhn 1955, with all points at once).
+
+    Args:
+        measured: (n, 3) in any frame [m], n at least 3.
+        nominal: (m, 3) of the drawing [m]; the first n are those that the measured points are said
+            to be, and any others were not measured, by what is said.
+        noise_m: What is known of a coordinate's noise [m].
+
+    Returns:
+        The best order, and how it compares with the stated one.
+    """
+    count = len(measured)
+    stated = np.arange(count)
+    orders = np.unique(np.vstack([stated, _orders(measured, nominal)]), axis=0)
+    squares = misfit(measured[None], nominal[orders])
+    freedom = 3.0 * count - 6.0
+    # What noise that is known beforehand leaves in any order counts as no difference.
+    floor = freedom * max(noise_m, LEAST_NOISE_M) ** 2
+    ratio = (squares + floor) / (squares.min() + floor)
+    as_good = ratio < f_limit(_AS_GOOD, freedom, freedom)
+    moves = (orders != stated).sum(axis=1)
+    best = int(np.lexsort((squares, moves, ~as_good))[0])
+    at = int(np.flatnonzero(moves == 0)[0])
+    # Corrected for the number of orders among which the best one was chosen.
+    tried = min(perm(len(nominal), count), _MOST_TRIED)
+    limit = f_limit(_FALSE_ALARM / tried, freedom, freedom)
+    return Numbering(
+        orders[best].astype(np.int64),
+        float(np.sqrt(squares[best] / count)),
+        float(np.sqrt(squares[at] / count)),
+        bool(ratio[at] > limit and not as_good[at]),
+        # Two measurements of one drawn point may be exchanged without being another order.
+        len(np.unique(_places(nominal)[orders[as_good]], axis=0)),
+    )
+
+
+def _places(nominal: FloatArray) -> IntArray:
+    """Numbers (m,) of the drawn points' places: the same where points coincide."""
+    return np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
+
+
+def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
+    """Orders (k, n) among which the best one is."""
+    count, drawn = len(measured), len(nominal)
+    if perm(drawn, count) <= _EXHAUSTIVE:
+        return np.array(list(permutations(range(drawn), count)))
+    found = []
+    free = np.arange(count)
+    for _ in range(_TRIANGLES):
+        if len(free) < 3:
+            break
+        triangle = free[_large_triangle(measured[free])]
+        free = np.setdiff1d(free, triangle)
+        triples = _similar_triples(measured[triangle], nominal)
+        placed = apply(align(measured[triangle][None], nominal[triples]), nominal[None])
+        # No order is better than every point's nearest one.
+        lower = [float(_squares(measured, it).min(axis=1).sum()) for it in placed]
+        nearest = np.argsort(lower, kind="stable")[:_PLACES]
+        found += [_nearest(measured, nominal, it) for it in placed[nearest]]
+    return np.array(found)
+
+
+def _nearest(measured: FloatArray, nominal: FloatArray, placed: FloatArray) -> IntArray:
+    """Gives each measured point a drawn one of its own, near where the drawing is laid."""
+    for _ in range(2):
+        order = linear_sum_assignment(_squares(measured, placed))[1]
+        # A triangle's few points lay the drawing less well than all of them.
+        placed = apply(align(measured, nominal[order]), nominal)
+    return np.asarray(order)
+
+
+def _squares(measured: FloatArray, placed: FloatArray) -> FloatArray:
+    """Squared distances (n, m) between measured points and drawn ones."""
+    return np.asarray(np.sum((measured[:, None] - placed[None]) ** 2, axis=2))
+
+
+def _large_triangle(points: FloatArray) -> IntArray:
+    """Numbers (3,) of three points that span much: the two farthest, and the one most aside."""
+    pairs = np.array(list(combinations(range(len(points)), 2)))
+    sides = points[pairs[:, 1]] - points[pairs[:, 0]]
+    longest = int(np.argmax(np.sum(sides**2, axis=1)))
+    first, second = pairs[longest]
+    aside = np.linalg.norm(np.cross(points - points[first], sides[longest]), axis=1)
+    aside[[first, second]] = -1.0
+    return np.array([first, second, int(np.argmax(aside))])
+
+
+def _similar_triples(triangle: FloatArray, nominal: FloatArray) -> IntArray:
+    """Ordered triples (k, 3) of drawn points whose sides are most like a triangle's."""
+    drawn = len(nominal)
+    distances = np.linalg.norm(nominal[:, None] - nominal[None], axis=2)
+    sides = [float(np.linalg.norm(triangle[i] - triangle[j])) for i, j in ((0, 1), (0, 2), (1, 2))]
+    pairs = np.array(list(permutations(range(drawn), 2)))
+    off = (distances[pairs[:, 0], pairs[:, 1]] - sides[0]) ** 2
+    keep = np.argsort(off, kind="stable")[:_PAIRS]
+    pairs, off = pairs[keep], off[keep]
+    total = (
+        off[:, None]
+        + (distances[pairs[:, 0]] - sides[1]) ** 2
+        + (distances[pairs[:, 1]] - sides[2]) ** 2
+    )
+    rows = np.arange(len(pairs))
+    total[rows, pairs[:, 0]] = total[rows, pairs[:, 1]] = np.inf
+    chosen = np.argsort(total, axis=None, kind="stable")[:_TRIPLES]
+    row, third = np.unravel_index(chosen[np.isfinite(total.ravel()[chosen])], total.shape)
+    return np.column_stack([pairs[row], third])

@@ -1,0 +1,334 @@
+"""What the motion can tell about the two unknown edges, and what it leaves open, in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.errors import DegenerateError
+from visioncal.estimation.boards import Boards, place
+from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
+from visioncal.estimation.linalg import Spectrum, covariance, spectrum
+from visioncal.figures import figure
+from visioncal.transforms import invert, rotation_angle
+from visioncal.types import FloatArray, Mount
+
+# Under this scaled eigenvalue ratio a direction is not determined by the motion at all.
+_NULL_RATIO = 1e-8
+# Over these predicted sigmas a result is of no use to anybody.
+SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
+# A direction this close to an axis is called by the axis.
+_NEARLY_AXIS = 0.95
+FEWEST_VIEWS = 3
+_PAIRED = 300
+# What is wrong where unknowns that all views share are not told, and what to do.
+_UNTOLD = {
+    "camera": (
+        "the views do not determine lens and board well enough",
+        "Give matrix and distortion in [camera], state the board's size with its sigma, or add "
+        "views tilted by 30 to 45 degrees.",
+    ),
+    "instrument": (
+        "the readings do not determine where the points sit on the flange",
+        "Add 3 or more stops in which the flange is tilted about different axes.",
+    ),
+}
+# A null direction moves a part of an edge if it moves it by this much, of a length of one.
+_PART_OF_NULL = 0.05
+
+
+@dataclass(frozen=True)
+class Direction:
+    """The direction of an edge that is known worst.
+
+    Attributes:
+        words: What it is, such as `the camera's offset along the tool's z`.
+        sigma: Its predicted standard deviation [m or rad].
+        limit: The largest that is accepted, in the same unit.
+        is_rotation: Whether it is an angle.
+    """
+
+    words: str
+    sigma: float
+    limit: float
+    is_rotation: bool
+
+    @property
+    def figure(self) -> str:
+        """The sigma and its limit with their unit."""
+        unit, scale = ("deg", np.rad2deg(1.0)) if self.is_rotation else ("mm", 1e3)
+        return f"{figure(self.sigma * scale)} {unit} (limit {figure(self.limit * scale)})"
+
+
+def edge_names(mount: Mount) -> tuple[str, str]:
+    """Names of the two unknown edges, in the order x, z."""
+    if mount == "instrument":
+        return "base_from_instrument", "flange_from_probe"
+    if mount == "eye-in-hand":
+        return "flange_from_cam", "base_from_target"
+    return "base_from_cam", "flange_from_target"
+
+
+def title(mount: Mount) -> str:
+    """What messages about both edges begin with."""
+    return "instrument" if mount == "instrument" else "hand-eye"
+
+
+def check_observability(
+    data: Closure, edges: Edges, noise: Noise, boards: Boards, looks: int = 0
+) -> None:
+    """Refuses motion that leaves a direction open.
+
+    Views that disagree wildly are no fault of the motion: poses in other units, of other images or
+    through a wrong lens leave residuals that no motion could average out. The motion is judged by a
+    noise of at most the limits themselves; what is beyond is the verdict's business.
+
+    Args:
+        data: The used views.
+        edges: The answer.
+        noise: Of the residuals.
+        boards: The boards, where there are several.
+        looks: How many of the unknowns that the views share are of lens and board, where these have
+            to be told, too; they come first.
+
+    Raises:
+        DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
+    """
+    refuse_too_few(data)
+    held, still = replace(data, shared=None), replace(edges, shared=np.zeros(0))
+    if data.shared is not None and boards.unknowns:
+        held = replace(data, shared=data.shared.only(boards.places))
+        still = replace(edges, shared=edges.shared[boards.places])
+    spread = spectrum(closure_information(held, still, noise))
+    if spread.ratio < _NULL_RATIO:
+        culprit = _null_direction(spread, edges, data.mount, boards)
+        verb = "are" if " and " in culprit else "is"
+        raise DegenerateError(
+            f"{title(data.mount)}: {culprit} {verb} not determined at all (information ratio "
+            f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data)}.",
+            culprits=[culprit],
+            next_step=f"{_or_measured(data.mount, culprit)}{_advice(data.mount)}",
+        )
+    plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
+    worst = worst_directions(held, still, plausible, replace(boards, begin=0))
+    if any(it.sigma > it.limit for it in worst[:4]):
+        _refuse(data.mount, worst[:4], _motion(data), _advice(data.mount))
+    for board, name in enumerate(boards.names[1:], start=1):
+        _refuse(
+            data.mount,
+            worst[2 + 2 * board : 4 + 2 * board],
+            "the views that show it are too few or too poor",
+            f"Add views of target {name}, or take it out of the session.",
+        )
+    if looks:
+        first = looks + boards.unknowns
+        _refuse(
+            data.mount,
+            worst_directions(
+                data.with_first(first),
+                replace(edges, shared=edges.shared[:first]),
+                plausible,
+                boards,
+            ),
+            *_UNTOLD["instrument" if data.mount == "instrument" else "camera"],
+        )
+
+
+def _refuse(mount: Mount, worst: Sequence[Direction], cause: str, next_step: str) -> None:
+    beyond = [it for it in worst if it.sigma > it.limit]
+    if beyond:
+        raise DegenerateError(
+            f"{title(mount)}: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
+            f"{cause}.",
+            culprits=[it.words for it in beyond],
+            next_step=next_step,
+        )
+
+
+def worst_directions(
+    data: Closure, edges: Edges, noise: Noise, boards: Boards
+) -> tuple[Direction, ...]:
+    """The worst directions of a fit; see `directions`."""
+    spread = covariance(closure_information(data, edges, noise))
+    return directions(spread, edges, data.mount, boards)
+
+
+def directions(
+    spread: FloatArray, edges: Edges, mount: Mount, boards: Boards
+) -> tuple[Direction, ...]:
+    """The worst direction of each edge, first x's and then each board's, offset before rotation.
+
+    Args:
+        spread: (12 + k, 12 + k) covariance of x, z and others.
+        edges: The answer.
+        mount: Where the camera is.
+        boards: The boards, where there are several.
+    """
+    found = []
+    placed = place(boards, edges)
+    spread = placed.covariance(spread)
+    for edge, transform in enumerate((edges.x, *placed.z)):
+        for is_rotation in (False, True):
+            start = 6 * edge + (0 if is_rotation else 3)
+            block = spread[start : start + 3, start : start + 3]
+            values, vectors = np.linalg.eigh(block)
+            limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
+            words = _words(edge, transform[:3, :3] @ vectors[:, -1], mount, is_rotation, boards)
+            found.append(Direction(words, float(np.sqrt(values[-1])), float(limit), is_rotation))
+    return tuple(found)
+
+
+def refuse_too_few(data: Closure, views: int = 1) -> None:
+    """Refuses stops that cannot tell anything, however they lie.
+
+    Args:
+        data: The used views, one a stop.
+        views: How many they were before those of one stop became one.
+
+    Raises:
+        DegenerateError: There are fewer than three.
+    """
+    if len(data) >= FEWEST_VIEWS:
+        return
+    culprit = f"the {_sensor(data.mount)}'s offset from the {_frame(data.mount)}"
+    cause = "it takes two different axes of rotation between views to determine it"
+    if len(data) == 2:
+        culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data)))}"
+        cause = f"two views share that axis of rotation, and {cause}"
+    stops = f"{len(data)} usable stops of the robot"
+    if len(data) == 1 < views:
+        stops = f"all {views} used views are from one pose of the robot"
+    raise DegenerateError(
+        f"{title(data.mount)}: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not "
+        f"determined: {cause}.",
+        culprits=[culprit],
+        next_step=_advice(data.mount),
+    )
+
+
+def _null_direction(spread: Spectrum, edges: Edges, mount: Mount, boards: Boards) -> str:
+    """Names what the null directions leave open: of the camera's edge, or else the target's."""
+    null = spread.vectors[:, spread.values < _NULL_RATIO * spread.values[-1]]
+    for edge, transform in enumerate((edges.x, edges.z)):
+        rotation, translation = (
+            transform[:3, :3] @ null[6 * edge + at : 6 * edge + at + 3] for at in (0, 3)
+        )
+        parts = [
+            _open_part(edge, directions, mount, is_rotation, boards)
+            for directions, is_rotation in ((translation, False), (rotation, True))
+        ]
+        named = [part for part in parts if part]
+        if named:
+            return " and ".join(named)
+    return "a combination of both edges"
+
+
+def _open_part(
+    edge: int, directions: FloatArray, mount: Mount, is_rotation: bool, boards: Boards
+) -> str:
+    """Names what (3, k) null directions leave open of a rotation or an offset, if anything."""
+    vectors, sizes, _ = np.linalg.svd(directions)
+    # Null vectors have unit length over all twelve unknowns, a radian counting as a metre.
+    rank = int(np.sum(sizes > _PART_OF_NULL))
+    if rank == 1:
+        return _words(edge, vectors[:, 0], mount, is_rotation, boards)
+    if rank == 0:
+        return ""
+    thing, frame = _names(edge, mount, boards)
+    return f"the {thing}'s {'rotation' if is_rotation else 'offset from the ' + frame}"
+
+
+def _words(
+    edge: int, direction: FloatArray, mount: Mount, is_rotation: bool, boards: Boards
+) -> str:
+    """Says which component of which edge a direction in the edge's parent frame is."""
+    thing, frame = _names(edge, mount, boards)
+    quantity = "rotation about" if is_rotation else "offset along"
+    return f"the {thing}'s {quantity} the {frame}'s {axis_words(direction)}"
+
+
+def _names(edge: int, mount: Mount, boards: Boards) -> tuple[str, str]:
+    """What an edge places, and the frame that it hangs on."""
+    if edge == 0:
+        return _sensor(mount), _frame(mount)
+    name = f"target {boards.names[edge - 1]}".strip()
+    return (
+        "probe" if mount == "instrument" else name,
+        "base" if mount == "eye-in-hand" else "tool",
+    )
+
+
+def _sensor(mount: Mount) -> str:
+    return "instrument" if mount == "instrument" else "camera"
+
+
+def axis_words(direction: FloatArray) -> str:
+    """Names a direction (3,): `x`, or `direction (0.71, 0.71, 0.00)`."""
+    at = int(np.argmax(np.abs(direction)))
+    if abs(direction[at]) > _NEARLY_AXIS:
+        return "xyz"[at]
+    signed = direction * np.sign(direction[at])
+    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*signed)
+
+
+def _frame(mount: Mount) -> str:
+    """The frame that the camera hangs on, in which the relative motions act."""
+    return "tool" if mount == "eye-in-hand" else "base"
+
+
+def _turns(data: Closure) -> FloatArray:
+    """Rotation vectors (p, 3) of the relative motions between all pairs of views [rad].
+
+    Of more views than can be paired in a moment, those that turn least and most are among them.
+    """
+    ranked = data.robot[np.argsort(rotation_angle(invert(data.robot[0]) @ data.robot))]
+    some = np.linspace(0, len(data) - 1, min(len(data), _PAIRED)).round().astype(np.int64)
+    i, j = np.triu_indices(len(some), 1)
+    relative = invert(ranked[some[j]]) @ ranked[some[i]]
+    return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
+
+
+def _main_axis(turns: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(turns, full_matrices=False)[2][0])
+
+
+def _motion(data: Closure) -> str:
+    """Says what is wrong with the motion."""
+    turns, count = _turns(data), len(data)
+    largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
+    # The flange's own positions: the robot's part is inverted where the camera stands still.
+    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
+    spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
+    if largest < 0.5 and spread_mm < 1.0:
+        return f"the {count} used views are all from one pose of the robot"
+    if largest < 0.5:
+        return (
+            f"the {count} used views differ in position only (largest rotation between two of "
+            f"them: {largest:.1g} deg)"
+        )
+    main = _main_axis(turns)
+    aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
+    if aside < 0.1 * largest:
+        return (
+            f"all {count} used views turn about the {_frame(data.mount)}'s {axis_words(main)} to "
+            f"within {max(aside, 0.01):.2g} deg"
+        )
+    return (
+        f"the {count} used views turn by at most {largest:.2g} deg, and by {aside:.2g} deg "
+        "about a second axis"
+    )
+
+
+def _or_measured(mount: Mount, culprit: str) -> str:
+    """What else there is where the arm cannot tilt, as with four axes, and one offset is open."""
+    if mount == "instrument" or "offset along" not in culprit:
+        return ""
+    return f"Where the arm cannot tilt, measure that offset for [prior.{edge_names(mount)[0]}]. "
+
+
+def _advice(mount: Mount) -> str:
+    return (
+        f"Add 3 or more views in which the flange is tilted by 20 to 40 degrees about different "
+        f"axes, not only about one axis of the {_frame(mount)}."
+    )

@@ -1,0 +1,137 @@
+"""The numbers of a joint table that an arm's errors move: what users know an arm by."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.robot import FUNCTION_NAMES, DHTable
+from visioncal.robot.slopes import ROW_NAMES, number_slopes, table_moves
+from visioncal.transforms import adjoint, invert
+from visioncal.types import FloatArray
+
+_LENGTHS = ("d", "a")
+_ROW = len(ROW_NAMES)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a joint table that is not held.
+
+    Attributes:
+        joint: Its row, from 0.
+        kind: `theta`, `d`, `a`, `alpha`, `beta`, or `ratio`, `sine`, `cosine` of its function.
+        link: Which link it stands in: 0 for X_0, i for Z_i X_i.
+    """
+
+    joint: int
+    kind: str
+    link: int
+
+    @property
+    def is_length(self) -> bool:
+        """Whether it is in metres."""
+        return self.kind in _LENGTHS
+
+    @property
+    def name(self) -> str:
+        """Its name with its unit."""
+        if self.kind == "ratio":
+            return self.kind
+        return f"{self.kind}_{'m' if self.is_length else 'rad'}"
+
+    @property
+    def unit(self) -> float:
+        """What counts as much as a radian."""
+        return LEVER_M if self.is_length else 1.0
+
+    @property
+    def place(self) -> int:
+        """Where it stands among the numbers of a row and its joint's function."""
+        if self.kind in ROW_NAMES:
+            return ROW_NAMES.index(self.kind)
+        return _ROW + FUNCTION_NAMES.index(self.kind)
+
+    def value(self, table: DHTable) -> float:
+        """Its value [rad, m or 1]."""
+        if self.place >= _ROW:
+            return float(table.functions[self.joint, self.place - _ROW])
+        if self.kind in ("theta", "d"):
+            return float({"theta": table.theta_rad, "d": table.d_m}[self.kind][self.joint])
+        across = {"a": table.a_m, "alpha": table.alpha_rad, "beta": table.beta_rad}
+        return float(across[self.kind][self.link])
+
+
+def free_parameters(model: ArmModel, table: DHTable) -> tuple[Parameter, ...]:
+    """The numbers of a table that a model's errors move, joint by joint."""
+    placements, functions = model.changes(np.ones(len(model.values)))
+    return tuple(_free(table, functions, links=bool(placements.any())))
+
+
+def _free(table: DHTable, functions: FloatArray, *, links: bool) -> Iterator[Parameter]:
+    for joint in range(len(table)):
+        link = joint if table.convention == "modified" else joint + 1
+        if links:
+            yield Parameter(joint, "theta", joint + 1)
+            # Between parallel axes beta stands for d.
+            if not table.parallel[joint + 1]:
+                yield Parameter(joint, "d", joint + 1)
+            yield Parameter(joint, "a", link)
+            yield Parameter(joint, "alpha", link)
+            if table.parallel[link]:
+                yield Parameter(joint, "beta", link)
+        elif functions[joint, 0]:
+            yield Parameter(joint, "d" if table.prismatic[joint] else "theta", joint + 1)
+        for place in range(1, len(FUNCTION_NAMES)):
+            if functions[joint, place]:
+                yield Parameter(joint, FUNCTION_NAMES[place], joint + 1)
+
+
+def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parameter]) -> FloatArray:
+    """How the numbers of the arm's table move with its errors.
+
+    Args:
+        model: The arm.
+        table: `table_of(model.bare, ...)`.
+        parameters: Those that are wanted.
+
+    Returns:
+        (k, p) derivatives, zero where the convention keeps a number and the base or the flange
+        takes its place.
+    """
+    steps = [model.changes(row) for row in np.eye(len(model.values))]
+    placements, functions = (np.array(it) for it in zip(*steps, strict=True))
+    rows = table_moves(model.bare, table, placements, functions)
+    moves = np.zeros((len(parameters), len(steps)))
+    for at, it in enumerate(parameters):
+        if it.place >= _ROW:
+            moves[at] = functions[:, it.joint, it.place - _ROW]
+        elif it.link:
+            moves[at] = rows[:, it.link - 1, it.place]
+    return moves
+
+
+def parameter_slopes(
+    table: DHTable, parameters: Sequence[Parameter], q: FloatArray, mounted: FloatArray
+) -> FloatArray:
+    """How the reported frame moves with the numbers of a table.
+
+    Args:
+        table: The table.
+        parameters: Those that are wanted.
+        q: (m, n) joint angles [rad].
+        mounted: (4, 4) `flange_from_reported`.
+
+    Returns:
+        (m, 6, k) right perturbations.
+    """
+    rows, functions = number_slopes(table, q)
+    columns = [
+        rows[:, :, it.link, it.place]
+        if it.place < _ROW
+        else functions[:, :, it.joint, it.place - _ROW]
+        for it in parameters
+    ]
+    return np.asarray(adjoint(invert(mounted)) @ np.stack(columns, axis=2))

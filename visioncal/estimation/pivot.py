@@ -1,0 +1,222 @@
+"""A tool's tip and rotation from touches of fixed points: the pivot.
+
+The linear solution starts a joint fit of the tool and of the touched points, whitened by what is
+known of the robot's noise, so that touches along the tool's axes carry the tip's uncertainty into
+its rotation. Touches that do not agree are left out (see `agreement`) and named.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.chance import f_limit
+from visioncal.errors import DataError
+from visioncal.estimation.agreement import Agreement, agreeing_groups
+from visioncal.estimation.closure import Noise
+from visioncal.estimation.groups import GroupFit, fit_groups
+from visioncal.estimation.observability import Direction
+from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
+from visioncal.estimation.turning import CARELESS_M, check_counts, check_turning
+from visioncal.threads import one_blas_thread
+from visioncal.types import FloatArray, Mask
+
+# A touch that errs fits another point by chance in one of a thousand.
+_FALSE_ALARM = 1e-3
+_NO_NOISE = Noise(0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PivotFit:
+    """A tool from n touches of k points.
+
+    Attributes:
+        flange_from_tool: (4, 4) the answer [m].
+        oriented: Whether the rotation was measured; else it is the flange's own.
+        covariance: (6, 6) of its right perturbation (rotation [rad], translation [m]); zero in the
+            rotation where that was not measured.
+        points: (k, 3) the touched points in the base [m].
+        points_covariance: (k, 3, 3) of them [m^2].
+        agrees: (n,) touches that the answer was made from.
+        doubtful: (n,) touches of which some are wrong, while nothing tells which: all are used.
+        explained: Whether noise explains the used touches (see `agreement.Agreement`).
+        surprise: (n,) squared Mahalanobis distance of each touch from what the others predict, one
+            on average where it is noise.
+        limit: (n,) what it may be; infinite where the others do not predict the touch.
+        residuals_m: (n,) how far each touched point is off in the tool [m], in as many directions
+            as its kind observes.
+        belongs_to: (n,) the other point that a touch fits which does not agree; None for none.
+        sigma_m: Noise of a touch per axis [m], beyond what is known of the robot's.
+        sigma_95_m: Its 95 % interval [m].
+        worst: The directions that are known worst: the tip's, then the rotation's if measured.
+    """
+
+    flange_from_tool: FloatArray
+    oriented: bool
+    covariance: FloatArray
+    points: FloatArray
+    points_covariance: FloatArray
+    agrees: Mask
+    doubtful: Mask
+    explained: bool
+    surprise: FloatArray
+    limit: FloatArray
+    residuals_m: FloatArray
+    belongs_to: tuple[int | None, ...]
+    sigma_m: float
+    sigma_95_m: tuple[float, float]
+    worst: tuple[Direction, ...]
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the used touches' distances [m]."""
+        return float(np.sqrt(np.mean(self.residuals_m[self.agrees] ** 2)))
+
+    @property
+    def looks_inverse(self) -> bool:
+        """Whether the poses may be `flange_from_base`: the tip and the one point exchange then.
+
+        Touches of one point close both ways alike; a tip that is farther from the flange than the
+        point is from the base tells.
+        """
+        reach = float(np.linalg.norm(self.flange_from_tool[:3, 3]))
+        return len(self.points) == 1 and reach > float(np.linalg.norm(self.points[0]))
+
+
+def fit_pivot(
+    touches: Touches, noise: Noise = _NO_NOISE, expected_sigma_m: float | None = None
+) -> PivotFit:
+    """Finds the tool on the flange.
+
+    Args:
+        touches: Of kind `point`, three of one point or two each of two points at least; with those
+            of kind `z` and `xz`, one each at least, the tool's rotation too.
+        noise: Known errors of the flange's pose, per axis; zero where unknown.
+        expected_sigma_m: Noise that a touch may be expected to have, per axis [m]; None where
+            unknown.
+
+    Returns:
+        The tool.
+
+    Raises:
+        DataError: Touches are missing, or contradict each other: about the side of an axis, or
+            grossly while nothing tells which is wrong.
+        DegenerateError: They leave a direction open; named with its predicted sigma.
+    """
+    check_counts(touches)
+    with one_blas_thread():
+        return _fitted(touches, noise, expected_sigma_m)
+
+
+def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
+    tips = touches.are("point")
+    problem = TouchProblem(touches.subset(tips), noise, oriented=False)
+    found = agreeing_groups(problem, expected)
+    _check_doubt(problem, found)
+    worst = check_turning(problem, found.fit)
+    if not tips.all():
+        # Touches of the axes hold the tool's rotation alone: a consensus of few would fit them and
+        # nothing else, so they join those that agree about the tip.
+        agreed = np.ones(len(touches), dtype=bool)
+        agreed[tips] = found.agrees
+        problem = TouchProblem(touches, noise, oriented=True)
+        found = agreeing_groups(problem, expected, (agreed, problem.turned(found.fit.state)))
+        _check_sides(touches, found)
+        worst = check_turning(problem, found.fit)
+    return _result(problem, found, worst)
+
+
+def _check_doubt(problem: TouchProblem, found: Agreement[Placed]) -> None:
+    """Refuses touches that contradict each other grossly where nothing tells which is wrong."""
+    if not found.doubtful.any() or found.fit.sigma < CARELESS_M:
+        return
+    touches, rows = problem.touches, np.flatnonzero(found.doubtful)
+    labels = [touches.labels[it] for it in rows]
+    belongs = _belonging(problem, found)
+    fitting = [
+        f"touch {touches.labels[it]} fits point {touches.names[at]!r}"
+        for it, at in enumerate(belongs)
+        if found.doubtful[it] and at is not None
+    ]
+    told = f" ({', '.join(fitting)})" if fitting else ""
+    raise DataError(
+        f"tcp: touches {', '.join(labels)} contradict each other, at a scatter of "
+        f"{1e3 * found.fit.sigma:.3g} mm, and nothing tells which of them is wrong{told}.",
+        culprits=labels,
+        next_step="Touch their point once or twice more, or correct its name.",
+    )
+
+
+def _check_sides(touches: Touches, found: Agreement[Placed]) -> None:
+    seen = in_tool(touches, found.fit.state)
+    for kind, along in (("z", seen[:, 2]), ("xz", seen[:, 0])):
+        these = found.agrees & np.array([it == kind for it in touches.kinds])
+        behind = [touches.labels[it] for it in np.flatnonzero(these & (along < 0.0))]
+        before = [touches.labels[it] for it in np.flatnonzero(these & (along > 0.0))]
+        if behind:
+            axis = kind[0]
+            raise DataError(
+                f"tcp: of the touches of kind {kind}, {', '.join(behind)} lie on the other side of "
+                f"the tip along the tool's {axis} than {', '.join(before)}: each has to have its "
+                f"point on the side of positive {axis}.",
+                culprits=behind,
+                next_step="Leave the wrong ones out, or touch again.",
+            )
+
+
+def _result(
+    problem: TouchProblem, found: Agreement[Placed], worst: tuple[Direction, ...]
+) -> PivotFit:
+    fit, edge = found.fit, 6 if problem.oriented else 3
+    spread = np.zeros((6, 6))
+    spread[6 - edge :, 6 - edge :] = fit.covariance[:edge, :edge]
+    count = len(fit.state.points)
+    blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
+    at = np.arange(count)
+    return PivotFit(
+        fit.state.flange_from_tool,
+        problem.oriented,
+        spread,
+        fit.state.points,
+        blocks[at, :, at, :],
+        found.agrees,
+        found.doubtful,
+        found.explained,
+        found.surprise,
+        found.limit,
+        np.linalg.norm(fit.groups.residuals, axis=1),
+        _belonging(problem, found),
+        fit.sigma,
+        fit.sigma_95,
+        worst,
+    )
+
+
+def _belonging(problem: TouchProblem, found: Agreement[Placed]) -> tuple[int | None, ...]:
+    """The other point that each disagreeing touch fits, as the touches beyond doubt have it."""
+    suspects = ~found.agrees | found.doubtful
+    fit = found.fit
+    if found.doubtful.any():
+        fit = fit_groups(problem, ~suspects, fit.state)
+    belongs: list[int | None] = [None] * len(suspects)
+    for at in np.flatnonzero(suspects):
+        ratios = [_surprise_at(problem, fit, int(at), it) for it in range(len(fit.state.points))]
+        ratios[problem.touches.points[at]] = np.inf
+        best = int(np.argmin(ratios))
+        if ratios[best] < 1.0:
+            belongs[at] = best
+    return tuple(belongs)
+
+
+def _surprise_at(problem: TouchProblem, fit: GroupFit[Placed], at: int, point: int) -> float:
+    """Squared distance of one touch from where it had been if of a point, over its limit."""
+    if not np.any(fit.used & (problem.touches.points == point)):
+        return float("inf")
+    moved = problem.touches.points.copy()
+    moved[at] = point
+    touched = replace(problem, touches=replace(problem.touches, points=moved))
+    groups = touched.linearise(fit.state)
+    rows = groups.observed[at]
+    residual, slope = groups.residuals[at][rows], groups.jacobian[at][rows]
+    spread = groups.spread(fit.sigma)[at][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
+    limit = f_limit(_FALSE_ALARM, len(residual), max(fit.freedom, 1))
+    return float(residual @ np.linalg.solve(spread, residual) / (len(residual) * limit))

@@ -1,0 +1,118 @@
+"""How well a frame is placed: its worst directions in words, and when they are too poor."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from visioncal.errors import DegenerateError
+from visioncal.estimation.groups import GroupFit, State
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.observability import (
+    SIGMA_LIMIT_M,
+    SIGMA_LIMIT_RAD,
+    Direction,
+    axis_words,
+)
+from visioncal.files import some_of
+from visioncal.transforms import skew
+from visioncal.types import FloatArray, Mask
+
+# No instrument of a cell is better [m]: exact coordinates would otherwise be judged by rounding.
+LEAST_NOISE_M = 1e-6
+# A careful touch by hand [m]: geometry is judged by it where nothing tells the noise.
+TOUCH_NOISE_M = 1e-4
+# Squared extents of points whose ratio is under this are a line.
+LEAST_RATIO = 1e-8
+
+
+def noise_words(sigma_m: float | None) -> str:
+    """Says by which noise geometry was judged: `a noise of 0.1 mm, which nothing contradicts`."""
+    if sigma_m is None:
+        return f"at a noise of {1e3 * TOUCH_NOISE_M:g} mm, taken because nothing tells it"
+    return f"at a noise of {1e3 * sigma_m:.2g} mm"
+
+
+def left_out_words(labels: Sequence[str], used: Mask) -> str:
+    """Says what was left out: `without P3, which does not agree with the others, `, or nothing."""
+    names = [name for name, stays in zip(labels, used, strict=True) if not stays]
+    verb = "does" if len(names) == 1 else "do"
+    return f"without {some_of(names)}, which {verb} not agree with the others, " if names else ""
+
+
+def worst_directions(
+    fit: GroupFit[State], base_from_fixture: FloatArray, centre: FloatArray, sigma_m: float | None
+) -> tuple[Direction, Direction]:
+    """Finds the worst known offset and rotation of a fixture.
+
+    Points that disagree wildly are no fault of the geometry: it is judged by a noise of at most
+    the limit, and at least of a micrometre.
+
+    Args:
+        fit: Whose first six unknowns are the fixture's right perturbation (rotation, translation).
+        base_from_fixture: (4, 4) the answer.
+        centre: (3,) where the offset counts, in the fixture's frame [m]: amid the points, since a
+            drawing's origin may be far away.
+        sigma_m: Noise of one coordinate [m], beyond what is known beforehand; None where nothing
+            tells it.
+
+    Returns:
+        The offset's worst direction in the base, and the rotation's in the fixture.
+    """
+    level = TOUCH_NOISE_M if sigma_m is None else min(max(sigma_m, LEAST_NOISE_M), SIGMA_LIMIT_M)
+    spread = covariance(fit.groups.subset(fit.used).information(level))[:6, :6]
+    return worst_of(base_from_fixture, spread, "fixture", "base", centre)
+
+
+def worst_of(
+    matrix: FloatArray,
+    spread: FloatArray,
+    thing: str,
+    parent: str,
+    centre: FloatArray | None = None,
+) -> tuple[Direction, Direction]:
+    """Finds the worst known offset and rotation of a frame.
+
+    Args:
+        matrix: (4, 4) the frame in its parent.
+        spread: (6, 6) covariance of its right perturbation (rotation [rad], translation [m]).
+        thing: What the frame is of, for messages.
+        parent: What it hangs on, likewise.
+        centre: (3,) where the offset counts, in the frame [m]; its origin where None.
+
+    Returns:
+        The offset's worst direction in the parent, and the rotation's in the frame itself.
+    """
+    point = np.zeros(3) if centre is None else centre
+    at_centre = matrix[:3, :3] @ np.hstack([-skew(point), np.eye(3)])
+    values, vectors = np.linalg.eigh(at_centre @ spread @ at_centre.T)
+    offset = Direction(
+        f"the {thing}'s offset along the {parent}'s {axis_words(vectors[:, -1])}",
+        float(np.sqrt(values[-1])),
+        SIGMA_LIMIT_M,
+        is_rotation=False,
+    )
+    values, vectors = np.linalg.eigh(spread[:3, :3])
+    rotation = Direction(
+        f"the {thing}'s rotation about its {axis_words(vectors[:, -1])}",
+        float(np.sqrt(values[-1])),
+        SIGMA_LIMIT_RAD,
+        is_rotation=True,
+    )
+    return offset, rotation
+
+
+def refuse_poor(
+    worst: Sequence[Direction], cause: str, culprits: Sequence[str], next_step: str
+) -> None:
+    """Refuses a fixture whose worst directions are over their limits.
+
+    Raises:
+        DegenerateError: Naming the first that is.
+    """
+    beyond = [it for it in worst if it.sigma > it.limit]
+    if beyond:
+        raise DegenerateError(
+            f"fixture: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: {cause}.",
+            culprits=[*(it.words for it in beyond), *culprits],
+            next_step=next_step,
+        )

@@ -1,0 +1,261 @@
+"""Places of points on the flange, read by an instrument: a start, and the poses they stand for.
+
+A reading of a place is a pose of the instrument's probe whose rotation is told by nothing: it is
+supplied as the chain predicts it, with the variance of a rotation that is not known at all. So
+supplied, readings of points are weighed and merged as poses are. Several points of one stop tell
+the rotation too, once their places on the flange are unknowns that all readings share.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.estimation.closure import Closure, Edges
+from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.linalg import damped_step
+from visioncal.estimation.procrustes import align
+from visioncal.estimation.shared import Shared
+from visioncal.transforms import adjoint, compose, exp, invert, skew
+from visioncal.types import FloatArray, IntArray, Mask
+
+# Variance about each axis of a rotation that is not told [rad^2].
+UNTOLD = 1.0
+# A cost [m^2] that changes by less than this share of itself and of a square metre is at rest.
+_SETTLED = 1e-14
+# Sets of stops to start from, and how many: with 30 % of the stops wrong, all of them contain a
+# wrong one with probability 1e-5.
+_SET_SIZE, _SETS = 5, 60
+_REFINED, _ROUNDS = 5, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """What an instrument read of points on the flange.
+
+    Attributes:
+        base_from_flange: (m, 4, 4) one a reading.
+        read: (m, 3) places in the instrument's frame [m].
+        points: (m,) which point each is of, numbered from 0.
+        stops: (m,) at which stop of the robot, numbered from 0.
+        sigmas: (m,) standard deviations of each coordinate [m].
+    """
+
+    base_from_flange: FloatArray
+    read: FloatArray
+    points: IntArray
+    stops: IntArray
+    sigmas: FloatArray
+
+    def subset(self, chosen: Mask) -> "Places":
+        """Returns the readings of an (m,) mask."""
+        return Places(
+            self.base_from_flange[chosen],
+            self.read[chosen],
+            self.points[chosen],
+            self.stops[chosen],
+            self.sigmas[chosen],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """Where the instrument stands and the points sit.
+
+    Attributes:
+        base_from_instrument: (4, 4).
+        on_flange: (p, 3) the points in the flange's frame [m].
+    """
+
+    base_from_instrument: FloatArray
+    on_flange: FloatArray
+
+    @property
+    def edges(self) -> Edges:
+        """The same as edges of the chain: the first point's frame is parallel to the flange."""
+        return Edges(self.base_from_instrument, compose(np.eye(3), self.on_flange[0]), np.zeros(0))
+
+    @property
+    def from_first(self) -> FloatArray:
+        """(p, 3) the points in the first one's frame [m]."""
+        return np.asarray(self.on_flange - self.on_flange[0])
+
+    def moved(self, edges: Edges) -> "Mounting":
+        """Returns the mounting that a fit of the chain found, starting from this one.
+
+        Args:
+            edges: Its edges; what is shared begins with the changes of the further points.
+        """
+        changes = np.zeros_like(self.on_flange)
+        changes[1:] = edges.shared[: 3 * len(changes) - 3].reshape(-1, 3)
+        on_flange = edges.z[:3, 3] + (self.from_first + changes) @ edges.z[:3, :3].T
+        return Mounting(edges.x, on_flange)
+
+
+def supplied_poses(places: Places, mounting: Mounting) -> tuple[FloatArray, FloatArray]:
+    """Supplies the rotation that places do not tell.
+
+    Args:
+        places: The readings.
+        mounting: What predicts the rotation.
+
+    Returns:
+        (m, 4, 4) `instrument_from_probe`, the probe being the first point with the flange's axes,
+        and the (m, 6, 6) covariances of their right perturbations.
+    """
+    x = mounting.base_from_instrument
+    turns = x[:3, :3].T @ places.base_from_flange[:, :3, :3]
+    away = mounting.from_first[places.points]
+    poses = compose(turns, places.read - (turns @ away[:, :, None])[:, :, 0])
+    spread = np.zeros((len(poses), 6, 6))
+    spread[:, range(3), range(3)] = UNTOLD
+    spread[:, range(3, 6), range(3, 6)] = places.sigmas[:, None] ** 2
+    carried = adjoint(compose(np.eye(3), away))
+    return poses, carried @ spread @ np.swapaxes(carried, 1, 2)
+
+
+def point_columns(points: IntArray, count: int) -> FloatArray:
+    """How the poses of `supplied_poses` move with the places of all points but the first.
+
+    Args:
+        points: (m,) which point each reading is of.
+        count: How many points there are.
+
+    Returns:
+        (m, 6, 3 (count - 1)) right perturbations.
+    """
+    columns = np.zeros((len(points), 6, 3 * (count - 1)))
+    for point in range(1, count):
+        columns[np.ix_(points == point, range(3, 6), range(3 * point - 3, 3 * point))] = -np.eye(3)
+    return columns
+
+
+def points_shared(columns: FloatArray) -> Shared:
+    """Puts the further points' places as unknowns of the chain, of which nothing is known.
+
+    Args:
+        columns: (m, 6, k) of `point_columns`.
+    """
+    size = columns.shape[2]
+    nothing = np.zeros(size)
+    return Shared(np.zeros((size, size)), nothing, nothing, columns, np.zeros_like(columns))
+
+
+def with_places(data: Closure, mounting: Mounting, columns: FloatArray) -> Closure:
+    """Tells a chain of supplied poses what they were supplied from."""
+    data = replace(data, guess=mounting.edges)
+    return data.with_more(points_shared(columns)) if columns.shape[2] else data
+
+
+def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:
+    """Finds where the instrument stands and the points sit, although some stops may be wrong.
+
+    The least trimmed sum of distances (Rousseeuw 1984) over small sets of stops.
+
+    Args:
+        places: The readings.
+
+    Returns:
+        The mounting, and the (m,) distances [m] between read and predicted places.
+    """
+    count = int(places.stops.max()) + 1
+    half = (count + 1) // 2 + 1
+    found = []
+    for start in _starts(places, count):
+        mounting = fit_mounting(places.subset(start), None, int(places.points.max()) + 1)
+        away = _by_stop(places, mounting)
+        found.append((float(np.sort(away)[:half].sum()), mounting, away))
+    found.sort(key=lambda it: it[0])
+    refined = [_concentrated(places, it, half) for it in found[:_REFINED]]
+    best = min(refined, key=lambda it: it[0])[1]
+    return best, distances(places, best)
+
+
+def _starts(places: Places, count: int) -> Iterator[Mask]:
+    """Masks of readings: all of them, and small sets of stops in which all points are read."""
+    yield np.ones(len(places.stops), dtype=bool)
+    if count <= _SET_SIZE:
+        return
+    rng = np.random.default_rng(0)
+    points = len(np.unique(places.points))
+    for _ in range(_SETS):
+        chosen = np.isin(places.stops, rng.choice(count, _SET_SIZE, replace=False))
+        if len(np.unique(places.points[chosen])) == points:
+            yield chosen
+
+
+def _concentrated(
+    places: Places, found: tuple[float, Mounting, FloatArray], half: int
+) -> tuple[float, Mounting]:
+    """Solves from the nearest half, again and again (Rousseeuw and Van Driessen 1999)."""
+    best, mounting, away = found
+    for _ in range(_ROUNDS):
+        chosen = np.isin(places.stops, np.argsort(away)[:half])
+        mounting_then = fit_mounting(places.subset(chosen), mounting, len(mounting.on_flange))
+        away = _by_stop(places, mounting_then)
+        then = float(np.sort(away)[:half].sum())
+        if then >= best:
+            break
+        best, mounting = then, mounting_then
+    return best, mounting
+
+
+def _by_stop(places: Places, mounting: Mounting) -> FloatArray:
+    """The largest distance of each stop [m]."""
+    away = np.zeros(int(places.stops.max()) + 1)
+    np.maximum.at(away, places.stops, distances(places, mounting))
+    return away
+
+
+def distances(places: Places, mounting: Mounting) -> FloatArray:
+    """Distances (m,) [m] between the read and the predicted places."""
+    return np.asarray(np.linalg.norm(residuals(places, mounting), axis=1))
+
+
+def fit_mounting(places: Places, start: Mounting | None, count: int) -> Mounting:
+    """Minimises the distances between read and predicted places.
+
+    Args:
+        places: The readings.
+        start: Where to start; None for the flange laid on what was read, without the points'
+            places on it.
+        count: How many points there are; those that were not read stay where they are.
+    """
+    if start is None:
+        x = align(places.base_from_flange[:, :3, 3], places.read)
+        start = Mounting(x, np.zeros((count, 3)))
+
+    def linearise(at: Mounting) -> Linearised[Mounting]:
+        off, jacobian = residuals(places, at), _jacobian(places, at)
+        information = np.einsum("mij,mik->jk", jacobian, jacobian)
+        gradient = np.einsum("mij,mi->j", jacobian, off)
+
+        def step(damping: float) -> Mounting:
+            by = damped_step(information, gradient, damping)
+            moved = at.on_flange + by[6:].reshape(-1, 3)
+            return Mounting(at.base_from_instrument @ exp(by[None, :6])[0], moved)
+
+        return Linearised(at, float(np.sum(off**2)), step)
+
+    return descend(start, linearise, _SETTLED)[0]
+
+
+def residuals(places: Places, at: Mounting) -> FloatArray:
+    """From the predicted to the read places (m, 3), in the flange's frame [m]."""
+    x = at.base_from_instrument
+    in_base = places.read @ x[:3, :3].T + x[:3, 3]
+    flange_from_base = invert(places.base_from_flange)
+    turned = np.einsum("mij,mj->mi", flange_from_base[:, :3, :3], in_base)
+    return np.asarray(turned + flange_from_base[:, :3, 3] - at.on_flange[places.points])
+
+
+def _jacobian(places: Places, at: Mounting) -> FloatArray:
+    """Their derivatives (m, 3, 6 + 3 p) by steps of the instrument's frame and of the points."""
+    turns = np.swapaxes(places.base_from_flange[:, :3, :3], 1, 2) @ at.base_from_instrument[:3, :3]
+    count = len(at.on_flange)
+    jacobian = np.zeros((len(turns), 3, 6 + 3 * count))
+    jacobian[:, :, :3] = -turns @ skew(places.read)
+    jacobian[:, :, 3:6] = turns
+    for point in range(count):
+        jacobian[:, :, 6 + 3 * point : 9 + 3 * point][places.points == point] = -np.eye(3)
+    return jacobian

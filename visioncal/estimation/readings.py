@@ -1,0 +1,75 @@
+"""Whether touches close when their poses are read in another way."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.estimation.touching import Touches, linear_tip
+from visioncal.transforms import compose, invert
+from visioncal.types import FloatArray
+
+# Touches that were read wrongly close so much better when they are read right, and this well [m].
+_MUCH_BETTER, _CLOSED_M = 20.0, 2e-3
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another way to read the poses, by which the touches close.
+
+    Attributes:
+        words: What it is: `with quaternions as w, x, y, z`.
+        rms_m: Root mean square distance of the touches then [m].
+        as_read_m: The same as they were read [m].
+    """
+
+    words: str
+    rms_m: float
+    as_read_m: float
+
+
+def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
+    """Finds other ways to read the poses by which the touches close, where as read they do not.
+
+    Touches of one point close in both directions alike, with the tip and the point exchanged; of
+    several, in one only.
+
+    Args:
+        touches: As they were read; those of kind `point` count.
+
+    Returns:
+        The readings under which they close to within 2 mm and twenty times better, best first.
+    """
+    there = touches.subset(touches.are("point"))
+    poses = there.base_from_flange
+    as_read = _linear_rms(there)
+    others = {
+        "with quaternions as w, x, y, z": _reordered(poses, -1),
+        "with quaternions as x, y, z, w": _reordered(poses, 1),
+    }
+    if len(np.unique(there.points)) > 1:
+        inverse = "the other way round, as flange_from_base"
+        others |= {f"{words} and {inverse}": invert(it) for words, it in others.items()}
+        others[inverse] = invert(poses)
+    found = [
+        Reading(words, _linear_rms(replace(there, base_from_flange=other)), as_read)
+        for words, other in others.items()
+    ]
+    closing = [it for it in found if it.rms_m < min(as_read / _MUCH_BETTER, _CLOSED_M)]
+    return tuple(sorted(closing, key=lambda it: it.rms_m))
+
+
+def _reordered(poses: FloatArray, shift: int) -> FloatArray:
+    """The poses had the numbers that were read as x, y, z, w stood so many places further on."""
+    numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    return compose(Rotation.from_quat(np.roll(numbers, shift, axis=1)).as_matrix(), poses[:, :3, 3])
+
+
+def _linear_rms(touches: Touches) -> float:
+    poses = touches.base_from_flange
+    met = poses[:, :3, :3] @ linear_tip(poses, touches.points) + poses[:, :3, 3]
+    away = [
+        met[touches.points == it] - met[touches.points == it].mean(axis=0)
+        for it in np.unique(touches.points)
+    ]
+    return float(np.sqrt(np.sum(np.concatenate(away) ** 2) / len(touches)))

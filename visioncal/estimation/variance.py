@@ -1,0 +1,215 @@
+"""Noise levels from residuals: restricted maximum likelihood of variance components."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from visioncal.estimation.linalg import covariance_root, gram
+from visioncal.types import FloatArray, Mask
+
+# Standard deviations stay within these, in units of the residuals [rad and m].
+LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
+_ITERATIONS = 60
+# A step changes a sigma by a factor of e at most; 1e-4 of it is far below its own uncertainty.
+_LONGEST_STEP, _SETTLED = 1.0, 1e-4
+_WORST_DAMPING = 1e6
+# Twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square), and how far
+# it is followed, in logarithms.
+_SURPRISE_95, _WIDEST = 3.84, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """What the covariance of m residuals of size d is made of: `known + sum sigma_k^2 parts_k`.
+
+    Attributes:
+        known: (m, d, d) the part that needs no estimate.
+        parts: (k, m, d, d) what each component adds, at a standard deviation of one.
+    """
+
+    known: FloatArray
+    parts: FloatArray
+
+    def total(self, sigmas: FloatArray) -> FloatArray:
+        """Covariances (m, d, d) of the residuals at some (k,) standard deviations."""
+        return np.asarray(self.known + np.tensordot(sigmas**2, self.parts, axes=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What is known of p parameters from elsewhere.
+
+    Attributes:
+        information: (p, p), zero on those of which nothing is known.
+        pull: (p,) half the gradient of what is known, at the present state.
+    """
+
+    information: FloatArray
+    pull: FloatArray
+
+
+@dataclass(frozen=True)
+class RatioPrior:
+    """What is known beforehand of the ratio of two sigmas, as a log-normal.
+
+    Attributes:
+        ratio: The second over the first, typically.
+        spread: Standard deviation of the ratio's logarithm.
+        places: Which two sigmas these are; of several pairs, all of them.
+    """
+
+    ratio: float
+    spread: float
+    places: tuple[tuple[int, int], ...] = ((0, 1),)
+
+
+def estimate_sigmas(
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    components: Components,
+    known: Knowledge,
+    start: FloatArray,
+    prior: RatioPrior | None = None,
+    free: Mask | None = None,
+) -> tuple[FloatArray, float]:
+    """Estimates the standard deviations of variance components.
+
+    Maximises the restricted likelihood (Patterson and Thompson 1971; in the form of Harville 1977,
+    section 3), which accounts for the parameters that the residuals have been fitted with, by
+    Newton's steps on the logarithms of the sigmas, and by Fisher's scoring where the likelihood is
+    not convex: scoring alone takes fifty rounds where the residuals say little of a level. Start
+    from above, and go down by short steps: a long one may end in a false optimum without any noise.
+
+    Args:
+        residuals: (m, d) at a state near the best one.
+        jacobian: (m, d, p) their derivatives by the parameters.
+        components: What the covariance is made of.
+        known: What is known of the parameters from elsewhere.
+        start: (k,) sigmas to start from.
+        prior: Of the ratio of pairs of sigmas: it decides where the residuals cannot, because one
+            kind of them can be fitted away altogether. None where nothing is known of it.
+        free: (k,) which sigmas to estimate; the others stay at their start. All where None.
+
+    Returns:
+        (k,) standard deviations, and the negative log-likelihood there.
+    """
+    limits = np.log([LEAST_SIGMA, MOST_SIGMA])
+    logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), *limits)
+    now, damping = _likelihood(residuals, jacobian, components, known, logs, prior), 1e-3
+    for _ in range(_ITERATIONS):
+        curvature = now.curvature + damping * np.eye(len(logs))
+        slope = now.slope
+        if free is not None:
+            curvature = np.where(np.outer(free, free), curvature, np.eye(len(logs)))
+            slope = np.where(free, slope, 0.0)
+        step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST_STEP, _LONGEST_STEP)
+        candidate = np.clip(logs + step, *limits)
+        moved = np.abs(candidate - logs).max()
+        then = None
+        # Of levels too far apart, one is lost in the rounding of the other.
+        with suppress(np.linalg.LinAlgError):
+            then = _likelihood(residuals, jacobian, components, known, candidate, prior)
+        if then is not None and then.value <= now.value:
+            logs, now, damping = candidate, then, max(damping / 10, 1e-6)
+        else:
+            damping *= 10
+        # Where no step goes down any more, rounding is all that is left.
+        if moved < _SETTLED or damping > _WORST_DAMPING:
+            break
+    return np.asarray(np.exp(logs), dtype=float), now.value
+
+
+def profile_interval(
+    profile: Callable[[float], float], sigma: float, lowest: float
+) -> tuple[float, float]:
+    """95 % interval of a standard deviation by its profile likelihood.
+
+    Args:
+        profile: The negative log-likelihood at a logarithm of the sigma.
+        sigma: The most likely one.
+        lowest: The negative log-likelihood there.
+
+    Returns:
+        Low and high: a low of zero where the residuals do not speak against no noise at all, and a
+        high of fifty times the sigma where they do not speak against that.
+    """
+    middle = float(np.log(max(sigma, LEAST_SIGMA)))
+
+    def surprise(logarithm: float) -> float:
+        return 2.0 * (profile(logarithm) - lowest) - _SURPRISE_95
+
+    def crossing(end: float, beyond: float) -> float:
+        if surprise(end) <= 0.0:
+            return beyond
+        return float(np.exp(brentq(surprise, middle, end, xtol=0.02)))
+
+    low, high = middle - _WIDEST, middle + _WIDEST
+    return crossing(low, 0.0), crossing(high, float(np.exp(high)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """Negative log-likelihood at some logarithms of the sigmas, its slope and its curvature."""
+
+    value: float
+    slope: FloatArray
+    curvature: FloatArray
+
+
+def _likelihood(
+    residuals: FloatArray,
+    jacobian: FloatArray,
+    components: Components,
+    known: Knowledge,
+    logs: FloatArray,
+    prior: RatioPrior | None,
+) -> _Likelihood:
+    sigmas = np.exp(logs)
+    total = components.total(sigmas)
+    weights = np.linalg.inv(total)
+    weighted = weights @ jacobian
+    root = covariance_root(gram(jacobian, weighted) + known.information)
+    pull = gram(weighted, residuals) + known.pull
+    best = root @ (root.T @ pull)
+    left = residuals - jacobian @ best
+    pulled = (weights @ left[:, :, None])[:, :, 0]
+    value = 0.5 * float(
+        np.linalg.slogdet(total)[1].sum()
+        - 2.0 * np.linalg.slogdet(root)[1]
+        + np.einsum("mi,mi->", left, pulled)
+        + best @ (known.information @ best - 2 * known.pull)
+    )
+    # How the residuals' covariance grows with the logarithm of each sigma.
+    growth = 2 * sigmas[:, None, None, None] ** 2 * components.parts
+    whitened = weights @ growth
+    # What the parameters have taken of the weights, as y y^T.
+    y = weighted @ root
+    removed = y @ np.swapaxes(y, 1, 2) @ growth
+    traces = np.einsum("kmii->k", whitened - removed)
+    asked = (growth @ pulled[:, :, None])[..., 0]
+    slope = 0.5 * (traces - np.einsum("mi,kmi->k", pulled, asked))
+    # Traces of P G_k P G_l, where P is the weight less what the parameters have taken of it.
+    shrunk = np.array([gram(y, it @ y) for it in growth])
+    expected = 0.5 * (
+        np.einsum("kmij,lmji->kl", whitened - 2.0 * removed, whitened)
+        + np.einsum("kij,lji->kl", shrunk, shrunk)
+    )
+    # Products of y P G_k P G_l P y: with them the second derivative itself, not its expectation.
+    answer = (weights @ asked[..., None])[..., 0]
+    by_unknowns = asked.reshape(len(asked), -1) @ y.reshape(-1, y.shape[-1])
+    seen = np.einsum("kmi,lmi->kl", asked, answer) - by_unknowns @ by_unknowns.T
+    curvature = seen - expected + 2.0 * np.diag(slope)
+    if np.linalg.eigvalsh(curvature)[0] <= 0.0:
+        curvature = expected
+    if prior is None:
+        return _Likelihood(value, slope, curvature)
+    lean = np.zeros((len(prior.places), len(logs)))
+    for row, (first, second) in zip(lean, prior.places, strict=True):
+        row[first], row[second] = -1.0 / prior.spread, 1.0 / prior.spread
+    offset = lean @ logs - np.log(prior.ratio) / prior.spread
+    return _Likelihood(
+        value + 0.5 * float(offset @ offset), slope + offset @ lean, curvature + lean.T @ lean
+    )

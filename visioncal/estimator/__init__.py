@@ -1,1 +1,0 @@
-"""The estimator: residuals with analytic Jacobians, normal equations, and what they can tell."""
