@@ -13,7 +13,13 @@ from visioncal.calibration import Alignment, Calibration, RobotResult, to_docume
 from visioncal.errors import DataError
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.simulation import BoardAt, NetworkOptions, RobotAt, simulate_network
+from visioncal.simulation import (
+    BoardAt,
+    NetworkOptions,
+    RobotAt,
+    network_session,
+    simulate_network,
+)
 from visioncal.stored import load_result
 from visioncal.transforms import invert, log
 from visioncal.verification import verify
@@ -127,6 +133,15 @@ def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_pa
     assert set(to_document(found)["robots"]) == {"robot"}
     assert found.of("left", "robot", "target").joint_covariance.shape == (12, 12)
     assert len(found.of("right").views) == len(session.of("right").views)
+
+
+def test_a_stated_camera_of_measured_poses_is_kept(cell):
+    found = package.calibrate(network_session(cell, "poses", seen="poses")).of("left", "b")
+    assert found.camera.camera.resolution == (2448, 2048)
+    assert not found.camera.estimated
+    assert "pixel_px" not in found.noise
+    # Of both together: more than the robot's alone.
+    assert found.noise["combined_translation_mm"] > found.noise["robot_translation_mm"]
 
 
 def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):

@@ -101,7 +101,7 @@ def _with_camera(
     mine = _numbered_through(session, views, corners)
     if not mine or resolution is None:
         return replace(looked, reasons={**looked.reasons, **reasons})
-    camera, unknowns = _stated(table, resolution), 0
+    camera, unknowns = stated_camera(table, resolution), 0
     warnings: tuple[str, ...] = ()
     estimated = camera is None
     try:
@@ -137,7 +137,8 @@ def _numbered_through(
     return {it: replace(corners[it], ids=corners[it].ids + first[it]) for it in first}
 
 
-def _stated(table: CameraTable, resolution: tuple[int, int]) -> Camera | None:
+def stated_camera(table: CameraTable, resolution: tuple[int, int]) -> Camera | None:
+    """The intrinsics as they are stated; None where they are to be estimated."""
     if table.matrix is None or table.distortion is None:
         return None
     matrix, distortion = np.array(table.matrix, float), np.array(table.distortion, float)

@@ -26,7 +26,7 @@ from visioncal.alignment.judging import (
     size_warnings,
     weakest_link,
 )
-from visioncal.alignment.looking import Looked, look_around
+from visioncal.alignment.looking import Looked, look_around, stated_camera
 from visioncal.alignment.priors import prior_components
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
@@ -35,7 +35,7 @@ from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Si
 from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
 from visioncal.robot import Robot
-from visioncal.session import Session
+from visioncal.session import Session, frame_name
 from visioncal.targets import target_document
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, Progress
@@ -237,9 +237,16 @@ def _cameras(
     solved: Solved, looked: Looked, spread: FloatArray, edges: int
 ) -> dict[str, CameraResult]:
     seen, looks = solved.seen, solved.looks
+    # Measured poses do without a camera; whoever looks through it later does not.
+    found = {
+        frame: CameraResult(camera, estimated=False)
+        for name, table in solved.cell.session.cameras.items()
+        if (frame := frame_name("camera", name)) in solved.cell.tree.branches
+        and table.resolution is not None
+        and (camera := stated_camera(table, (table.resolution[0], table.resolution[1]))) is not None
+    }
     if seen is None or looks is None:
-        return {}
-    found = {}
+        return found
     for name, look in looked.cameras.items():
         lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
         if not np.isin(lens, seen.free).all():
