@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 
-from visioncal.estimation.budget import covariance_by_source, point_covariance
+from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
 from visioncal.estimation.closure import closure_information
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.linalg import covariance
@@ -29,6 +29,15 @@ def answered(cell):
     known = calibrated(cell, joints=False)
     data = known.closure(known.used).merged(known.stops)
     return data, known.solved, known
+
+
+def told(data, result):
+    return data.problem, result.edges.state, result.noise.levels
+
+
+def sources(**shared):
+    columns = {name: 12 + places for name, places in shared.items()}
+    return Sources({"cam": "pixels"}, {"robot": "robot"}, columns)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -101,7 +110,7 @@ def test_intervals_of_the_noise_hold_the_truth():
     truth = np.array([5e-5, 3e-5])
     for seed in range(count):
         data, result, _ = answered(simulate(replace(FINE, seed=seed, views=12)))
-        low, high = noise_intervals(data, result.edges, result.noise).T
+        low, high = noise_intervals(*told(data, result))[0].T
         assert np.all(low <= result.noise.sigmas)
         assert np.all(result.noise.sigmas <= high)
         inside += (low <= truth) & (truth <= high)
@@ -113,7 +122,7 @@ def test_intervals_of_the_noise_hold_the_truth():
 def test_the_budget_adds_up(given):
     data, result, known = answered(simulate(replace(FINE, state_intrinsics=given, seed=2)))
     rows = np.arange(len(result.edges.shared))
-    parts = covariance_by_source(data, result.edges, result.noise, {"shared": rows})
+    parts = covariance_by_source(*told(data, result), sources(shared=rows))
     whole = covariance(closure_information(data, result.edges, result.noise))[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
@@ -128,7 +137,7 @@ def test_sources_that_are_known_together_add_up_as_well():
     data, result, known = answered(simulate(bent))
     is_lens = known.free.columns < known.free.lens_count
     owners = {"intrinsics": np.flatnonzero(is_lens), "board": np.flatnonzero(~is_lens)}
-    parts = covariance_by_source(data, result.edges, result.noise, owners)
+    parts = covariance_by_source(*told(data, result), sources(**owners))
     whole = covariance(closure_information(data, result.edges, result.noise))[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())

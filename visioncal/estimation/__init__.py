@@ -1,1 +1,1 @@
-"""Estimation: the problem of a cell over its tree of frames, its residuals, and its solver."""
+"""Estimation of a cell: one problem of blocks over a tree of frames, and its solver."""

@@ -1,57 +1,128 @@
 """Where the uncertainty of a result comes from, and how it looks at a place of work."""
 
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure, Edges, Noise, closure_information, weighted_slopes
-from visioncal.estimation.linalg import covariance, gram
+from visioncal.estimation.linalg import covariance_among, gram
+from visioncal.estimation.problem import Linear, Noise, Problem, State
+from visioncal.estimation.solve import fisher_information
 from visioncal.transforms import skew
 from visioncal.types import FloatArray, IntArray
 
 
-def covariance_by_source(
-    data: Closure,
-    edges: Edges,
-    noise: Noise,
-    shared: Mapping[str, IntArray],
-    seen: str = "pixels",
-) -> dict[str, FloatArray]:
-    """Splits the covariance of the joint fit into the parts that its sources contribute.
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """What the sources of uncertainty are called; those of one name are one.
 
-    The estimate is linear in the errors of corners, arm, lens and board: each contributes its own
-    covariance through the same gain, and the parts add up to the whole. Lens and board are known
-    from the same corners, so their errors hang together: each takes half of what is common, which
-    may leave one of them less than nothing where they make up for each other.
+    Attributes:
+        sensors: The noise of what each frame observed, by the frame.
+        robots: The error of each robot's flange from stop to stop, by the robot.
+        columns: What is open about effects beforehand, by the source: which of the problem's
+            columns these are. Those of no source count for nothing.
+        priors: What was measured of frames by hand.
+    """
+
+    sensors: Mapping[str, str]
+    robots: Mapping[str, str]
+    columns: Mapping[str, IntArray] = field(default_factory=dict)
+    priors: str = "priors"
+
+
+def covariance_by_source(
+    problem: Problem, state: State, noise: Noise, sources: Sources
+) -> dict[str, FloatArray]:
+    """Splits the covariance of the edges into the parts that its sources contribute.
+
+    The estimate is linear in the errors of observations, flanges, effects and priors: each
+    contributes its own covariance through the same gain, and the parts add up to the whole. What is
+    known of effects together hangs together, as of lens and board that are known from the same
+    corners: each takes half of what is common, which may leave one of them less than nothing where
+    they make up for each other.
 
     Args:
-        data: The views, one a stop.
-        edges: The answer.
-        noise: Of the flange, or of both together where the camera's is not known.
-        shared: Which of the unknowns that the views share belong to which source, a new one or one
-            of the others; those of no source count for nothing.
-        seen: What the noise of the camera's poses is called.
+        problem: The observations.
+        state: The answer.
+        noise: Its levels.
+        sources: What is to be told apart.
 
     Returns:
-        (12, 12) by source: `seen`, `robot` (or `poses` for both together), and `shared`'s.
+        (6 e, 6 e) by source.
     """
-    fitted = covariance(closure_information(data, edges, noise))
-    slopes, camera, robot = weighted_slopes(data, edges, noise)
-    parts: dict[str, FloatArray] = {}
-    if data.camera_covariance is None:
-        parts["poses"] = gram(slopes, robot @ slopes)
-    else:
-        parts[seen] = gram(slopes, camera @ slopes)
-        parts["robot"] = gram(slopes, robot @ slopes)
-    if data.shared is not None:
-        owned = np.concatenate([*shared.values(), np.zeros(0, np.int64)])
-        information = data.shared.information[np.ix_(owned, owned)]
-        for name, rows in shared.items():
-            share = np.where(np.isin(owned, rows), 0.5, 0.0)
-            known = np.zeros_like(fitted)
-            known[np.ix_(12 + owned, 12 + owned)] = (share[:, None] + share) * information
-            parts[name] = parts.get(name, 0.0) + known
-    return {name: (fitted @ part @ fitted)[:12, :12] for name, part in parts.items()}
+    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
+    linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
+    gain = _weighted(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
+    found: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
+    for frame in dict.fromkeys(problem.observations.observers):
+        mine = np.array([it == frame for it in problem.observations.observers])
+        # Where nothing is known of the observations' own noise, that and the robot's are one.
+        if own[mine].any():
+            found[sources.sensors[frame]] += gram(gain[mine], own[mine] @ gain[mine])
+    for name, part in _by_errors(problem, linear, gain, noise, sources):
+        found[name] += part
+    carried = fitted[:, : 6 * len(problem.unknown)]
+    known = problem.knowledge(state).information
+    owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
+    for prior in problem.priors:
+        _, slopes = problem.prior_rows(prior, state)
+        known = known - slopes.T @ slopes
+        pulled = slopes @ carried
+        found[sources.priors] += pulled.T @ pulled
+    for name, columns in sources.columns.items():
+        share = np.where(np.isin(owned, columns), 0.5, 0.0)
+        part = (share[:, None] + share) * known[np.ix_(owned, owned)]
+        found[name] += carried[owned].T @ part @ carried[owned]
+    return dict(found)
+
+
+def _weighted(problem: Problem, linear: Linear, own: FloatArray, noise: Noise) -> FloatArray:
+    """(n, 6, p) the inverse covariance of all residuals times their derivatives."""
+    found, alone, (of, _) = linear.jacobian, problem.alone, problem.units
+    total = problem.total_covariance(linear, noise)
+    found[alone] = np.linalg.solve(total[alone], found[alone])
+    rest = np.flatnonzero(~alone)
+    if not len(rest):
+        return found
+    weights = np.linalg.inv(own[rest])
+    found[rest] = weights @ found[rest]
+    errors = problem.error_covariance(noise)
+    joined, units = rest[of[rest] >= 0], of[rest][of[rest] >= 0]
+    slopes = linear.by_errors[joined]
+    turned = np.swapaxes(slopes, 1, 2)
+    weighted = weights[of[rest] >= 0] @ slopes
+    shape = errors.shape
+    told, asked = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
+    np.add.at(told, units, turned @ weighted)
+    np.add.at(asked, units, turned @ found[joined])
+    taken = np.linalg.solve(np.eye(shape[1]) + errors @ told, errors @ asked)
+    found[joined] -= weighted @ taken[units]
+    return found
+
+
+def _by_errors(
+    problem: Problem, linear: Linear, gain: FloatArray, noise: Noise, sources: Sources
+) -> list[tuple[str, FloatArray]]:
+    """What flanges' errors contribute, and those that repeats share, by their sources."""
+    of, members = problem.units
+    errors = problem.error_covariance(noise)
+    rows = of >= 0
+    by_unit = np.zeros((len(members), errors.shape[1], gain.shape[2]))
+    np.add.at(by_unit, of[rows], np.swapaxes(linear.by_errors[rows], 1, 2) @ gain[rows])
+    found = []
+    for at, robot in enumerate(problem.robots):
+        units, slots = np.nonzero(members == at)
+        places = 6 * slots[:, None] + np.arange(6)
+        mine = by_unit[units[:, None], places]
+        variances = errors[units[:, None], places, places]
+        found.append((sources.robots[robot], gram(mine, variances[:, :, None] * mine)))
+    first = len(members) - len(problem.repeats)
+    for unit, repeated in enumerate(problem.repeats, start=first):
+        frame = problem.observations.observers[repeated[0]]
+        part = by_unit[unit].T @ errors[unit] @ by_unit[unit]
+        found.append((sources.sensors[frame], part))
+    return found
 
 
 def point_covariance(edge: FloatArray, spread: FloatArray, point: FloatArray) -> FloatArray:

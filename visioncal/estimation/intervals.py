@@ -1,40 +1,41 @@
 """How well the noise's levels are known."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure, Edges, Noise, noise_likelihood
-from visioncal.estimation.solve import robot_likelihood
+from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.solve import robot_levels, robot_likelihood, starting_noise
 from visioncal.estimation.variance import profile_interval
 from visioncal.types import FloatArray
 
 
-def noise_intervals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
-    """95 % intervals of the noise's levels by the profile likelihood.
+def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
+    """95 % intervals of the robots' levels by the profile likelihood.
 
     Args:
-        data: The views.
-        edges: The answer.
+        problem: The observations.
+        state: The answer.
         noise: The most likely levels.
 
     Returns:
-        (2, 2): low and high of the rotation's sigma [rad], then of the translation's [m]; a low of
-        zero where the residuals do not speak against no noise at all, and a high of fifty times the
-        level where they do not speak against that.
+        (r, 2, 2) by robot: low and high of the rotation's sigma [rad], then of the translation's
+        [m]; a low of zero where the residuals do not speak against no noise at all, and a high of
+        fifty times the level where they do not speak against that.
     """
-    problem = data.problem
-    likelihood = robot_likelihood(problem, edges.state, noise.levels)
-    lowest = noise_likelihood(data, edges)[1]
+    likelihood = robot_likelihood(problem, state, noise)
+    start = replace(noise, robots=starting_noise(problem).robots)
+    lowest = robot_levels(problem, state, start, from_above=True)[1]
+    sigmas = noise.robots.ravel()
 
     def profile(level: int, logarithm: float) -> float:
-        start, others = noise.sigmas.copy(), np.arange(2) != level
-        start[level] = np.exp(logarithm)
-        return likelihood.most_likely(start[None], others)[1]
+        at, others = sigmas.copy(), np.arange(len(sigmas)) != level
+        at[level] = np.exp(logarithm)
+        return likelihood.most_likely(at.reshape(noise.robots.shape), others)[1]
 
-    return np.array(
-        [
-            profile_interval(partial(profile, level), sigma, lowest)
-            for level, sigma in enumerate(noise.sigmas)
-        ]
-    )
+    found = [
+        profile_interval(partial(profile, level), sigma, lowest)
+        for level, sigma in enumerate(sigmas.tolist())
+    ]
+    return np.array(found).reshape(*noise.robots.shape, 2)

@@ -25,6 +25,7 @@ SOURCES = {
     "board": "what is open about the board",
     "arm": "errors of the arm's links",
     "temperature": "what is open about the arm's drift with temperature",
+    "priors": "what was measured by hand",
     "held_values": "values that are held",
     "misfit": "neighbouring stops that err alike",
 }

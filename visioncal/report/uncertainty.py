@@ -18,6 +18,7 @@ _REMEDIES = {
     "arm": "what of it looks the same in all views stays, and a calibrated arm's poses make up "
     "for it",
     "temperature": "more views while the arm warms up would lower it",
+    "priors": "measuring more exactly by hand would lower it",
     "held_values": "stating lens and board better, or letting them move, would lower it",
     "misfit": "a cell that has warmed up and settled would lower it",
 }

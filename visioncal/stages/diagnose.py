@@ -9,7 +9,7 @@ from visioncal.chance import chi2_limit
 from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
 from visioncal.estimation.boards import Boards
-from visioncal.estimation.budget import covariance_by_source, point_covariance
+from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
 from visioncal.estimation.closure import Closure, fit_closure
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
@@ -81,14 +81,13 @@ def diagnose(
             rest = fit_closure(data, edges)
             alike = neighbours(data, rest.edges, rest.noise)
             moved = drift(data, rest.edges, rest.noise)
-        source = "instrument" if data.mount == "instrument" else "pixels"
-        owners = _owners(data, free, arm, boards, drifting)
-        parts = covariance_by_source(data, edges, noise, owners, source)
+        told = data.problem, edges.state, noise.levels
+        parts = covariance_by_source(*told, _sources(data, free, arm, boards, drifting))
         if arm is not None and not arm.is_estimated:
             parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
         if result.held.any():
             parts["held_values"] = np.outer(result.held[:12], result.held[:12])
-        intervals = noise_intervals(data, edges, noise)
+        intervals = noise_intervals(*told)[0]
     inflation = alike.factor if alike.is_significant else 1.0
     if inflation > 1.0:
         parts["misfit"] = (inflation - 1.0) * sum(parts.values(), np.zeros((12, 12)))
@@ -109,10 +108,10 @@ def diagnose(
     )
 
 
-def _owners(
+def _sources(
     data: Closure, free: Free | None, arm: ArmErrors | None, boards: Boards, drifting: int
-) -> dict[str, IntArray]:
-    """Which of the unknowns that all views share are whose.
+) -> Sources:
+    """What makes the result uncertain, and which of the unknowns that views share are whose.
 
     The arm's errors come last, and before them its drift.
     """
@@ -137,7 +136,12 @@ def _owners(
         owners["temperature"] = np.arange(before, before + drifting)
     if arm is not None and arm.is_estimated:
         owners["arm"] = np.arange(shared - errors, shared)
-    return owners
+    first = 6 * len(data.problem.unknown)
+    return Sources(
+        {"cam": "instrument" if data.mount == "instrument" else "pixels"},
+        {"robot": "poses" if data.camera_covariance is None else "robot"},
+        {name: first + places for name, places in owners.items()},
+    )
 
 
 def _length(spread: FloatArray) -> float:
