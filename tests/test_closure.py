@@ -14,13 +14,12 @@ from visioncal.estimation.closure import (
     components_of,
     fit_closure,
     knowledge_of,
-    left_out_residuals,
     normal_equations,
     residual_blocks,
     solve_closure,
 )
 from visioncal.estimation.shared import Shared
-from visioncal.estimation.solve import RATIO_PRIOR
+from visioncal.estimation.solve import RATIO_PRIOR, left_out_residuals
 from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -37,7 +36,7 @@ def answered(given, **changes):
 @LENS
 def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
     data, fit = answered(given, views=12, seed=3)
-    predicted = left_out_residuals(data, fit.edges, fit.noise)
+    predicted = left_out_residuals(data.problem, fit.edges.state, fit.noise.levels)
     spread = residual_blocks(data, fit.edges, fit.noise)[2]
     for view in range(12):
         others = np.arange(12) != view

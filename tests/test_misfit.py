@@ -7,7 +7,7 @@ import pytest
 from cells import calibrated, error_of
 
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
-from visioncal.estimation.closure import closure_information
+from visioncal.estimation.closure import ROBOT, closure_information
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.misfit import drift, neighbours
@@ -37,7 +37,11 @@ def told(data, result):
 
 def sources(**shared):
     columns = {name: 12 + places for name, places in shared.items()}
-    return Sources({"cam": "pixels"}, {"robot": "robot"}, columns)
+    return Sources({"cam": "pixels"}, {ROBOT: "robot"}, columns)
+
+
+def of_fit(test, data, result):
+    return test(*told(data, result), ROBOT)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -45,10 +49,10 @@ def test_a_creeping_base_is_noticed_and_its_way_told(mount):
     for seed in range(4):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
         data, result, _ = answered(cell)
-        assert drift(data, result.edges, result.noise) is None
+        assert of_fit(drift, data, result) is None
         moved = with_moving_base(cell, np.array([0, 0, 0, 0.0, 3e-4, 0]))
         data, result, known = answered(moved)
-        found = drift(data, result.edges, result.noise)
+        found = of_fit(drift, data, result)
         # A turn of the base by its sigma of some 0.1 mrad moves the place of work by 0.1 mm.
         assert found.moved_m == pytest.approx(3e-4, abs=2.5e-4)
         assert any("drift with time" in it for it in known.warnings)
@@ -61,7 +65,7 @@ def test_a_turning_base_moves_the_target_by_its_distance(mount):
     data, result, _ = answered(with_moving_base(cell, turn))
     z = cell.transforms["base_from_target" if mount == "eye-in-hand" else "flange_from_target"]
     target = z if mount == "eye-in-hand" else (cell.base_from_flange @ z).mean(axis=0)
-    found = drift(data, result.edges, result.noise)
+    found = of_fit(drift, data, result)
     moved = np.linalg.norm(np.cross(turn[:3], target[:3, 3]))
     # Where the target is, noise leaves some 0.03 mm; the flange moves by 0.2 mm more or less.
     assert found.moved_m == pytest.approx(moved, abs=8e-5)
@@ -84,7 +88,7 @@ def test_independent_noise_gives_neighbours_no_more_than_their_share(mount):
     factors = []
     for seed in range(12):
         data, result, _ = answered(simulate(replace(FINE, mount=mount, seed=seed)))
-        found = neighbours(data, result.edges, result.noise)
+        found = of_fit(neighbours, data, result)
         assert not found.is_significant
         factors.append(found.factor)
     # One on average; a single one scatters by 0.16.
@@ -97,7 +101,7 @@ def test_stops_that_err_in_groups_are_noticed():
     group = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 3, axis=0)
     together = replace(cell, base_from_flange=cell.base_from_flange @ exp(group))
     data, result, known = answered(together)
-    found = neighbours(data, result.edges, result.noise)
+    found = of_fit(neighbours, data, result)
     assert found.is_significant
     # The diagnosis comes to rest anew, which the fit does to 1e-4.
     assert known.diagnosis.inflation == pytest.approx(found.factor, rel=1e-3)

@@ -22,7 +22,7 @@ from test_kinematics import WRONG_LINKS, target_in_camera
 import visioncal
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import Closure, Edges, Noise, solve_closure
+from visioncal.estimation.closure import ROBOT, Closure, Edges, Noise, solve_closure
 from visioncal.estimation.kinematics import LEVELS, fit_level
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
@@ -144,12 +144,12 @@ def fitted(world: World, noise: Noise | None) -> tuple[Edges, ArmModel]:
     edges = Edges(start.x, start.z, np.zeros(0))
     errors = {"links": ArmErrors(basis, SIZE_RAD, 0.0, of_links=True)}
     if noise is None:
-        level = fit_level(
-            _chain(world, cell.base_from_flange), edges, {"links": basis}, LEVELS["geometry"]
-        )
+        problem = _chain(world, cell.base_from_flange).problem
+        level = fit_level(problem, edges.state, ROBOT, {"links": basis}, LEVELS["geometry"])
         if level is None:
             raise RuntimeError("the arm's errors do not show")
-        errors, edges, noise = dict(level.errors), level.fit.edges, level.fit.noise
+        errors, noise = dict(level.errors), Noise(*level.fit.noise.robots[0].tolist())
+        edges = Edges(*level.fit.state.edges, level.fit.state.values)
     model = model.erring(errors)
     while True:
         data = _chain(world, model.robot.base_from_flange(q))

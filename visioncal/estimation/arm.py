@@ -13,20 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    flange_to_residual,
-    noise_likelihood,
-    normal_equations,
-    residual_blocks,
-)
-from visioncal.estimation.linalg import covariance, gram
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.problem import Effect, Noise, Problem, State
 from visioncal.estimation.shared import Shared
+from visioncal.estimation.solve import normal_equations, robot_levels
+from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray, Mask
 
 # Arms are off by some 0.5 mm for each mrad.
 LEVER_M = 0.5
@@ -48,7 +42,7 @@ class ArmErrors:
     """Errors of the arm as random effects.
 
     Attributes:
-        basis: (m, 6, p) how each view's flange moves with them, all of them in radians.
+        basis: (s, 6, p) how the flange moves with them at each stop, all of them in radians.
         sigma: Their standard deviation [rad]; lengths are off by 0.5 m times as much.
         gain: Twice the gain in log-likelihood over white noise alone.
         of_links: Whether they are errors of this arm's links, which can be estimated along; else
@@ -77,6 +71,15 @@ class ArmErrors:
         at = nothing if values is None else values
         known = np.eye(size) / self.sigma**2
         return Shared(known, known @ at, nothing, np.zeros_like(self.basis), self.basis)
+
+    def effect(self, robot: str, name: str = "arm", values: FloatArray | None = None) -> Effect:
+        """Puts the effects as unknowns of a robot's flange, at their (p,) present values."""
+        size = self.basis.shape[2]
+        at = np.zeros(size) if values is None else values
+        information = np.eye(size) / self.sigma**2
+        known = Knowledge(information, information @ at)
+        held = np.zeros(size, dtype=bool)
+        return Effect(f"{name} of {robot}", at, known, held, by_flange={robot: self.basis})
 
 
 def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
@@ -118,29 +121,37 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
 
 
 def find_arm_errors(
-    data: Closure, edges: Edges, basis: FloatArray, *, of_links: bool
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    robot: str,
+    basis: FloatArray,
+    *,
+    of_links: bool,
 ) -> ArmErrors | None:
-    """Estimates the size of the arm's errors, where they are significant.
+    """Estimates the size of the errors of one robot's arm, where they are significant.
 
     Args:
-        data: The views, one a stop.
-        edges: The answer under white noise.
-        basis: (m, 6, p) of `link_basis` or `pose_basis`.
+        problem: The observations.
+        state: The answer under white noise.
+        noise: The levels of the sensors; those of robots are sought anew.
+        robot: The robot.
+        basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
         of_links: Whether it is of this arm's links.
 
     Returns:
         The errors; None where white noise explains the residuals about as well.
     """
-    if len(data) < _FEWEST_STOPS:
+    if len(stops_of(problem, robot)) < _FEWEST_STOPS:
         return None
-    white = noise_likelihood(data, edges)[1]
+    white = robot_levels(problem, state, noise, from_above=True)[1]
+    still = State(state.edges, np.concatenate([state.values, np.zeros(basis.shape[2])]))
 
     def gain(sigma: float) -> float:
-        errors = ArmErrors(basis, sigma, 0.0, of_links).shared()
-        widened = data.with_more(errors)
-        still = Edges(edges.x, edges.z, np.concatenate([edges.shared, np.zeros(basis.shape[2])]))
+        effect = ArmErrors(basis, sigma, 0.0, of_links).effect(robot)
+        widened = problem.with_effects([*problem.effects, effect])
         # The effects' own density, which the likelihood of given knowledge leaves out.
-        value = noise_likelihood(widened, still)[1]
+        value = robot_levels(widened, still, noise, from_above=True)[1]
         return float(2.0 * (white - value - basis.shape[2] * math.log(sigma)))
 
     found = {sigma: gain(sigma) for sigma in _TRIED}
@@ -149,6 +160,19 @@ def find_arm_errors(
         return None
     best, highest = _climb(gain, best, found[best])
     return ArmErrors(basis, best, highest, of_links)
+
+
+def rows_of(problem: Problem, robot: str) -> Mask:
+    """(n,) which observations belong to units that have the error of a robot's flange."""
+    (of, members), place = problem.units, problem.robots.index(robot)
+    found = of >= 0
+    found[found] = (members[of[found]] == place).any(axis=1)
+    return found
+
+
+def stops_of(problem: Problem, robot: str) -> IntArray:
+    """The stops at which a robot was observed, in their order."""
+    return np.unique(problem.observations.stops[rows_of(problem, robot)])
 
 
 def _climb(gain: Callable[[float], float], at: float, value: float) -> tuple[float, float]:
@@ -164,37 +188,44 @@ def _climb(gain: Callable[[float], float], at: float, value: float) -> tuple[flo
     return at, value
 
 
-def misfit_covariance(data: Closure, edges: Edges, noise: Noise, errors: ArmErrors) -> FloatArray:
+def misfit_covariance(
+    problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
+) -> FloatArray:
     """What errors of the arm add to the covariance of a fit that takes them for white noise.
 
     Args:
-        data: The views, one a stop.
-        edges: The answer.
+        problem: The observations.
+        state: The answer.
         noise: The white noise that it was weighted with.
-        errors: The arm's errors, at the same views.
+        robot: The robot.
+        errors: The arm's errors, at the same stops.
 
     Returns:
-        (12 + k, 12 + k).
+        (p, p) among the unknowns.
     """
-    answer = errors.sigma * misfit_slopes(data, edges, noise, errors)
+    answer = errors.sigma * misfit_slopes(problem, state, noise, robot, errors)
     return np.asarray(answer @ answer.T)
 
 
-def misfit_slopes(data: Closure, edges: Edges, noise: Noise, errors: ArmErrors) -> FloatArray:
+def misfit_slopes(
+    problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
+) -> FloatArray:
     """How a fit that takes errors of the arm for white noise moves with them.
 
     Args:
-        data: The views, one a stop.
-        edges: The answer.
+        problem: The observations.
+        state: The answer.
         noise: The white noise that it was weighted with.
-        errors: The arm's errors, at the same views.
+        robot: The robot.
+        errors: The arm's errors, at the same stops.
 
     Returns:
-        (12 + k, p) by how much the fit is off from the truth, for each error of one.
+        (p, q) by how much the fit is off from the truth, for each error of one.
     """
-    _, jacobian, spread = residual_blocks(data, edges, noise)
-    seen = data.under(edges.shared)
-    moved = flange_to_residual(seen, edges) @ errors.basis
-    weighted = np.linalg.solve(spread, moved)
-    fitted = covariance(normal_equations(data, edges, noise)[0])
-    return np.asarray(fitted @ gram(jacobian, weighted))
+    effect = errors.effect(robot)
+    widened = problem.with_effects([*problem.effects, effect])
+    there = State(state.edges, np.concatenate([state.values, effect.values]))
+    information = normal_equations(widened, there, noise)[0]
+    size = problem.size
+    fitted = covariance_among(information[:size, :size], problem.moving)
+    return np.asarray(fitted @ information[:size, size:])

@@ -33,7 +33,6 @@ from visioncal.estimation.shared import Shared
 from visioncal.estimation.solve import (
     fisher_information,
     fit_problem,
-    fitted_covariance,
     robot_levels,
     solve_problem,
     starting_noise,
@@ -46,6 +45,8 @@ from visioncal.estimation.variance import Components, Knowledge
 from visioncal.transforms import adjoint, exp, invert, log, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
 
+# What the only robot goes by.
+ROBOT = "robot"
 # Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
 _CHOSEN = 1e12
 # Variances of a direction that a pose leaves open are above this [rad^2].
@@ -84,7 +85,7 @@ class Closure:
         camera, target = ("flange", "base") if self.mount == "eye-in-hand" else ("base", "flange")
         poses = self.robot if self.mount == "eye-in-hand" else invert(self.robot)
         unknown = {"cam": Branch(camera), "target": Branch(target)}
-        tree = Tree("base", {"flange": Branch("base", robot="robot"), **unknown})
+        tree = Tree("base", {"flange": Branch("base", robot=ROBOT), **unknown})
         known, shared, count = self.camera_covariance, self.shared, len(self)
         observations = Observations(
             ("cam",) * count,
@@ -105,13 +106,13 @@ class Closure:
                     known_of,
                     shared.anchor > 0.0,
                     shared.by_camera,
-                    {"robot": shared.by_flange},
+                    {ROBOT: shared.by_flange},
                 ),
             )
         hangs = {0: (camera, "cam"), 1: (target, "target")}
         return Problem(
             tree,
-            {"robot": poses},
+            {ROBOT: poses},
             observations,
             effects,
             tuple(
@@ -349,17 +350,6 @@ def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatAr
     information, gradient = information_and_gradient(problem, edges.state, noise.levels)
     scale = np.maximum(np.diag(information), 1.0)
     return information + np.diag(np.where(problem.moving, 0.0, _CHOSEN * scale)), gradient
-
-
-def left_out_residuals(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
-    """Residuals (m, 6) of each view from a fit without it, to first order.
-
-    By the identity of Cook and Weisberg (1982, section 2.2), with the noise as it is.
-    """
-    residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    fitted = fitted_covariance(data.problem, edges.state, noise.levels)
-    taken = jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
-    return np.asarray((spread @ covariance(spread - taken) @ residuals[:, :, None])[:, :, 0])
 
 
 def weighted_slopes(

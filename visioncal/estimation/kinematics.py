@@ -10,17 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from visioncal.estimation.arm import ArmErrors, find_arm_errors
+import numpy as np
+
+from visioncal.estimation.arm import ArmErrors, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
-from visioncal.estimation.closure import (
-    Closure,
-    ClosureFit,
-    Edges,
-    fit_closure,
-    left_out_residuals,
-    residual_blocks,
-)
-from visioncal.types import FloatArray
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals
+from visioncal.types import FloatArray, Mask
 
 
 @dataclass(frozen=True)
@@ -54,21 +50,23 @@ _RIGID = Blocks((), ())
 
 @dataclass(frozen=True, eq=False)
 class LevelFit:
-    """The chain with the arm's errors of one level free.
+    """The fit with the errors of one level of a robot's arm free.
 
     Attributes:
         errors: The errors by block; empty for the arm as stated.
-        fit: Edges and noise.
+        fit: The unknowns and the noise.
         gain: Twice the gain in log-likelihood over the arm as stated.
-        inside: (m, 6) residuals of the fit (rotation [rad], translation [m]).
+        inside: (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
         left_out: (m, 6) the same of each stop from a fit without it, to first order.
+        has_rotation: (m,) which of them say anything of a rotation.
     """
 
     errors: Mapping[str, ArmErrors]
-    fit: ClosureFit
+    fit: Solution
     gain: float
     inside: FloatArray
     left_out: FloatArray
+    has_rotation: Mask
 
     @property
     def size(self) -> int:
@@ -76,80 +74,108 @@ class LevelFit:
         return sum(it.basis.shape[2] for it in self.errors.values())
 
 
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """The observations without errors of the arm, and whose arm it is."""
+
+    problem: Problem
+    robot: str
+
+    def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
+        """The observations with errors of the arm among the unknowns."""
+        effects = [it.effect(self.robot, name) for name, it in errors.items()]
+        return self.problem.with_effects([*self.problem.effects, *effects])
+
+    def fitted(self, errors: Mapping[str, ArmErrors], near: State) -> tuple[Problem, Solution]:
+        """That with its fit."""
+        problem = self.erring(errors)
+        return problem, fit_problem(problem, State(near.edges, problem.start_values))
+
+    def found(
+        self, among: Mapping[str, ArmErrors], fit: Solution, basis: FloatArray
+    ) -> ArmErrors | None:
+        """Looks for errors of one more block."""
+        problem = self.erring(among)
+        return find_arm_errors(problem, fit.state, fit.noise, self.robot, basis, of_links=True)
+
+    def level(self, errors: Mapping[str, ArmErrors], fit: Solution, gain: float) -> LevelFit:
+        """Puts a level's fit together."""
+        problem, mine = self.erring(errors), rows_of(self.problem, self.robot)
+        rotation = [
+            has and name not in problem.points
+            for has, name in zip(
+                problem.observations.has_rotation, problem.observations.observed, strict=True
+            )
+        ]
+        return LevelFit(
+            errors,
+            fit,
+            gain,
+            problem.linear(fit.state).residuals[mine],
+            left_out_residuals(problem, fit.state, fit.noise)[mine],
+            np.array(rotation, dtype=bool)[mine],
+        )
+
+
 def fit_level(
-    data: Closure, edges: Edges, bases: Mapping[str, FloatArray], blocks: Blocks = _RIGID
+    problem: Problem,
+    state: State,
+    robot: str,
+    bases: Mapping[str, FloatArray],
+    blocks: Blocks = _RIGID,
 ) -> LevelFit | None:
-    """Fits the chain with some blocks of the arm's errors free.
+    """Fits all unknowns with some blocks of the errors of one robot's arm free.
 
     Args:
-        data: The views, one a stop, without errors of the arm.
-        edges: Where to start.
-        bases: (m, 6, p) columns of each block by its name.
+        problem: The observations, without errors of this arm.
+        state: Where to start.
+        robot: The robot.
+        bases: (s, 6, p) by stop, columns of each block by its name.
         blocks: Those to free; behind the first, those that explain no more than chance stay out.
 
     Returns:
         The fit; None where nothing beyond chance makes it this level.
     """
-    plain, gain = data, 0.0
-    fit = fit_closure(data, Edges(edges.x, edges.z, data.unchanged))
-    errors: dict[str, ArmErrors] = {}
     if blocks.own and not bases.keys() & set(blocks.own):
         return None
+    arm, gain = _Arm(problem, robot), 0.0
+    errors: dict[str, ArmErrors] = {}
+    _, fit = arm.fitted(errors, state)
     for name in (it for it in blocks.names if it in bases):
-        found = find_arm_errors(data, fit.edges, bases[name], of_links=True)
+        found = arm.found(errors, fit, bases[name])
         if found is None or not found.is_significant:
             if not errors:
                 return None
             continue
-        errors, gain = errors | {name: found}, gain + found.gain
-        errors = _without_springs(plain, fit.edges, errors)
-        data = _erring(plain, errors)
-        fit = fit_closure(data, _at_rest(data, fit.edges))
+        gain += found.gain
+        errors = _without_springs(arm, fit.state, errors | {name: found})
+        _, fit = arm.fitted(errors, fit.state)
     if blocks.own and not errors.keys() & set(blocks.own):
         return None
-    return _level_fit(data, errors, fit, gain)
+    return arm.level(errors, fit, gain)
 
 
-def resized(data: Closure, fit: LevelFit) -> LevelFit:
+def resized(problem: Problem, robot: str, fit: LevelFit) -> LevelFit:
     """Estimates the size of each block's errors anew, beside those of all others.
 
     They were looked for one after the other: what explains the most takes too much at first.
 
     Args:
-        data: The views of `fit_level`.
+        problem: The observations of `fit_level`.
+        robot: The robot.
         fit: Its answer.
     """
     if len(fit.errors) < 2:
         return fit
-    errors, edges = dict(fit.errors), fit.fit.edges
+    arm, errors, state = _Arm(problem, robot), dict(fit.errors), fit.fit.state
     for name, it in fit.errors.items():
-        others = _erring(data, {other: errors[other] for other in errors if other != name})
-        near = fit_closure(others, _at_rest(others, edges)).edges
-        errors[name] = find_arm_errors(others, near, it.basis, of_links=True) or it
-    whole = _erring(data, errors)
-    return _level_fit(whole, errors, fit_closure(whole, _at_rest(whole, edges)), fit.gain)
-
-
-def _level_fit(
-    data: Closure, errors: Mapping[str, ArmErrors], fit: ClosureFit, gain: float
-) -> LevelFit:
-    inside = residual_blocks(data, fit.edges, fit.noise)[0]
-    return LevelFit(errors, fit, gain, inside, left_out_residuals(data, fit.edges, fit.noise))
-
-
-def _erring(data: Closure, errors: Mapping[str, ArmErrors]) -> Closure:
-    """The views with errors of the arm among what they share."""
-    for it in errors.values():
-        data = data.with_more(it.shared())
-    return data
-
-
-def _at_rest(data: Closure, edges: Edges) -> Edges:
-    return Edges(edges.x, edges.z, data.unchanged)
+        others = {other: errors[other] for other in errors if other != name}
+        errors[name] = arm.found(others, arm.fitted(others, state)[1], it.basis) or it
+    return arm.level(errors, arm.fitted(errors, state)[1], fit.gain)
 
 
 def _without_springs(
-    data: Closure, edges: Edges, errors: Mapping[str, ArmErrors]
+    arm: _Arm, state: State, errors: Mapping[str, ArmErrors]
 ) -> dict[str, ArmErrors]:
     """Holds joints rigid that would yield against their load: the bound of a compliance is zero.
 
@@ -158,17 +184,10 @@ def _without_springs(
     """
     kept = dict(errors)
     while COMPLIANCE in kept:
-        seen = _erring(data, kept)
-        values = fit_closure(seen, _at_rest(seen, edges)).edges.shared
-        basis = kept[COMPLIANCE].basis
-        behind = sum(it.basis.shape[2] for it in list(kept.values())[_place(kept) :])
-        bends = values[len(values) - behind :][: basis.shape[2]]
+        problem, fit = arm.fitted(kept, state)
+        springs = kept[COMPLIANCE]
+        bends = problem.values_of(springs.effect(arm.robot, COMPLIANCE).name, fit.state)
         if not (bends < 0.0).any():
             break
-        basis = basis * (bends >= 0.0)
-        kept[COMPLIANCE] = replace(kept[COMPLIANCE], basis=basis)
+        kept[COMPLIANCE] = replace(springs, basis=springs.basis * (bends >= 0.0))
     return kept
-
-
-def _place(errors: Mapping[str, ArmErrors]) -> int:
-    return list(errors).index(COMPLIANCE)

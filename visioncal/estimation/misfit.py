@@ -5,16 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.chance import chi2_limit
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    flange_to_residual,
-    normal_equations,
-    residual_blocks,
-)
-from visioncal.estimation.linalg import covariance, gram
+from visioncal.estimation.arm import rows_of, stops_of
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.solve import normal_equations
+from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, invert
+from visioncal.types import FloatArray
 
 # Noise looks like a misfit in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -49,29 +46,33 @@ class Drift:
     moved_rad: float
 
 
-def neighbours(data: Closure, edges: Edges, noise: Noise) -> Neighbours:
-    """Compares a blocked jackknife with the covariance of the joint fit.
+def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neighbours:
+    """Compares a blocked jackknife with the covariance of the fit.
 
-    Blocks of neighbouring stops are left out in turn (Kuensch 1989), to first order. The squared
-    influence of each block is put in proportion to its expectation under the model, so that small
-    samples and unequal blocks do not bias it.
+    Blocks of neighbouring stops of one robot are left out in turn (Kuensch 1989), to first order.
+    The squared influence of each block is put in proportion to its expectation under the model, so
+    that small samples and unequal blocks do not bias it.
 
     Args:
-        data: The views, one a stop, in the order of the session.
-        edges: Where the whitened residuals are least: elsewhere their slope passes for a misfit.
-        noise: Of the flange.
+        problem: The observations, their stops in the order of the session.
+        state: Where the whitened residuals are least: elsewhere their slope passes for a misfit.
+        noise: Its levels.
+        robot: The robot whose stops are left out.
     """
-    residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    information = normal_equations(data, edges, noise)[0]
-    fitted, metric = covariance(information), information[:12, :12]
+    moving, edges = problem.moving, slice(6 * len(problem.unknown))
+    whole = normal_equations(problem, state, noise)[0]
+    fitted, metric = covariance_among(whole, moving), whole[edges, edges]
+    mine, stops = rows_of(problem, robot), stops_of(problem, robot)
+    known = problem.knowledge(state)
     seen = expected = scatter = 0.0
-    for rows in np.array_split(np.arange(len(data)), min(_BLOCKS, len(data) // 2)):
-        weighted = np.linalg.solve(spread[rows], jacobian[rows])
-        own = gram(jacobian[rows], weighted)
+    for block in np.array_split(stops, min(_BLOCKS, len(stops) // 2)):
+        part = problem.subset(mine & np.isin(problem.observations.stops, block))
+        information, gradient = normal_equations(part, state, noise)
+        own = information - known.information
         # Leaving the block out takes its information, too.
-        without = covariance(information - own)
-        moved = (without @ gram(weighted, residuals[rows]))[:12]
-        likely = (without @ own @ fitted)[:12, :12] @ metric
+        without = covariance_among(whole - own, moving)
+        moved = (without @ (gradient - known.pull))[edges]
+        likely = (without @ own @ fitted)[edges, edges] @ metric
         seen += float(moved @ metric @ moved)
         expected += float(np.trace(likely))
         scatter += 2.0 * float(np.trace(likely @ likely))
@@ -80,34 +81,45 @@ def neighbours(data: Closure, edges: Edges, noise: Noise) -> Neighbours:
     return Neighbours(factor, factor > float(chi2_limit(_FALSE_ALARM, freedom)) / freedom)
 
 
-def drift(data: Closure, edges: Edges, noise: Noise) -> Drift | None:
-    """Looks for a motion in proportion to the number of the stop (Rao's score test).
+def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | None:
+    """Looks for a motion of a robot's base in proportion to the number of the stop.
+
+    Rao's score test: what stands still before the base moves in it as much, the other way.
 
     Args:
-        data: The views, one a stop, in the order of the session.
-        edges: Where the whitened residuals are least.
-        noise: Of the flange.
+        problem: The observations, their stops in the order of the session.
+        state: Where the whitened residuals are least.
+        noise: Its levels.
+        robot: The robot.
 
     Returns:
         The motion; None where noise explains the residuals as well.
     """
-    residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
-    time = np.linspace(-0.5, 0.5, len(data))[:, None, None]
-    seen = data.under(edges.shared)
-    moving = flange_to_residual(seen, edges) @ (adjoint(invert(flange)) * time)
-    both = np.concatenate([jacobian, moving], axis=2)
-    weighted = np.linalg.solve(spread, both)
-    information = gram(both, weighted)
-    known = normal_equations(data, edges, noise)[0]
-    size = len(known)
-    information[:size, :size] = known
-    gradient = gram(weighted, residuals)
-    gradient[:size] = 0.0
-    step = -covariance(information) @ gradient
+    stops, poses = stops_of(problem, robot), problem.poses[robot]
+    creep = np.zeros((len(poses), 6, 6))
+    time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
+    creep[stops] = adjoint(invert(poses[stops])) * time
+    nothing, freely = np.zeros(6), Knowledge(np.zeros((6, 6)), np.zeros(6))
+    effect = Effect("creep", nothing, freely, nothing > 0.0, by_flange={robot: creep})
+    widened = problem.with_effects([*problem.effects, effect])
+    there = State(state.edges, np.concatenate([state.values, nothing]))
+    information, gradient = normal_equations(widened, there, noise)
+    gradient[: problem.size] = 0.0
+    step = -covariance_among(information, widened.moving) @ gradient
     if -gradient @ step < chi2_limit(_FALSE_ALARM, 6):
         return None
-    base = step[size:]
-    target = edges.z if data.mount == "eye-in-hand" else (flange @ edges.z).mean(axis=0)
-    moved = base[3:] + np.cross(base[:3], target[:3, 3])
+    base = step[problem.size :]
+    moved = base[3:] + np.cross(base[:3], _where_it_looks(problem, state, robot))
     return Drift(float(np.linalg.norm(moved)), float(np.linalg.norm(base[:3])))
+
+
+def _where_it_looks(problem: Problem, state: State, robot: str) -> FloatArray:
+    """(3,) the mean place, in a robot's base, of what is observed by way of it [m]."""
+    branches = problem.tree.branches.values()
+    base = next(it.parent for it in branches if it.robot == robot)
+    rows, observed = rows_of(problem, robot), np.array(problem.observations.observed)
+    places = [
+        problem.between(base, frame, state, np.flatnonzero(rows & (observed == frame)))[:, :3, 3]
+        for frame in dict.fromkeys(observed[rows].tolist())
+    ]
+    return np.asarray(np.concatenate(places).mean(axis=0))

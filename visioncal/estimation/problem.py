@@ -505,6 +505,10 @@ class Problem:
             product = product @ (invert(edge) if step.is_up else edge)
         return product
 
+    def between(self, first: str, second: str, state: State, rows: IntArray) -> FloatArray:
+        """The (m, 4, 4) `first_from_second` of two frames at some observations."""
+        return self._product(self.tree.path(first, second), state, rows)
+
     def predicted(self, state: State) -> FloatArray:
         """The (n, 4, 4) `observer_from_observed` that the unknowns and the robots predict."""
         found = np.zeros((len(self), 4, 4))

@@ -4,9 +4,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.estimation.descend import Linearised, descend
-from visioncal.estimation.linalg import covariance_among, damped_step, gram, squared_lengths
+from visioncal.estimation.linalg import (
+    covariance,
+    covariance_among,
+    damped_step,
+    gram,
+    squared_lengths,
+)
 from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
 from visioncal.estimation.variance import Components, Knowledge, RatioPrior, estimate_sigmas
 from visioncal.types import FloatArray, Mask
@@ -412,6 +419,30 @@ def mahalanobis_sq(
     squares, directions = squared_lengths(linear.residuals, left, noise)
     unmeasured = np.where(problem.observations.has_rotation, 0, 3)
     return squares, np.asarray(directions - unmeasured, dtype=float)
+
+
+def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArray:
+    """Residuals (n, 6) of each observation from a fit without it, to first order.
+
+    With it go all that share its flange's error. By the identity of Cook and Weisberg (1982,
+    section 2.2), with the noise as it is.
+    """
+    linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
+    total = problem.total_covariance(linear, noise)
+    left = total - linear.spread(fitted)
+    found = (total @ covariance(left) @ linear.residuals[:, :, None])[:, :, 0]
+    (of, members), errors = problem.units, problem.error_covariance(noise)
+    count = np.bincount(of[of >= 0], minlength=len(members))
+    own, jacobian = problem.covariance(noise), linear.jacobian
+    for unit in np.flatnonzero(count > 1).tolist():
+        rows = np.flatnonzero(of == unit)
+        by_errors, slopes = (
+            it[rows].reshape(6 * len(rows), -1) for it in (linear.by_errors, jacobian)
+        )
+        among = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
+        without = covariance(among - slopes @ fitted @ slopes.T)
+        found[rows] = (among @ without @ linear.residuals[rows].ravel()).reshape(-1, 6)
+    return np.asarray(found)
 
 
 def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:

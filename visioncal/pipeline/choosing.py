@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel, blocks_of
-from visioncal.estimation.closure import distances
+from visioncal.estimation.closure import ROBOT, Edges, distances
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree
@@ -63,8 +63,11 @@ def arm_told(known: Known) -> Known:
     # What is open about the drift comes last, and is held at any level.
     data = data.with_first(len(data.unchanged) - known.drift_size)
     lost = stated.stated_closure(known.used)
-    told = None if lost is None else lost.merged(known.stops).with_first(len(data.unchanged))
-    found = choose_level(data, agreed.edges, bases, known.level, told)
+    told = (
+        None if lost is None else lost.merged(known.stops).with_first(len(data.unchanged)).problem
+    )
+    start = Edges(agreed.edges.x, agreed.edges.z, data.unchanged).state
+    found = choose_level(data.problem, start, ROBOT, bases, known.level, told)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
     known = replace(known, compared_from_first=known.from_first)
     known = known.noting((), doubts(found))

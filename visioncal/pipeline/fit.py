@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.estimation.arm import misfit_slopes
 from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.closure import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
 from visioncal.types import FloatArray, IntArray
@@ -89,7 +90,8 @@ def _covariance(known: Known) -> FloatArray:
     data = known.closure(known.used).merged(known.stops)
     first = np.unique(known.stops, return_index=True)[1]
     by_stop = replace(errors, basis=known.arm_basis(known.used)[first])
-    slopes = misfit_slopes(data, result.edges, result.noise, by_stop)[kept]
+    edges, noise = result.edges.state, result.noise.levels
+    slopes = misfit_slopes(data.problem, edges, noise, ROBOT, by_stop)[kept]
     size, variance = slopes.shape[1], diagnosis.inflation * errors.sigma**2
     # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
     between = -variance * slopes

@@ -7,7 +7,8 @@ import numpy as np
 
 from visioncal.estimation.arm import find_arm_errors
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import Edges, flange_to_residual, residual_blocks
+from visioncal.estimation.closure import ROBOT, Edges, flange_to_residual, residual_blocks
+from visioncal.estimation.solve import starting_noise
 from visioncal.pipeline.known import Known
 from visioncal.robot import Robot
 from visioncal.stages.thermal import (
@@ -111,8 +112,9 @@ def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
     model = ArmModel.of(robot, q, known.flange_poses(known.used))
     known = replace(known, arm=None)
     data = known.closure(known.used).merged(known.stops)
-    edges = Edges(agreed.edges.x, agreed.edges.z, data.unchanged)
-    links = find_arm_errors(data, edges, model.columns("links", q[first]), of_links=True)
+    edges, problem = Edges(agreed.edges.x, agreed.edges.z, data.unchanged), data.problem
+    noise, basis = starting_noise(problem), model.columns("links", q[first])
+    links = find_arm_errors(problem, edges.state, noise, ROBOT, basis, of_links=True)
     if links is not None:
         data = data.with_more(links.shared())
         edges = replace(edges, shared=data.unchanged)

@@ -41,7 +41,8 @@ def _held_back(
     stated = replace(known, arm=None, arm_model=None, from_first=known.compared_from_first)
     lost = stated.stated_closure(views)
     data = (stated.closure(views) if lost is None else lost, known.closure(views))
-    edges = (found.fits[0].fit.edges, known.solved.edges)
+    nominal = found.fits[0].fit.state
+    edges = (Edges(nominal.edges[0], nominal.edges[1], nominal.values), known.solved.edges)
     before, after = (
         _distances(one, two, it, views)
         for one, two, it in zip((stated, known), data, edges, strict=True)

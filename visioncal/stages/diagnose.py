@@ -10,7 +10,7 @@ from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
 from visioncal.estimation.boards import Boards
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
-from visioncal.estimation.closure import Closure, fit_closure
+from visioncal.estimation.closure import ROBOT, Closure, fit_closure
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
@@ -79,12 +79,13 @@ def diagnose(
         if len(data) >= _FEWEST_STOPS:
             # A closed form is not at rest, and that would pass for a misfit.
             rest = fit_closure(data, edges)
-            alike = neighbours(data, rest.edges, rest.noise)
-            moved = drift(data, rest.edges, rest.noise)
+            fitted = (data.problem, rest.edges.state, rest.noise.levels, ROBOT)
+            alike, moved = neighbours(*fitted), drift(*fitted)
         told = data.problem, edges.state, noise.levels
         parts = covariance_by_source(*told, _sources(data, free, arm, boards, drifting))
         if arm is not None and not arm.is_estimated:
-            parts["arm"] = misfit_covariance(data, edges, noise, arm)[:12, :12]
+            of_arm = misfit_covariance(*told, ROBOT, arm)
+            parts["arm"] = of_arm[:12, :12]
         if result.held.any():
             parts["held_values"] = np.outer(result.held[:12], result.held[:12])
         intervals = noise_intervals(*told)[0]

@@ -9,6 +9,7 @@ from visioncal.errors import ConvergenceError
 from visioncal.estimation.arm import ArmErrors, misfit_covariance
 from visioncal.estimation.boards import Boards
 from visioncal.estimation.closure import (
+    ROBOT,
     Closure,
     ClosureFit,
     Edges,
@@ -122,7 +123,9 @@ def solve_hand_eye(
         spread = covariance(closure_information(data, fit.edges, fit.noise))
         spread = spread + np.outer(shift, shift)
         if arm is not None and not arm.is_estimated:
-            spread = spread + misfit_covariance(data, fit.edges, fit.noise, arm)
+            spread = spread + misfit_covariance(
+                data.problem, fit.edges.state, fit.noise.levels, ROBOT, arm
+            )
     if not fit.settled:
         raise ConvergenceError(
             f"{title(data.mount)}: the joint fit of {len(data)} views does not come to rest.",

@@ -2,18 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from visioncal.calibration import Rms
 from visioncal.errors import DataError
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.closure import Closure, Edges, noise_likelihood
 from visioncal.estimation.kinematics import LEVELS, LevelFit, fit_level, resized
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.figures import figure
 from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mask
 
 NOMINAL = "nominal"
 # What a zero that was found from the target's poses is still off by, before the corners are asked,
@@ -72,39 +72,41 @@ class Kinematics:
 
 
 def choose_level(
-    data: Closure,
-    edges: Edges,
+    problem: Problem,
+    state: State,
+    robot: str,
     bases: Mapping[str, FloatArray],
     asked: str,
-    stated: Closure | None = None,
+    stated: Problem | None = None,
 ) -> Kinematics:
-    """Chooses how much of the arm to free.
+    """Chooses how much of a robot's arm to free.
 
     A level is taken where it is likelier than all others by more than chance, with the price of its
     unknowns in the likelihood, and predicts stops that are left out better than the nominal arm.
 
     Args:
-        data: The views, one a stop, without errors of the arm.
-        edges: The answer with the nominal arm.
-        bases: (m, 6, p) how each stop's flange moves with the errors of each block.
+        problem: The observations, without errors of this arm.
+        state: The answer with the nominal arm.
+        robot: The robot.
+        bases: (s, 6, p) by stop, how the flange moves with the errors of each block.
         asked: A key of `ASKED`.
-        stated: The same views with a lost zero where the model has it, where `data` have it where
-            it is; None where none is lost. Then offsets are what is taken at the least.
+        stated: The same observations with a lost zero where the model has it, where `problem` has
+            it where it is; None where none is lost. Then offsets are what is taken at the least.
     """
     with one_blas_thread():
-        fits = {NOMINAL: fit_level(data, edges, bases)}
-        fits |= {it: fit_level(data, edges, bases, blocks) for it, blocks in LEVELS.items()}
+        fits = {NOMINAL: fit_level(problem, state, robot, bases)}
+        fits |= {it: fit_level(problem, state, robot, bases, to) for it, to in LEVELS.items()}
         if stated is not None:
-            fits = _with_lost_zero(fits, data, stated, edges, bases)
+            nominal = fit_level(stated, state, robot, bases)
+            fits = _with_lost_zero(fits, problem, stated, nominal, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
-    turned = data.guess is None
-    levels = tuple(_level(name, fit, turned=turned) for name, fit in found.items())
+    levels = tuple(_level(name, fit) for name, fit in found.items())
     least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
     best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
     with one_blas_thread():
-        chosen = resized(data, found[best.name])
+        chosen = resized(problem, robot, found[best.name])
     levels = tuple(
-        _level(it, chosen, turned=turned) if it == best.name else was
+        _level(it, chosen) if it == best.name else was
         for it, was in zip(found, levels, strict=True)
     )
     return Kinematics(best.name, levels, chosen.errors, asked not in _ALL, (found[NOMINAL], chosen))
@@ -112,17 +114,16 @@ def choose_level(
 
 def _with_lost_zero(
     fits: Mapping[str, LevelFit | None],
-    data: Closure,
-    stated: Closure,
-    edges: Edges,
+    problem: Problem,
+    stated: Problem,
+    nominal: LevelFit | None,
     bases: Mapping[str, FloatArray],
 ) -> dict[str, LevelFit | None]:
     """The levels beside the arm as it was stated, with what the zero explains in all others."""
-    nominal, zeroed = fit_level(stated, edges, bases), fits[NOMINAL]
+    zeroed = fits[NOMINAL]
     if nominal is None or zeroed is None:
         return dict(fits)
-    before = noise_likelihood(stated, nominal.fit.edges)[1]
-    gain = 2.0 * (before - noise_likelihood(data, zeroed.fit.edges)[1])
+    gain = 2.0 * (_unlikeliness(stated, nominal) - _unlikeliness(problem, zeroed))
     found = {
         name: None if fit is None else replace(fit, gain=fit.gain + gain)
         for name, fit in fits.items()
@@ -131,6 +132,10 @@ def _with_lost_zero(
         errors = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
         found["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
     return found | {NOMINAL: nominal}
+
+
+def _unlikeliness(problem: Problem, fit: LevelFit) -> float:
+    return robot_levels(problem, fit.fit.state, starting_noise(problem), from_above=True)[1]
 
 
 def _best(levels: Sequence[Level]) -> Level:
@@ -149,17 +154,16 @@ def _best(levels: Sequence[Level]) -> Level:
     return best
 
 
-def _level(name: str, fit: LevelFit, *, turned: bool) -> Level:
-    """Writes a fit as figures; `turned` says whether the views tell rotations."""
-    rms = partial(_rms, turned=turned)
-    sizes = len(fit.errors)
-    return Level(name, fit.size, rms(fit.inside), rms(fit.left_out), fit.gain, sizes)
+def _level(name: str, fit: LevelFit) -> Level:
+    """Writes a fit as figures."""
+    inside, left_out = (_rms(it, fit.has_rotation) for it in (fit.inside, fit.left_out))
+    return Level(name, fit.size, inside, left_out, fit.gain, len(fit.errors))
 
 
-def _rms(residuals: FloatArray, *, turned: bool) -> Rms:
-    square = np.mean(residuals.reshape(-1, 2, 3) ** 2, axis=0).sum(axis=1)
-    deg = float(np.rad2deg(np.sqrt(square[0])))
-    return Rms(mm=1e3 * float(np.sqrt(square[1])), deg=deg if turned else None)
+def _rms(residuals: FloatArray, turned: Mask) -> Rms:
+    turns, shifts = (np.sum(it**2, axis=1) for it in (residuals[turned, :3], residuals[:, 3:]))
+    deg = float(np.rad2deg(np.sqrt(np.mean(turns)))) if turned.any() else None
+    return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
 
 
 def check_asked(asked: str, *, can: bool, misread: str = "") -> None:

@@ -13,7 +13,7 @@ from visioncal.estimation.appearance import (
     compress,
 )
 from visioncal.estimation.arm import ArmErrors, find_arm_errors
-from visioncal.estimation.closure import Closure, Edges, fit_closure, left_out_residuals
+from visioncal.estimation.closure import ROBOT, Closure, Edges, fit_closure
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.joint import (
     Arm,
@@ -32,6 +32,7 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import worst_directions
+from visioncal.estimation.solve import left_out_residuals
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import numbered_positions
@@ -144,9 +145,16 @@ def arm_errors(arm: Arm, data: Closure, edges: Edges) -> ArmErrors | None:
     Returns:
         The errors at all m views; None where white noise explains the residuals as well.
     """
-    edges = fit_closure(data, Edges(edges.x, edges.z, data.unchanged)).edges
+    fit = fit_closure(data, Edges(edges.x, edges.z, data.unchanged))
     first = np.unique(arm.stops, return_index=True)[1]
-    found = find_arm_errors(data, edges, arm.basis[first], of_links=arm.of_links)
+    found = find_arm_errors(
+        data.problem,
+        fit.edges.state,
+        fit.noise.levels,
+        ROBOT,
+        arm.basis[first],
+        of_links=arm.of_links,
+    )
     return None if found is None else replace(found, basis=arm.basis)
 
 
@@ -288,7 +296,9 @@ def _shapes(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
 def _predicts_worse(wider: State, state: State) -> bool:
     """Whether views that are left out are predicted worse, in position and in rotation."""
     errors = [
-        left_out_residuals(it.data, it.fit.edges, it.fit.noise).reshape(-1, 2, 3)
+        left_out_residuals(it.data.problem, it.fit.edges.state, it.fit.noise.levels).reshape(
+            -1, 2, 3
+        )
         for it in (wider, state)
     ]
     more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
