@@ -33,6 +33,11 @@ class Pair:
         """Both, as messages and results name them."""
         return f"{self.camera} and robot {self.robot or 'robot'}"
 
+    @property
+    def effect(self) -> str:
+        """The effect of their clocks' offset, by its name."""
+        return f"clock of {self.words}"
+
 
 @dataclass(frozen=True, eq=False)
 class Clocks:
@@ -147,7 +152,7 @@ def _effect(cell: Cell, pair: Pair, clocked: Clocked) -> Effect:
     sigma_s = clocked.clock.sigma_s
     known = Knowledge(np.array([[sigma_s**-2.0]]), np.zeros(1))
     return Effect(
-        f"clock of {pair.words}",
+        pair.effect,
         np.zeros(1),
         known,
         np.zeros(1, dtype=bool),

@@ -1,6 +1,6 @@
 """Aligning a whole cell: the way from a session to its frames, each with respect to all others."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.alignment.arms import ARMS_ASKED, ArmsAsked, erring_arms
 from visioncal.alignment.cell import Cell, read_cell, robot_key
-from visioncal.alignment.clocks import Clocks, set_clocks
+from visioncal.alignment.clocks import Clocks, Pair, set_clocks
 from visioncal.alignment.faults import (
     Version,
     movements,
@@ -36,6 +36,7 @@ from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
+from visioncal.stages.offset import Clock
 from visioncal.targets import target_document
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, Progress
@@ -132,7 +133,7 @@ def alignment_of(
             moved,
             untied,
             [*clocks.warnings, *_warnings(solved, looked, spread)],
-            clocks.notes,
+            (*clocks.notes, *_clock_words(clocks, solved, spread)),
         ),
         details=_details(clocks, solved, spread),
         arms=_arms(session),
@@ -193,10 +194,39 @@ def _details(clocks: Clocks, solved: Solved, spread: FloatArray) -> dict[str, An
     """What was found of clocks, and of the arms where it was asked for."""
     agreed, found = solved.agreed, {}
     if clocks.found:
-        found["clocks"] = {it.words: at.clock.document() for it, at in clocks.found.items()}
+        found["clocks"] = {
+            it.words: _fitted_clock(it, at.clock, solved, spread).document()
+            for it, at in clocks.found.items()
+        }
     if solved.arms.effects:
         found["arms"] = solved.arms.document(agreed.problem, agreed.fit.state, spread)
     return found
+
+
+def _fitted_clock(pair: Pair, clock: Clock, solved: Solved, spread: FloatArray) -> Clock:
+    """A clock as the fit of the whole cell has it, where that estimates it."""
+    problem = solved.agreed.problem
+    columns = problem.effect_columns.get(pair.effect)
+    if columns is None:
+        return clock
+    (late_s,) = problem.values_of(pair.effect, solved.agreed.fit.state)
+    return replace(
+        clock,
+        camera_minus_robot_s=clock.camera_minus_robot_s + float(late_s),
+        sigma_s=float(np.sqrt(spread[columns.start, columns.start])),
+    )
+
+
+def _clock_words(clocks: Clocks, solved: Solved, spread: FloatArray) -> Iterator[str]:
+    """Says what the fit of the whole cell makes of clocks that the motion told."""
+    for pair, it in clocks.found.items():
+        clock = _fitted_clock(pair, it.clock, solved, spread)
+        if clock is not it.clock:
+            yield (
+                f"{pair.words}: the fit of the whole cell has the camera's clock "
+                f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
+                f"{1e3 * clock.sigma_s:.2g} ms)."
+            )
 
 
 def _by_name(named: Mapping[str, Version]) -> dict[str, Version]:

@@ -1,0 +1,278 @@
+"""A whole cell with everything at once: are all parts found together, within their sigmas?
+
+Two arms with errors of their joints' zeros, two fixed cameras and one in hand. One fixed camera
+also follows the first arm in a sweep, by a clock of its own; one board is printed 0.2 % too large;
+a gauge measured where the second base is. Nothing is known but what the session holds. No images
+are rendered: corners carry noise.
+
+    PYTHONPATH=tests python tests/benchmarks/wholecell.py [CELLS]
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from multiprocessing import Pool
+
+import numpy as np
+from results import wished, write_section
+from scipy.interpolate import CubicSpline
+
+from visioncal.alignment import align
+from visioncal.calibration import Alignment
+from visioncal.session import Session, Stream, View
+from visioncal.simulation.arms import forward
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt
+from visioncal.simulation.network import simulate_network
+from visioncal.simulation.network_records import network_session
+from visioncal.simulation.optics import fine_camera, project, sees
+from visioncal.simulation.options import checkerboard_target
+from visioncal.simulation.records import pose_row
+from visioncal.simulation.seen import Network, camera_named, sheet_named
+from visioncal.simulation.sweep import POSE_COLUMNS
+from visioncal.transforms import exp, invert, log
+from visioncal.types import Corners, FloatArray
+
+CELLS = 50
+STOPS = 40
+OFFSET_RAD = 1e-3
+SCALE = 1.002
+AHEAD_S = 0.0437
+GAUGE_M = 0.0005
+_ROBOT_HZ, _FRAMES_HZ, _PACE_S = 125.0, 10.0, 1.7
+# So many postures of the first arm are swept through.
+_SWEPT = 10
+
+
+def options(seed: int) -> NetworkOptions:
+    robots = (
+        RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=OFFSET_RAD),
+        RobotAt("b", (0.6, 0.05, 0.02), offset_sigma_rad=OFFSET_RAD),
+    )
+    cameras = (
+        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=fine_camera()),
+        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
+        CameraAt("hand", "b"),
+    )
+    boards = (
+        BoardAt("floor", place_m=(0.0, 0.0, 0.05), scale=SCALE),
+        BoardAt("plate_a", "a", target=checkerboard_target()),
+        BoardAt("plate_b", "b"),
+    )
+    return NetworkOptions(robots, cameras, boards, stops=STOPS, seed=seed)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A cell with its session, what is detected in its images, and where its frames are.
+
+    Attributes:
+        cell: The cell at its stops.
+        session: What was recorded.
+        corners: What is detected, by view.
+    """
+
+    cell: Network
+    session: Session
+    corners: Mapping[int, Corners]
+
+
+def world(seed: int) -> World:
+    cell = simulate_network(options(seed))
+    rng = np.random.default_rng([seed, 77])
+    session = network_session(cell, "everything", seen="names")
+    corners = {it.view: it for it in cell.corners}
+    rows, more, stream = _sweep(cell, 1 + max(it.number for it in session.views), rng)
+    height_m = cell.between("base_a", "base_b")[2, 3] + GAUGE_M * float(rng.standard_normal())
+    prior = {"z_m": height_m, "sigma_m": GAUGE_M}
+    document = {**session.document, "prior": {"base_a_from_base_b": prior}}
+    views = (*session.views, *rows)
+    columns = (*session.columns, "stamp_s")
+    built = Session.assemble(
+        document,
+        columns,
+        [[row.cell(column) for column in columns] for row in views],
+        session.images,
+        target_document=session.target_document,
+    )
+    return World(cell, built.with_streams({"a": stream}), {**corners, **more})
+
+
+def _sweep(
+    cell: Network, view: int, rng: np.random.Generator
+) -> tuple[list[View], dict[int, Corners], Stream]:
+    """The rows of the camera `left` while the first arm moves, and what its controller tells."""
+    seen = [it.stop for it in cell.sights if (it.camera, it.board) == ("left", "plate_a")]
+    stops = cell.joints["a"][seen[:_SWEPT]]
+    way = CubicSpline(_PACE_S * np.arange(len(stops)), _in_turn(stops), bc_type="clamped")
+    end_s = _PACE_S * (len(stops) - 1)
+    robot_s, frames_s = (
+        np.arange(0.0, end_s, 1.0 / _ROBOT_HZ),
+        np.arange(0.1, end_s - 0.1, 1.0 / _FRAMES_HZ),
+    )
+    robot = next(it for it in cell.options.robots if it.name == "a")
+    sigmas = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
+    flanges = forward(cell.true_arms["a"], way(frames_s)) @ exp(
+        sigmas * rng.standard_normal((len(frames_s), 6))
+    )
+    camera, sheet = camera_named(cell.options, "left").camera, sheet_named(cell.options, "plate_a")
+    hung = cell.transforms
+    plates = hung["base_a"] @ flanges @ hung["target_plate_a"]
+    poses = invert(hung["cam_left"]) @ plates
+    rows, corners = [], {}
+    for stamp_s, pose in zip(frames_s + AHEAD_S, poses, strict=True):
+        points = corners_m(sheet) @ pose[:3, :3].T + pose[:3, 3]
+        ids = np.flatnonzero(sees(camera, points, 2.0))
+        if len(ids) < len(points):
+            continue
+        px = project(camera, points[ids])
+        if px[0].sum() > px[-1].sum():
+            continue
+        corners[view] = Corners(
+            view, ids, px + cell.options.pixel_sigma_px * rng.standard_normal(px.shape), 0.7
+        )
+        text = {"camera": "left", "target": "plate_a"}
+        rows.append(
+            View(view, f"sweep/{view:04d}.png", numbers={"stamp_s": float(stamp_s)}, text=text)
+        )
+        view += 1
+    q = way(robot_s)
+    told = [list(pose_row(it).values()) for it in forward(cell.arms["a"], q)]
+    names = [f"q{at}_rad" for at in range(1, 1 + q.shape[1])]
+    stream = Stream(("stamp_s", *POSE_COLUMNS, *names), np.hstack([robot_s[:, None], told, q]))
+    return rows, corners, stream
+
+
+def _in_turn(stops: FloatArray) -> FloatArray:
+    """Orders postures so that each is the nearest to the one before of those that are left."""
+    left, order = list(range(1, len(stops))), [0]
+    while left:
+        away = [float(np.abs(stops[at] - stops[order[-1]]).max()) for at in left]
+        order.append(left.pop(int(np.argmin(away))))
+    return stops[order]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one cell gave, in units of its sigmas or as a share of the freedom.
+
+    Attributes:
+        frames: Squared error of all frames over their covariance, by the freedom.
+        frames_mm: Root mean square error of the frames' places.
+        offsets: (k,) errors of the joints' zeros over their sigmas.
+        clock: The offset's error over its sigma.
+        scale: The board's size, the same.
+        prior_used: Whether the gauge counted.
+        verdict: The status.
+    """
+
+    frames: float
+    frames_mm: float
+    offsets: FloatArray
+    clock: float
+    scale: float
+    prior_used: bool
+    verdict: str
+
+
+def outcome(seed: int) -> Outcome:
+    it = world(seed)
+    found = align(it.session, corners=it.corners, arms="offsets")
+    truth = _regauged(it.cell)
+    names = [edge.partition("_from_")[2] for edge in found.edges]
+    error = np.concatenate(
+        [log(invert(truth(name, found)) @ found.edge_of(name).matrix) for name in names]
+    )
+    offsets = [
+        (np.array(found.details["arms"][robot]["values"]) - it.cell.true_arms[robot].offset[1:-1])
+        / np.array(found.details["arms"][robot]["sigmas"])
+        for robot in ("a", "b")
+    ]
+    (clock,) = found.details["clocks"].values()
+    floor = found.stages["boards"]["floor"]
+    return Outcome(
+        float(error @ np.linalg.solve(found.joint_covariance, error)) / len(error),
+        1e3 * float(np.sqrt(np.mean(error.reshape(-1, 6)[:, 3:] ** 2))),
+        np.concatenate(offsets),
+        (clock["camera_minus_robot_s"] - AHEAD_S) / clock["sigma_s"],
+        (floor["shape"]["scale"] - (SCALE - 1.0)) / floor["sigma"]["scale"],
+        not any("base_a_from_base_b" in reason for reason in found.verdict.reasons),
+        found.verdict.status,
+    )
+
+
+def _regauged(cell: Network) -> Callable[[str, Alignment], FloatArray]:
+    """Where frames are, errors of each arm's first and last joint being the base's and flange's."""
+    before, behind = {}, {}
+    for name, arm in cell.arms.items():
+        q = cell.joints[name][:1]
+        for place, turns in ((0, before), (-1, behind)):
+            only = np.zeros_like(arm.offset)
+            only[place] = cell.true_arms[name].offset[place]
+            turned = forward(replace(arm, offset=arm.offset + only), q)[0]
+            there = forward(arm, q)[0]
+            turns[name] = turned @ invert(there) if place == 0 else invert(there) @ turned
+
+    def truth(name: str, found: Alignment) -> FloatArray:
+        parent, at = cell.parents[name], cell.transforms[name]
+        if parent != "cell":
+            return behind[parent.removeprefix("flange_")] @ at
+        if name.startswith("base_"):
+            at = at @ before[name.removeprefix("base_")]
+        reference = cell.transforms[found.reference] @ before[found.reference.removeprefix("base_")]
+        return invert(reference) @ at
+
+    return truth
+
+
+def report(cells: Sequence[Outcome], taken_s: float) -> str:
+    """The section's text."""
+
+    def squares(values: Iterable[FloatArray | float]) -> str:
+        found = np.array([np.asarray(it) for it in values])
+        return f"{float(np.mean(found**2)):.2f}"
+
+    frames = float(np.mean([it.frames for it in cells]))
+    rows = (
+        ("all frames, jointly", f"{frames:.2f}"),
+        ("zeros of the joints", squares(it.offsets for it in cells)),
+        ("offset of the clock", squares(it.clock for it in cells)),
+        ("size of the board", squares(it.scale for it in cells)),
+    )
+    away = float(np.median([it.frames_mm for it in cells]))
+    doubted = Counter(it.verdict for it in cells)
+    verdicts = ", ".join(f"{count} {status}" for status, count in doubted.most_common())
+    return "\n".join(
+        [
+            f"{len(cells)} cells of two arms ({1e3 * OFFSET_RAD:g} mrad at every joint's zero), "
+            f"three cameras, {STOPS} stops and a sweep by a clock {1e3 * AHEAD_S:g} ms ahead; one "
+            f"board {100 * (SCALE - 1.0):.1f} % too large, one height measured to {1e3 * GAUGE_M:g} mm.",
+            "",
+            "| | mean squared error over variance |",
+            "|---|---:|",
+            *(f"| {name} | {value} |" for name, value in rows),
+            "",
+            f"The frames' places are off by {away:.3f} mm (median, per axis). The height is taken "
+            f"in {sum(it.prior_used for it in cells)} of {len(cells)}; verdicts: {verdicts}. One "
+            f"cell takes {taken_s:.1f} s of one core.",
+        ]
+    )
+
+
+def main() -> None:
+    count = wished(CELLS, 2)
+    begin = time.process_time()
+    cells = [outcome(0)]
+    taken_s = time.process_time() - begin
+    with Pool() as pool:
+        cells += pool.map(outcome, range(1, count))
+    text = report(cells, taken_s)
+    print(text)
+    if count >= CELLS:
+        command = "PYTHONPATH=tests python tests/benchmarks/wholecell.py"
+        write_section("Everything at once", command, text)
+
+
+if __name__ == "__main__":
+    main()
