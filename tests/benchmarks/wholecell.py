@@ -247,7 +247,8 @@ def report(cells: Sequence[Outcome], taken_s: float) -> str:
         [
             f"{len(cells)} cells of two arms ({1e3 * OFFSET_RAD:g} mrad at every joint's zero), "
             f"three cameras, {STOPS} stops and a sweep by a clock {1e3 * AHEAD_S:g} ms ahead; one "
-            f"board {100 * (SCALE - 1.0):.1f} % too large, one height measured to {1e3 * GAUGE_M:g} mm.",
+            f"board {100 * (SCALE - 1.0):.1f} % too large, one height measured to "
+            f"{1e3 * GAUGE_M:g} mm.",
             "",
             "| | mean squared error over variance |",
             "|---|---:|",
