@@ -1,18 +1,19 @@
-"""Which observations of a whole cell belong together, and what moved between them.
+"""Which observations of a cell are outliers, and what moved between them.
 
-What is wrong as a whole (an image of another stop, a pose of another row) is left out, by how far
-it is from what all others predict. A frame that moved while the session was taken is no noise: from
+An observation is wrong as a whole (an image of another stop, a pose of another row), by how far it
+is from what all others predict. A frame that moved while the session was taken is no noise: from
 some stop on, all that saw it asks for one other place. It is then two frames, and nothing is lost.
 
-It begins with the earliest stops, where what moves later on has not moved yet.
+Where frames may have moved, the search begins with the earliest stops: what moves later on has not
+moved yet.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.chance import chi2_limit, f_limit
+from visioncal.chance import f_limit
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.moves import (
     Move,
@@ -27,6 +28,7 @@ from visioncal.estimation.moves import (
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
@@ -34,21 +36,30 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
+from visioncal.solvers import SOLVERS
 from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray, Mask
+from visioncal.types import FloatArray, IntArray, Mask
 
 # A sound observation is lost in one session of a thousand.
 _FALSE_ALARM = 1e-3
 # The earliest share of the stops, at the least, that the search begins with.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
-_ROUNDS, _MOST_MOVES = 10, 8
-# An observation is near a start within so much [m], or so many times the median.
+_MOST_MOVES = 8
+# With 40 % of 20 views wrong, all 60 sets of three contain a wrong one with probability 3e-6.
+_SETS, _SET_SIZE = 60, 3
+# An observation is near within so much [m], or so many times the median.
 _NEAR_M, _FAR = 0.04, 6.0
 # Whatever robots err by more is wrong, and no noise [rad, m].
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
+# The noise of measured poses differs by so much from view to view: with tilt and distance.
+_UNEVEN = 3.0
+# Where fewer than this share of the observations agree, nothing tells which of them are right.
+_LEAST_SHARE = 0.5
+# Inliers, at the least: with fewer, outliers cannot be told from noise.
+LEAST_VIEWS = 5
 # Distances are compared with the limit once more, without the observation's own say in the noise,
 # when they come this near.
-_SUSPECT_SHARE = 0.6
+_SUSPECT_SHARE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,33 +70,74 @@ class Agreed:
         problem: All n observations; what moved is two frames in its tree.
         fit: The unknowns and the noise, by those that agree.
         used: (n,) mask of these.
-        surprise: (n,) squared distance of each from what the others predict.
-        limit: (n,) what it may be.
+        distances: How far each is from what the others predict.
         moves: What moved, in the order in which it was found.
     """
 
     problem: Problem
     fit: Solution
     used: Mask
-    surprise: FloatArray
-    limit: FloatArray
+    distances: Distances
     moves: tuple[Move, ...]
 
 
-def agree(problem: Problem, state: State, movable: Sequence[str]) -> Agreed:
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search among the observations of a problem."""
+
+    problem: Problem
+
+    def fit(self, used: Mask, start: Solution) -> Solution:
+        fit = fit_problem(self.problem.subset(used), start.state, start.noise)
+        robots = np.minimum(fit.noise.robots, _MOST_NOISE)
+        return replace(fit, noise=replace(fit.noise, robots=robots))
+
+    def distances(self, used: Mask, fit: Solution) -> Distances:
+        # What is far away is wrong, however little is known of where it should be.
+        found, away = distances(self.problem, used, fit), _away(self.problem, fit.state)
+        far = away > max(_FAR * float(np.median(away[used])), _NEAR_M)
+        return replace(found, squares=np.where(far, np.inf, found.squares))
+
+
+def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
+    """How far each observation is from what the others predict.
+
+    Args:
+        problem: All n observations.
+        used: (n,) those that the fit was made from.
+        fit: The unknowns and the noise.
+    """
+    squares, directions = mahalanobis_sq(problem, used, fit)
+    counted = np.maximum(directions, 1.0)
+    # Robots' levels are estimated from half of the residuals each, which gives the squares the
+    # tails of an F distribution.
+    edges = int(problem.counted[: 6 * len(problem.unknown)].sum())
+    freedom = max(0.5 * (float(problem.observations.directions[used].sum()) - edges), 6.0)
+    limit = counted * f_limit(_FALSE_ALARM / len(problem), counted, freedom)
+    # Poses that were measured by others are better in some views than in others, and nobody says
+    # how much.
+    return Distances(squares, directions, _UNEVEN**2 * limit if problem.is_combined else limit)
+
+
+def agree(problem: Problem, state: State | None = None, movable: Sequence[str] = ()) -> Agreed:
     """Finds what belongs together at first sight, what does not, and what clearly moved.
 
     `settle` has the last word, once lenses and boards are as well known as they can be.
 
     Args:
         problem: All observations.
-        state: A start.
+        state: A start; None where a closed form gives one (see `closed_form`).
         movable: Unknown frames that may have moved.
     """
-    used, fit = _early(problem, state)
+    used, fit = _core(
+        problem, state, _early(problem) if movable else np.ones(len(problem), dtype=bool)
+    )
+    if not movable:
+        return _agreed(problem, used, fit, ())
     moves: list[Move] = []
+    used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
-        beyond = _beyond(problem, used, fit)
+        beyond = _Search(problem).distances(used, fit).beyond
         move = gross_move(problem, fit, beyond < 1.0, movable)
         if move is None:
             break
@@ -120,7 +172,7 @@ def _without_needless(found: Agreed) -> Agreed:
     return found if len(moves) == len(found.moves) else _agreed(problem, used, fit, moves)
 
 
-def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
+def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     """Settles what agrees one by one, and what moved by less than single observations tell."""
     problem, moves = agreed.problem, list(agreed.moves)
     used, fit = _settled(problem, *_widened(problem, agreed.used, agreed.fit))
@@ -135,96 +187,113 @@ def settle(agreed: Agreed, movable: Sequence[str]) -> Agreed:
     return _without_needless(_agreed(problem, used, fit, moves))
 
 
-def _agreed(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> Agreed:
-    squares, directions = mahalanobis_sq(problem, used, fit)
-    return Agreed(problem, fit, used, squares, _limit(problem, used, directions), tuple(moves))
+def inliers(problem: Problem, state: State | None = None, used: Mask | None = None) -> Agreed:
+    """Finds the observations that agree, where nothing moved.
 
+    Args:
+        problem: All observations.
+        state: A start; None where a closed form gives one.
+        used: (n,) those that are thought to agree; None for a search without any idea.
 
-def _limit(problem: Problem, used: Mask, directions: FloatArray) -> FloatArray:
-    """Largest surprise (n,) that noise may give, corrected for how many observations there are.
-
-    Robots' levels are estimated from half of the residuals each, which gives the surprise the tails
-    of an F distribution.
+    Returns:
+        Those that agree. Where fewer than half do, or those only to within more than any result
+        may be off, nothing tells which are right: all stay.
     """
-    told = np.where(problem.observations.has_rotation[used], 6, 3).sum()
-    freedom = max(0.5 * (float(told) - problem.size), 6.0)
-    counted = np.maximum(directions, 1.0)
-    return np.asarray(counted * f_limit(_FALSE_ALARM / len(problem), counted, freedom))
+    every = np.ones(len(problem), dtype=bool)
+    if len(problem) > LEAST_VIEWS:
+        mask, fit = _core(problem, state, every) if used is None else _fitted(problem, state, used)
+        mask, fit = _settled(problem, mask, fit)
+        is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
+        if mask.sum() >= max(_LEAST_SHARE * len(problem), LEAST_VIEWS) and is_noise:
+            return _agreed(problem, mask, fit, ())
+    return _agreed(problem, *_fitted(problem, state, every), ())
 
 
-def _beyond(problem: Problem, used: Mask, fit: Solution) -> FloatArray:
-    """Surprises (n,) as shares of what they may be, the noise scaled by the used ones' median."""
-    squares, directions = mahalanobis_sq(problem, used, fit)
-    typical = chi2_limit(0.5, np.maximum(directions, 1.0))
-    scale = max(float(np.median((squares / typical)[used])), 1.0) if used.any() else 1.0
-    return np.asarray(squares / (scale * _limit(problem, used, directions)))
+def closed_form(problem: Problem, rows: IntArray) -> State | None:
+    """The unknowns by a hand-eye solver, where one robot parts two unknown edges.
+
+    Args:
+        problem: The observations.
+        rows: (m,) those to solve from.
+    """
+    paths = [it.path for it in problem.groups]
+    if len(paths) != 1 or not problem.observations.has_rotation.all() or problem.points:
+        return None
+    steps = paths[0]
+    if [it.frame in problem.unknown for it in steps] != [True, False, True]:
+        return None
+    poses = problem.poses[steps[1].robot][problem.observations.stops[rows]]
+    found = SOLVERS["park"](
+        poses if steps[1].is_up else invert(poses), problem.observations.measured[rows]
+    )
+    edges = {steps[0].frame: found.x, steps[2].frame: found.z}
+    return State(np.array([edges[it] for it in problem.unknown]), problem.start_values)
 
 
-def _early(problem: Problem, state: State) -> tuple[Mask, Solution]:
-    """Fits the earliest stops, without what is far from the start."""
+def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Solution]:
+    """The trimmed start among some observations, and all of them within its reach."""
+    rows, noise = np.flatnonzero(among), starting_noise(problem)
+    part = problem.subset(among)
+
+    def solve(mask: Mask, state: State) -> State:
+        found = closed_form(part, np.flatnonzero(mask))
+        # Noise is estimated once what is wrong by far is out: it would pass for noise of a robot.
+        return solve_problem(part.subset(mask), state, noise)[0] if found is None else found
+
+    starts = _starts(part, state)
+    mask, start = trimmed_start(starts, lambda it: _away(part, it), solve, half_of(len(rows)))
+    mask, fit = widened(
+        _Search(part), mask, fit_problem(part.subset(mask), start), np.ones(len(rows), dtype=bool)
+    )
+    used = among.copy()
+    used[rows] = mask
+    return used, fit
+
+
+def _starts(problem: Problem, state: State | None) -> Iterator[State]:
+    """The one that is given, or closed forms of all observations and of small sets."""
+    if state is not None:
+        yield state
+        return
+    rng = np.random.default_rng(0)
+    count = len(problem)
+    for rows in (
+        np.arange(count),
+        *(rng.choice(count, _SET_SIZE, replace=False) for _ in range(_SETS)),
+    ):
+        if (found := closed_form(problem, rows)) is not None:
+            yield found
+
+
+def _early(problem: Problem) -> Mask:
+    """(n,) the observations of the earliest stops."""
     stops = problem.observations.stops
     last = max(_EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:_FEWEST_EARLY][-1]))
-    early = stops <= last
-    # Noise is estimated once what is wrong by far is out: it would pass for noise of a robot.
-    noise = starting_noise(problem)
-    used = early & _near(problem, state, early)
-    state, _ = solve_problem(problem.subset(used), state, noise)
-    fit = Solution(state, noise)
-    return _widened(problem, early & (_beyond(problem, used, fit) < 1.0), fit, early)
+    return np.asarray(stops <= last)
 
 
-def _near(problem: Problem, state: State, among: Mask) -> Mask:
-    """(n,) whether an observation is where a start has it, as most among some are."""
+def _away(problem: Problem, state: State) -> FloatArray:
+    """Distances (n,) [m] of what was measured from what is predicted, rotations on a lever."""
     between = invert(problem.predicted(state)) @ problem.measured(state)
-    away = np.linalg.norm(between[:, :3, 3], axis=1)
-    away = away + LEVER_M * np.where(
-        problem.observations.has_rotation, rotation_angle(between), 0.0
-    )
-    return np.asarray(away < max(_FAR * float(np.median(away[among])), _NEAR_M))
+    turned = np.where(problem.observations.has_rotation, rotation_angle(between), 0.0)
+    return np.asarray(np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * turned)
 
 
-def _widened(
-    problem: Problem, used: Mask, fit: Solution, among: Mask | None = None
-) -> tuple[Mask, Solution]:
-    """Fits, and takes all within reach of the noise, in turn."""
-    noise = None
-    for _ in range(_ROUNDS):
-        fit = fit_problem(problem.subset(used), fit.state, noise)
-        noise = replace(fit.noise, robots=np.minimum(fit.noise.robots, _MOST_NOISE))
-        fit = replace(fit, noise=noise)
-        before = used
-        # What is far away is wrong, however little is known of where it should be.
-        used = (_beyond(problem, used, fit) < 1.0) & _near(problem, fit.state, used)
-        if among is not None:
-            used &= among
-        if np.array_equal(before, used):
-            break
-    return used, fit
+def _fitted(problem: Problem, state: State | None, used: Mask) -> tuple[Mask, Solution]:
+    start = state or closed_form(problem, np.flatnonzero(used))
+    if start is None:
+        raise RuntimeError("no closed form gives a start")
+    return used, fit_problem(problem.subset(used), start)
+
+
+def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
+    search = _Search(problem)
+    return widened(search, used, search.fit(used, fit))
 
 
 def _settled(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
-    """Takes observations in and out one at a time, until none moves.
+    return settled(_Search(problem), used, fit, LEAST_VIEWS, _SUSPECT_SHARE)
 
-    Of hundreds, one in a hundred goes in at a time.
-    """
-    step = max(len(problem) // 100, 1)
-    for _ in range(len(problem)):
-        squares, directions = mahalanobis_sq(problem, used, fit)
-        beyond = squares / _limit(problem, used, directions)
-        outside = np.flatnonzero(~used & (beyond < 1.0))
-        if len(outside):
-            used = used.copy()
-            used[outside[beyond[outside].argsort()[:step]]] = True
-            fit = fit_problem(problem.subset(used), fit.state, fit.noise)
-            continue
-        worst = int(np.where(used, beyond, -1.0).argmax())
-        if beyond[worst] < _SUSPECT_SHARE:
-            break
-        fewer = used.copy()
-        fewer[worst] = False
-        again = fit_problem(problem.subset(fewer), fit.state, fit.noise)
-        squares, directions = mahalanobis_sq(problem, fewer, again)
-        if squares[worst] < _limit(problem, fewer, directions)[worst]:
-            break
-        used, fit = fewer, again
-    return used, fit
+
+def _agreed(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> Agreed:
+    return Agreed(problem, fit, used, distances(problem, used, fit), tuple(moves))

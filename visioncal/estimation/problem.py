@@ -27,6 +27,8 @@ from visioncal.types import FloatArray, IntArray, Mask
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
 _NOT_MEASURED = 1.0
+# Variances of a direction that a pose leaves open are above this [rad^2].
+_OPEN = 0.05
 # Variance of a flange's error where nothing was observed of it [rad^2 and m^2]: nothing is known.
 ANYTHING = 1e4
 
@@ -55,6 +57,12 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.stops)
+
+    @cached_property
+    def directions(self) -> IntArray:
+        """(n,) in how many directions each was measured: six, or fewer where some are open."""
+        found = np.sum(np.linalg.eigvalsh(self.covariance) < _OPEN, axis=1)
+        return np.asarray(np.where(self.has_rotation, found, 3))
 
     def take(self, rows: IntArray) -> "Observations":
         """Returns those of (m,) rows."""

@@ -417,7 +417,7 @@ def mahalanobis_sq(
     noise = problem.total_covariance(linear, solution.noise)
     left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.spread(known)
     squares, directions = squared_lengths(linear.residuals, left, noise)
-    unmeasured = np.where(problem.observations.has_rotation, 0, 3)
+    unmeasured = 6 - problem.observations.directions
     return squares, np.asarray(directions - unmeasured, dtype=float)
 
 

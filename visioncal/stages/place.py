@@ -13,8 +13,8 @@ import numpy as np
 from visioncal.errors import DegenerateError
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closure import Closure, Edges, distances
-from visioncal.estimation.consensus import agreeing_views
 from visioncal.estimation.observability import FEWEST_VIEWS
+from visioncal.estimation.outliers import inliers
 from visioncal.stages.choose import (
     CLEAR_RATIO,
     Candidates,
@@ -117,8 +117,8 @@ def _edges(
     camera = np.array([it.cam_from_target[0] for it in choice.views])
     data = Closure(mount, robot[rows], camera)
     with one_blas_thread():
-        found = agreeing_views(data)
-    edges = found.fit.edges
+        state = inliers(data.problem).fit.state
+    edges = Edges(state.edges[0], state.edges[1], state.values)
     away_m, away_rad = distances(data.placed(edges.x), edges.z)
     return edges, float(np.median(away_m + LEVER_M * away_rad))
 

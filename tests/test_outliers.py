@@ -7,10 +7,11 @@ import pytest
 from cells import calibrated, error_of
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.closure import Closure, ClosureFit, Edges, fit_closure, solve_closure
-from visioncal.estimation.consensus import agreeing_views, surprises, whole_units
+from visioncal.estimation.closure import Closure
+from visioncal.estimation.outliers import distances, inliers
+from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
-from visioncal.stages.agree import agree
+from visioncal.stages.agree import agree, whole_units
 from visioncal.transforms import exp, invert
 
 WORLDS = {
@@ -38,17 +39,16 @@ def test_just_the_wrong_views_are_left_out(world, wrong):
 def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch):
     fits = []
     monkeypatch.setattr(
-        "visioncal.estimation.consensus.fit_closure",
-        lambda data, edges: fits.append(len(data)) or fit_closure(data, edges),
+        "visioncal.estimation.outliers.fit_problem",
+        lambda problem, *start: fits.append(len(problem)) or fit_problem(problem, *start),
     )
     cell = simulate(replace(WORLDS["fine, given"], views=600, seed=3))
     # Poses that others measured: no covariance, and some are many times worse than most.
     noise = 3e-4 * np.random.default_rng(0).standard_t(3, (600, 6))
-    found = agreeing_views(
-        Closure("eye-in-hand", cell.base_from_flange, cell.cam_from_target @ exp(noise))
-    )
+    seen = cell.cam_from_target @ exp(noise)
+    found = inliers(Closure("eye-in-hand", cell.base_from_flange, seen).problem)
     # All views but one or two belong to the noise, of which the search first left out fifty.
-    assert found.agrees.sum() >= 598
+    assert found.used.sum() >= 598
     assert len(fits) < 25
 
 
@@ -128,16 +128,16 @@ def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
     assert caught.value.culprits == ("the camera's offset from the tool",)
 
 
-def test_a_surprise_is_the_distance_from_what_the_others_predict():
+def test_a_square_is_the_distance_from_what_the_others_predict():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
-    data = replace(known.closure(known.used), shared=None)
-    start = Edges(known.solved.edges.x, known.solved.edges.z, np.zeros(0))
-    fit = fit_closure(data, start)
+    problem = replace(known.closure(known.used), shared=None).problem
     everything = np.ones(12, dtype=bool)
-    inside = surprises(data, everything, fit)
+    fit = fit_problem(problem, replace(known.solved.edges, shared=np.zeros(0)).state)
+    inside = distances(problem, everything, fit)
     for view in (0, 7):
         others = everything.copy()
         others[view] = False
         # The same noise, so that the deletion identity holds to the fit's own curvature.
-        without = ClosureFit(solve_closure(data.subset(others), fit.edges, fit.noise)[0], fit.noise)
-        assert surprises(data, others, without)[view] == pytest.approx(inside[view], rel=1e-3)
+        state, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
+        without = distances(problem, others, Solution(state, fit.noise))
+        assert without.squares[view] == pytest.approx(inside.squares[view], rel=1e-3)

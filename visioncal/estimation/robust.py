@@ -1,0 +1,180 @@
+"""The search for outliers, whatever is fitted: least trimmed squares, then F tests.
+
+It starts from the state under which the nearest half of all units is nearest (least trimmed
+squares: Rousseeuw 1984), found by concentration steps (Rousseeuw and Van Driessen 1999). Then units
+go in and out one at a time, by their deletion residuals (Cook and Weisberg 1982, section 2.2). A
+unit is what is right or wrong as a whole: a view, a touch, a point, an image.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from visioncal.chance import chi2_limit
+from visioncal.types import FloatArray, Mask
+
+Fit = TypeVar("Fit")
+State = TypeVar("State")
+
+# Of the starts, so many are followed up by concentration steps.
+_REFINED, _ROUNDS = 5, 10
+# A sound unit beside the core is missed with this chance, until units are looked at one by one.
+_MISSED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """How far each of m units is from what the others predict.
+
+    Attributes:
+        squares: (m,) squared Mahalanobis distances.
+        directions: (m,) in how many directions the others predict the unit.
+        limit: (m,) largest square that noise may give.
+    """
+
+    squares: FloatArray
+    directions: FloatArray
+    limit: FloatArray
+
+    @property
+    def beyond(self) -> FloatArray:
+        """(m,) the squares as shares of what they may be."""
+        return np.asarray(self.squares / self.limit)
+
+
+class Robust(Protocol[Fit]):
+    """What is fitted to units, some of which may be outliers."""
+
+    def fit(self, used: Mask, start: Fit) -> Fit:
+        """Fits the unknowns and the noise to the units of a mask, from another fit's unknowns."""
+        ...
+
+    def distances(self, used: Mask, fit: Fit) -> Distances:
+        """Gives how far all units are, by a fit of those of a mask."""
+        ...
+
+
+def half_of(count: int) -> int:
+    """How many of some units the start goes by: one more than half."""
+    return (count + 1) // 2 + 1
+
+
+def nearest(away: FloatArray, count: int) -> Mask:
+    """(m,) mask of the nearest units."""
+    mask = np.zeros(len(away), dtype=bool)
+    mask[np.argsort(away)[:count]] = True
+    return mask
+
+
+def trimmed_sum(away: FloatArray, count: int) -> float:
+    """The sum of the distances of the nearest units."""
+    return float(np.sort(away)[:count].sum())
+
+
+def trimmed_start(
+    starts: Iterable[State],
+    away: Callable[[State], FloatArray],
+    solve: Callable[[Mask, State], State],
+    count: int,
+) -> tuple[Mask, State]:
+    """Finds the units that are nearest to what they alone say.
+
+    Args:
+        starts: States to try, of all units and of small sets.
+        away: Gives the distances (m,) of all units under a state, in any unit.
+        solve: Solves from the units of an (m,) mask, near a state.
+        count: How many units are taken for inliers.
+
+    Returns:
+        (m,) mask of these units, and the state that they agree on.
+    """
+    found = [(it, away(it)) for it in starts]
+    found.sort(key=lambda it: trimmed_sum(it[1], count))
+    refined = [_concentrated(*it, away, solve, count) for it in found[:_REFINED]]
+    return min(refined, key=lambda it: it[0])[1:]
+
+
+def _concentrated(
+    state: State,
+    distances: FloatArray,
+    away: Callable[[State], FloatArray],
+    solve: Callable[[Mask, State], State],
+    count: int,
+) -> tuple[float, Mask, State]:
+    """Solves from the nearest units, again and again; the sum of their distances comes first."""
+    mask = nearest(distances, count)
+    for _ in range(_ROUNDS):
+        state = solve(mask, state)
+        distances = away(state)
+        before, mask = mask, nearest(distances, count)
+        if np.array_equal(before, mask):
+            break
+    return trimmed_sum(distances, count), mask, state
+
+
+def widened(
+    search: Robust[Fit], used: Mask, fit: Fit, among: Mask | None = None
+) -> tuple[Mask, Fit]:
+    """Takes all units within reach of the noise, and fits to them, in turn.
+
+    Args:
+        search: What is fitted.
+        used: (m,) units that are inliers.
+        fit: Their fit.
+        among: (m,) the units to choose from, of which most are inliers; the noise is scaled by
+            their median, because that of the nearest half is less than that of all. Where None, all
+            are chosen from, by the noise of those that are used.
+    """
+    fewest = int(used.sum()) if among is not None else 1
+    for _ in range(_ROUNDS):
+        it = search.distances(used, fit)
+        directions = np.maximum(it.directions, 1)
+        shares = it.squares / chi2_limit(0.5, directions)
+        scale = max(float(np.median(shares[used if among is None else among])), 1.0)
+        reached = (it.squares < scale * chi2_limit(_MISSED, directions)) | (it.directions < 1)
+        if among is not None:
+            reached &= among
+        if np.array_equal(reached, used) or reached.sum() < fewest:
+            break
+        used, fit = reached, search.fit(reached, fit)
+    return used, fit
+
+
+def settled(
+    search: Robust[Fit], used: Mask, fit: Fit, fewest: int, suspect: float
+) -> tuple[Mask, Fit]:
+    """Takes units in and out one at a time, with the noise estimated anew, until none moves.
+
+    Of hundreds, one in a hundred goes in at a time.
+
+    Args:
+        search: What is fitted.
+        used: (m,) units that are thought to be inliers.
+        fit: Their fit.
+        fewest: So many are left in.
+        suspect: A unit is judged once more, by noise that it has no say in, where its square comes
+            within this share of the limit.
+    """
+    step = max(len(used) // 100, 1)
+    for _ in range(2 * len(used)):
+        if used.sum() < fewest:
+            break
+        beyond = search.distances(used, fit).beyond
+        outside = np.flatnonzero(~used & (beyond < 1.0))
+        if len(outside):
+            used = used.copy()
+            used[outside[beyond[outside].argsort()[:step]]] = True
+            fit = search.fit(used, fit)
+            continue
+        worst = int(np.where(used, beyond, -1.0).argmax())
+        if beyond[worst] < suspect or used.sum() <= fewest:
+            break
+        fewer = used.copy()
+        fewer[worst] = False
+        again = search.fit(fewer, fit)
+        if search.distances(fewer, again).beyond[worst] <= 1.0:
+            break
+        used, fit = fewer, again
+    return used, fit
