@@ -88,6 +88,13 @@ def test_a_pixel_is_located_in_the_base_of_any_robot(place):
         (told,) = json.loads(done("locate", "-c", place / "out", *words, *names, "--json"))
         (found,) = locate(whole, px, plane, camera="left", robot=robot)
         np.testing.assert_allclose(told["p_base_m"], found.p_base)
+    # In the plane of a board that stands still, it is on that board.
+    board = ("--pixel", "1200,1000", "--plane", "floor")
+    names = ("--camera", "left", "--robot", "b")
+    (told,) = json.loads(done("locate", "-c", place / "out", *board, *names, "--json"))
+    floor = whole.cell.between("base_b", "target_floor").matrix
+    height = (np.array(told["p_base_m"]) - floor[:3, 3]) @ floor[:3, 2]
+    assert abs(height) < 1e-9
     ambiguous = visioncal("locate", "-c", place / "out", *words, "--camera", "left")
     assert ambiguous.status == 2
     assert "several robots (a, b)" in ambiguous.err

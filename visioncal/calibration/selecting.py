@@ -89,6 +89,16 @@ def placed_name(cell: Alignment, choice: Choice, needs: Collection[Part], name: 
     return f"{frames[parent]}_from_{child}"
 
 
+def boards_before(cell: Alignment, choice: Choice, needs: Collection[Part]) -> dict[str, Edge]:
+    """The targets that stand still before a robot's base, as `base_from_target_floor`."""
+    base = _chosen(cell, choice, needs).base
+    return {
+        f"base_from_{it}": cell.between(base, it)
+        for it in frames_of_kind(cell.frames, "target")
+        if not robots_between(cell.frames, base, it)
+    }
+
+
 def _chosen(cell: Alignment, choice: Choice, needs: Collection[Part]) -> Chosen:
     """What is meant, where all stood last; of what is neither needed nor named, nothing."""
     before = {it.before for it in cell.moved}

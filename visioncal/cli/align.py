@@ -68,9 +68,9 @@ def _tell(result: Alignment) -> None:
     console.print(f"the cell's frame is that of {result.reference}")
     for name, edge in result.edges.items():
         x, y, z = 1e3 * edge.transform.translation
+        turned = f" and {edge.sigma_deg:.2g} deg" if edge.oriented else ""
         console.print(
-            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm and "
-            f"{edge.sigma_deg:.2g} deg"
+            f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) mm, sigma {edge.sigma_mm:.2g} mm{turned}"
         )
     for name, levels in result.noise.items():
         words = [

@@ -8,11 +8,12 @@ import numpy as np
 import typer
 from rich.markup import escape
 
+from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages
 from visioncal.cli.dynamics_options import CutoffOption, SessionArgument
 from visioncal.cli.numbers import numbers_in
 from visioncal.dynamics import BaseModel, DynamicModel, FrictionTerms, Gains, drive_gains
-from visioncal.dynamics.run import current_streams, robot_of
+from visioncal.dynamics.run import current_streams, of_one_arm, robot_of
 from visioncal.errors import DataError
 from visioncal.figures import matched, significant
 from visioncal.robot import Inertias, matrices
@@ -41,6 +42,7 @@ def dynamics_gains_command(
         ),
     ] = "0,0,0,0,0,0",
     cutoff_hz: CutoffOption = None,
+    named: RobotName = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
 ) -> None:
     """Find how much torque a drive's current makes, by a body that is known.
@@ -48,10 +50,12 @@ def dynamics_gains_command(
     Exit status 0: there are gains; 2: there are none, for the reason given.
     """
     body = _body(mass_kg, com_mm, inertia)
-    without = Session.load(session)
+    without = of_one_arm(Session.load(session), named)
     robot = robot_of(without)
     empty = current_streams(without, robot, cutoff_hz)
-    full = current_streams(Session.load(loaded), robot, cutoff_hz or empty[0].cutoff_hz)
+    full = current_streams(
+        of_one_arm(Session.load(loaded), named), robot, cutoff_hz or empty[0].cutoff_hz
+    )
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
     found = drive_gains(base, empty, full, body)
     if as_json:

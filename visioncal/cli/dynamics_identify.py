@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from visioncal.calibration import Verdict
+from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages, print_verdict, tell_written
 from visioncal.cli.dynamics_options import (
     AgainstOption,
@@ -67,6 +68,7 @@ def dynamics_identify_command(
         bool,
         typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
     ] = False,
+    robot: RobotName = None,
     as_json: Annotated[bool, typer.Option("--json", help=f"Print {FILE}.")] = False,
 ) -> None:
     """Identify an arm's inertias and friction from the torques of its motions.
@@ -81,6 +83,7 @@ def dynamics_identify_command(
         number_list(gains, "--gains"),
         options,
         rotors,
+        robot,
     )
     run = identify_session(Session.load(session), request)
     identified = run.identified
@@ -101,6 +104,7 @@ def dynamics_validate_command(
     stream: StreamOption = None,
     cutoff_hz: CutoffOption = None,
     gains: GainsOption = None,
+    robot: RobotName = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
 ) -> None:
     """Predict the torques of other motions, and say how near that comes.
@@ -108,7 +112,9 @@ def dynamics_validate_command(
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
     identified = identified_of(against, "validate")
-    request = Request(tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"))
+    request = Request(
+        tuple(stream or ()), "", cutoff_hz, number_list(gains, "--gains"), robot=robot
+    )
     predictions = validate_session(Session.load(session), identified, request)
     if as_json:
         typer.echo(json.dumps([_figures(it) for it in predictions], indent=2))

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from visioncal.cli.choosing import RobotName
 from visioncal.cli.dynamics_options import (
     AgainstOption,
     CutoffOption,
@@ -33,6 +34,7 @@ def dynamics_payload_command(
             "--same-friction", help="Friction is as it was without the payload, however it presses."
         ),
     ] = False,
+    robot: RobotName = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print figures as JSON.")] = False,
 ) -> None:
     """Weigh what the arm carries, by how much more its drives gave than without it.
@@ -41,7 +43,7 @@ def dynamics_payload_command(
     """
     identified = identified_of(against, "payload")
     torque_nm_a = number_list(gains, "--gains")
-    request = Request(tuple(stream or ()), "", cutoff_hz, torque_nm_a)
+    request = Request(tuple(stream or ()), "", cutoff_hz, torque_nm_a, robot=robot)
     loaded = conditioned_streams(Session.load(session), identified, request)
     found = estimate_payload(identified, loaded, friction_changes=not same_friction)
     if as_json:

@@ -11,7 +11,8 @@ import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, Edge
+from visioncal.calibration.selecting import boards_before
 from visioncal.cli.choosing import CameraName, RobotName
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.numbers import numbers_in
@@ -134,7 +135,9 @@ def locate_command(
             flange = _flange_of(session, _chosen(session, view), known)
         elif source is not None:
             check_size(Eye.of(known), read_image(source), source.name)
-        found = _by_plane(known, pixel, plane, plane_sigma or 0.0, flange, sigma_px)
+        cell = result.cell
+        boards = {} if cell is None else boards_before(cell, Choice(camera, robot), EYE)
+        found = _by_plane(known, boards, pixel, plane, plane_sigma or 0.0, flange, sigma_px)
     else:
         refuse_given({"--plane": plane, "--plane-sigma-mm": plane_sigma}, "it is for --pixel")
         origin_m = 1e-3 * np.array(numbers_in(point or "0,0,0", "--point-mm", "x,y,z"))
@@ -227,6 +230,7 @@ def _flange_of(
 
 def _by_plane(
     calibration: Calibration,
+    boards: Mapping[str, Edge],
     pixels: Sequence[str],
     plane: str | None,
     sigma_mm: float,
@@ -240,7 +244,7 @@ def _by_plane(
             next_step=f"It is {FORMS}.",
         )
     px = np.array([numbers_in(it, "--pixel", "u,v") for it in pixels])
-    declared, told = plane_of(plane, sigma_mm, calibration)
+    declared, told = plane_of(plane, sigma_mm, calibration, boards)
     places = locate(calibration, px, declared, flange, sigma_px=sigma_px)
     return tuple(
         _Found(

@@ -1,8 +1,10 @@
 """The plane that features lie in, as an option says it."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, Edge
 from visioncal.cli.numbers import numbers_in
 from visioncal.errors import DataError
 from visioncal.files import did_you_mean, some_of
@@ -16,13 +18,16 @@ FORMS = (
 _LEAD = "base_from_"
 
 
-def plane_of(words: str, sigma_mm: float, calibration: Calibration) -> tuple[Plane, str]:
+def plane_of(
+    words: str, sigma_mm: float, calibration: Calibration, boards: Mapping[str, Edge]
+) -> tuple[Plane, str]:
     """Reads a plane.
 
     Args:
         words: As in `FORMS`; of a frame's name, `base_from_` may be left out.
         sigma_mm: How well its height is known [mm].
         calibration: Whose frames can be named.
+        boards: What else can be: targets of a whole cell by the transforms that place them.
 
     Returns:
         The plane, and what to know of its frame before it is trusted; empty where nothing is.
@@ -38,26 +43,33 @@ def plane_of(words: str, sigma_mm: float, calibration: Calibration) -> tuple[Pla
         normal = np.array([nx, ny, nz])
         foot = 1e-3 * product * normal / max(float(normal @ normal), 1e-300)
         return Plane.through(normal, foot, 1e-3 * sigma_mm), ""
-    return _of_frame(frame, _height_m(height), sigma_mm, calibration)
+    return _of_frame(frame, _height_m(height), sigma_mm, calibration, boards)
 
 
 def _of_frame(
-    words: str, z_m: float, sigma_mm: float, calibration: Calibration
+    words: str,
+    z_m: float,
+    sigma_mm: float,
+    calibration: Calibration,
+    boards: Mapping[str, Edge],
 ) -> tuple[Plane, str]:
-    planes = [it for it in calibration.placed if it.startswith(_LEAD) and it != f"{_LEAD}cam"]
-    name = words if words.startswith(_LEAD) else f"{_LEAD}{words}"
-    if name not in planes:
+    placed = {**calibration.placed, **boards}
+    planes = [it for it in placed if it.startswith(_LEAD) and it != f"{_LEAD}cam"]
+    names = (words, f"{_LEAD}{words}", f"{_LEAD}target_{words}")
+    name = next((it for it in names if it in planes), "")
+    if not name:
         there = some_of(planes) if planes else "none yet; visioncal fixture places them"
         raise DataError(
             f"--plane is {words[:80]!r}, and no frame in the base is called that; there are: "
             f"{there}.",
             culprits=["--plane"],
-            next_step=did_you_mean(name, planes) or f"A plane is {FORMS}.",
+            next_step=did_you_mean(f"{_LEAD}{words.removeprefix(_LEAD)}", planes)
+            or f"A plane is {FORMS}.",
         )
     told = ""
     if name in calibration.frames and calibration.frames[name].verdict.status == "bad":
         told = f"The verdict of {name} is bad: {calibration.frames[name].verdict.reasons[0]}"
-    return Plane.of_frame(calibration.placed[name], z_m, 1e-3 * sigma_mm), told
+    return Plane.of_frame(placed[name], z_m, 1e-3 * sigma_mm), told
 
 
 def _height_m(words: str) -> float:

@@ -15,6 +15,8 @@ from visioncal.errors import DataError, DegenerateError
 from visioncal.files import did_you_mean
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
+from visioncal.session.choosing import ARM, Choice
+from visioncal.session.selecting import select
 from visioncal.session.single import check_one_of_each
 from visioncal.types import FloatArray
 
@@ -36,6 +38,7 @@ class Request:
         options: What is estimated.
         rotors: Whether that are rotors, too; None where the torques shall tell: those behind the
             gears have none in them.
+        robot: Which robot of a whole cell; its streams are those that have or begin with its name.
     """
 
     streams: tuple[str, ...] = ()
@@ -44,6 +47,7 @@ class Request:
     gains_nm_a: tuple[float, ...] = ()
     options: Options = field(default_factory=Options)
     rotors: bool | None = None
+    robot: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +94,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
         DegenerateError: The motion cannot tell all base parameters.
     """
     request = Request() if request is None else request
+    session = of_one_arm(session, request.robot)
     robot = robot_of(session)
     names = [it for it in torque_streams(session, request.streams) if it != request.validate_on]
     if not names:
@@ -143,7 +148,7 @@ def conditioned_streams(
     Raises:
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
     """
-    robot = identified.robot
+    robot, session = identified.robot, of_one_arm(session, request.robot)
     names = torque_streams(session, request.streams)
     recorded = [_read(session, robot, it, request) for it in names]
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
@@ -177,6 +182,15 @@ def current_streams(
             next_step="Drives whose torques are told need no gains: visioncal dynamics identify.",
         )
     return [condition(it, cutoff_hz) for it in recorded]
+
+
+def of_one_arm(session: Session, robot: str | None = None) -> Session:
+    """Takes one robot with its streams out of a session of several.
+
+    Raises:
+        DataError: There is no such robot, or several are meant.
+    """
+    return select(session, Choice(robot=robot), ARM)
 
 
 def robot_of(session: Session) -> Robot:

@@ -119,7 +119,8 @@ def _of_whole(
     named = selection.robot is not None or selection.target is not None
     if not named and not isinstance(form, ArmFormat):
         return whole.cell, selection
-    needs = PARTS if selection.target is not None else EYE
+    of_arm = isinstance(form, ArmFormat) or form.holds in ("tool", "fixture")
+    needs = PARTS if selection.target is not None else ARM if of_arm else EYE
     choice = Choice(selection.camera, selection.robot, selection.target)
     chosen = whole.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
     return chosen, replace(selection, camera=None, robot=None, target=None)

@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -50,6 +51,16 @@ class Fields:
 
     def __len__(self) -> int:
         return len(self.places)
+
+    def rows(self, chosen: Sequence[int]) -> Self:
+        """The same of some rows alone."""
+        return replace(
+            self,
+            places=tuple(self.places[it] for it in chosen),
+            numbers={name: it[list(chosen)] for name, it in self.numbers.items()},
+            texts={name: tuple(it[at] for at in chosen) for name, it in self.texts.items()},
+            views=tuple(self.views[it] for it in chosen) if self.views else (),
+        )
 
     def find(self, name: str) -> str:
         """Finds the full name of a field, which may be given without what stands before its point.

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.conventions import POSE_FORMS, UNITS_M
 from visioncal.errors import DataError
-from visioncal.files import some_of
+from visioncal.files import did_you_mean, some_of
 from visioncal.formats.columns import foreign_from, read_fields, view_numbers
 from visioncal.formats.fields import Fields, unnamed_columns
 from visioncal.formats.poses import ROBOT_KEYS, check_radians, pose_names
@@ -30,7 +30,7 @@ def read_touches(
         path: A table with the columns of views.csv, `kind` and `point`; of these, only the pose or
             the joints have to be there. Or a session, whose rows have them.
         wishes: How poses and joints are written, where the columns do not say.
-        robot: Which robot of a whole cell's session is meant.
+        robot: Which robot of a whole cell is meant, where a session or a column `robot` has more.
         positions: Whether positions will do where the table has no rotations: x_m, y_m, z_m, or
             x, y, z with the unit given.
 
@@ -39,7 +39,7 @@ def read_touches(
     """
     if path.is_dir() or path.suffix.lower() == ".rrd":
         return touches_of(Session.load(path), robot)
-    fields = read_fields(path)
+    fields = _of_robot(read_fields(path), robot)
     unnamed = unnamed_columns(fields)["robot"]
     named = pose_names(fields, wishes.robot.names, unnamed, ROBOT_KEYS, ())
     if positions and (not named or (wishes.robot.names and len(named) == 3)):
@@ -55,6 +55,28 @@ def read_touches(
     foreign = foreign_from(fields, wishes)
     check_radians(foreign.robot, wishes.robot, "robot", guesses=False)
     return _rows_of(fields, path, foreign.robot.poses(), foreign.joints_rad)
+
+
+def _of_robot(fields: Fields, robot: str | None) -> Fields:
+    """The rows of one robot, where a column tells whose each is."""
+    named = fields.texts.get("robot", ())
+    known = list(dict.fromkeys(named))
+    if len(known) < 2:
+        return fields
+    if robot is None:
+        raise DataError(
+            f"{fields.name} has touches of several robots ({some_of(known)}), and which is meant "
+            "is not said.",
+            culprits=["--robot"],
+            next_step=f"Name one: --robot {known[0]}.",
+        )
+    if robot not in known:
+        raise DataError(
+            f"{fields.name} has no touches of robot {robot!r}: its robots are {some_of(known)}.",
+            culprits=["--robot"],
+            next_step=did_you_mean(robot, known),
+        )
+    return fields.rows([at for at, it in enumerate(named) if it == robot])
 
 
 def _rows_of(

@@ -61,12 +61,21 @@ def select(
         columns,
         cells,
         session.images,
-        target_document=boards if boards is None or not session.targets else boards[target],
+        target_document=boards if boards is None or not session.targets else boards.get(target),
         robot_document=models.get(chosen.robot),
         corners=None if table is None else table.of_views(tuple(rows)).without_targets(),
     )
-    others = {it or "robot" for it in session.robots if it != chosen.robot}
-    return found.with_streams({k: it for k, it in session.streams.items() if k not in others})
+    mine = {None, chosen.robot or "robot"}
+    return found.with_streams(
+        {name: it for name, it in session.streams.items() if _robot_of(session, name) in mine}
+    )
+
+
+def _robot_of(session: "Session", stream: str) -> str | None:
+    """The robot whose name a stream has or begins with, as `a` and `a_excite`; None for none."""
+    names = (it or "robot" for it in session.robots)
+    fitting = [it for it in names if stream == it or stream.startswith(f"{it}_")]
+    return max(fitting, key=len, default=None)
 
 
 def _rows(
