@@ -153,6 +153,85 @@ def test_torques_are_identified_and_a_load_is_weighed(place):
     assert np.abs(centre).max() < 4.0
 
 
+@pytest.fixture(scope="module")
+def cell(place):
+    """A whole cell with touches and torques, calibrated."""
+    folder, out = place / "whole", place / "whole-out"
+    done("simulate", folder, "--cell", "two-arms", "--no-images", "--touches", "--torques")
+    done("calibrate", folder, "-o", out)
+    return folder, out
+
+
+def test_tools_and_fixtures_of_every_robot_of_a_cell_are_found_by_touches(cell):
+    folder, out = cell
+    unnamed = visioncal("tcp", folder / "touches.csv", "-o", folder / "frames.json")
+    assert unnamed.status == 2
+    assert "touches of several robots (a, b)" in unnamed.err
+    drawing = ("--cad", folder / "cad.csv")
+    for robot in ("a", "b"):
+        into = ("-c", out, "--robot", robot, "--name")
+        done("tcp", folder / "touches.csv", *into, f"tool{robot}")
+        tool = ("--tool", f"tool{robot}")
+        done("fixture", folder / "points.csv", *drawing, *tool, *into, f"jig{robot}")
+        done("fixture", folder / "features.csv", *tool, *into, f"plate{robot}")
+        found, (_, edges) = Calibration.load(out).frames, truth_of(folder)
+        for name, truth in (
+            (f"flange_{robot}_from_tool{robot}", f"flange_{robot}_from_tool"),
+            (f"base_{robot}_from_jig{robot}", f"base_{robot}_from_fixture"),
+            (f"base_{robot}_from_plate{robot}", f"base_{robot}_from_fixture"),
+        ):
+            assert misfit(found[name].edge, edges[truth]) < MOST, name
+    # A tool needs no camera: which robot is enough.
+    assert "set_tcp" in done("export", out, "--to", "ur-tcp", "--robot", "b")
+
+
+def test_torques_of_one_robot_of_a_cell_are_identified(cell, place):
+    (folder, _), loaded, out = cell, place / "whole-loaded", place / "arm-b"
+    assert "several robots (a, b)" in visioncal("dynamics", "identify", folder).err
+    some = ("--cell", "two-arms", "--no-images", "--views", 2, "--torques", "--payload-kg", 2)
+    done("simulate", loaded, *some)
+    one = ("--robot", "b")
+    done("dynamics", "identify", folder, *one, "--validate-on", "b_fresh", "-o", out)
+    found, (content, _) = Identified.load(out), truth_of(folder)
+    assert [it.label for it in found.streams] == ["streams/b_excite.csv", "streams/b_sweeps.csv"]
+    assert content["dynamics"]["a"]["bodies"] != content["dynamics"]["b"]["bodies"]
+    weighed = json.loads(done("dynamics", "payload", loaded, "--against", out, *one, "--json"))
+    assert weighed["mass_kg"] == pytest.approx(2.0, abs=4.0 * weighed["mass_sigma_kg"])
+    # The arm of the other was built otherwise, which looks like a load.
+    other = ("--robot", "a", "--json")
+    mistaken = json.loads(done("dynamics", "payload", loaded, "--against", out, *other))
+    assert abs(mistaken["mass_kg"] - 2.0) > 4.0 * weighed["mass_sigma_kg"]
+
+
+def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_knocked(place):
+    first, again = place / "whole-1", place / "whole-2"
+    some = ("--cell", "two-arms", "--no-images", "--views", 5, "--arm-sigma-mm", 0.3)
+    done("simulate", first, *some)
+    done("simulate", again, *some, "--recording", 1, "--camera-moved-mm", 2)
+    (before, edges), (after, other) = truth_of(first), truth_of(again)
+    assert all(np.array_equal(edges[name], other[name]) for name in edges)
+    assert before["arms"] == after["arms"]
+    assert before["arms"]["a"]["a"] != before["arms"]["b"]["a"]
+    assert before["base_from_flange"] != after["base_from_flange"]
+    assert after["moved"] == [{"frame": "cam_left", "from_stop": 0}]
+
+
+@pytest.mark.parametrize("read", ["points", "probe"])
+def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
+    folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
+    done(
+        "simulate", folder, "--cell", "two-arms", "--no-images", "--views", 8, "--instrument", read
+    )
+    done("calibrate", folder, "-o", out)
+    found, (_, edges) = Alignment.load(out), truth_of(folder)
+    truth = invert(edges["base_a"]) @ edges["instrument_tracker"]
+    assert misfit(found.between("base_a", "instrument_tracker"), truth) < MOST
+    for robot in ("a", "b"):
+        edge = found.edges[f"flange_{robot}_from_point_{robot}1"]
+        among = slice(None) if read == "probe" else slice(3, 6)
+        assert misfit(edge, edges[f"point_{robot}1"], among) < MOST
+
+
 def test_currents_stand_for_torques_by_gains_that_the_truth_has(place):
     done("simulate", place / "motors", "--torques", "--currents")
     content, _ = truth_of(place / "motors")
@@ -238,7 +317,10 @@ def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, t
     [
         (("--cell", "two-arms", "--board", "charuco"), "--board goes with"),
         (("--cell", "to-arms"), "Did you mean two-arms"),
-        (("--sweep", "--touches"), "--touches goes with a plain cell of one robot, not with"),
+        (("--cell", "two-arms", "--sweep"), "and --cell: each makes a session of its own"),
+        (("--cell", "two-arms", "--payload-kg", 1), "--payload-kg goes with"),
+        (("--cell", "camera-and-tracker", "--instrument", "point"), "instruments or points"),
+        (("--sweep", "--touches"), "goes with a plain cell of one robot or --cell, not"),
         (("--clock-offset-ms", 3), "--clock-offset-ms goes with --sweep"),
         (("--torques", "--instrument", "probe"), "each makes a session of its own kind"),
         (("--torques", "--payload-kg", 1, "--payload-kg", 2), "one load"),

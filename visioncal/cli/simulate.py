@@ -1,15 +1,13 @@
 """`visioncal simulate`."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
-import numpy as np
 import typer
 
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.simulated import given_for
-from visioncal.errors import DataError
+from visioncal.cli.simulated_cell import CENTRE_M, Along, Read, exercise_options, whole_cell
 from visioncal.simulation import (
     ARMS,
     CAMERAS,
@@ -23,32 +21,21 @@ from visioncal.simulation import (
     cell_names,
     charuco_target,
     checkerboard_target,
-    read_cell,
     simulate,
-    simulate_network,
     simulate_warm_up,
     touch,
     truth_path,
-    write_network,
     write_session,
     write_sweep,
     write_touches,
     write_warm_up,
 )
 from visioncal.simulation import sweep as swept
-from visioncal.simulation.dynamics import Body
-from visioncal.simulation.exercise import ExerciseOptions, Senses, write_exercise
+from visioncal.simulation.exercise import write_exercise
 from visioncal.simulation.records import truth_of, write_truth
 from visioncal.simulation.tracked import THREE, Tracked, tracked, write_tracked
 from visioncal.types import CameraMount
 
-Read: TypeAlias = Literal["point", "points", "probe"]
-
-# Where the centre of a simulated load is, in the flange's frame [m].
-_CENTRE_M = (0.0, 0.0, 0.1)
-# Half of the side of a load that is a cube [m], and torque for a current of each drive [N m/A].
-_HALF_M = 0.05
-_GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 _BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
 
 
@@ -114,14 +101,25 @@ def simulate_command(
     ] = None,
     instrument: Annotated[
         Read | None,
-        typer.Option(help="A tracker that reads one point or three on the flange, or a probe."),
+        typer.Option(
+            help="A tracker that reads one point or three on the flange, or a probe; of a whole "
+            "cell on every flange."
+        ),
     ] = None,
     torques: Annotated[
-        bool, typer.Option("--torques", help="Streams of a moving arm's torques, without views.")
+        bool,
+        typer.Option(
+            "--torques",
+            help="Streams of a moving arm's torques, without views; of a whole cell beside its "
+            "views.",
+        ),
     ] = False,
     touches: Annotated[
         bool,
-        typer.Option("--touches", help="Also touches of a tool and a fixture, in touches.csv ..."),
+        typer.Option(
+            "--touches",
+            help="Also touches of a tool and a fixture by every robot, in touches.csv ...",
+        ),
     ] = False,
     currents: Annotated[
         bool,
@@ -144,7 +142,8 @@ def simulate_command(
         ),
     ] = 0,
     camera_moved_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="How far the camera was knocked [mm].")
+        float,
+        typer.Option(min=0.0, max=100.0, help="How far the camera was knocked [mm]; the first."),
     ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
@@ -164,19 +163,20 @@ def simulate_command(
         wrong_views=wrong_views,
         board_scale=board_scale,
         compliance_rad_per_nm=_compliance(robot, stiffness_knm),
-        payloads=tuple(Payload(it, _CENTRE_M) for it in payload_kg or ()),
+        payloads=tuple(Payload(it, CENTRE_M) for it in payload_kg or ()),
         second=Second() if second_board else None,
         recording=recording,
         camera_moved_m=1e-3 * camera_moved_mm,
         seed=seed,
     )
     if cell is not None:
-        _whole_cell(cell, folder, options, given, images=images)
+        along = Along(touches, instrument, torques, currents, payload_kg)
+        whole_cell(cell, folder, options, given, along, images=images)
     elif instrument is not None:
         stops = views if "views" in given else Tracked.stops
         write_tracked(tracked(_read_by(instrument, options, stops)), folder)
     elif torques:
-        write_exercise(_exercise(robot, payload_kg, seed, currents=currents), folder)
+        write_exercise(exercise_options(robot, payload_kg, seed, currents=currents), folder)
     elif warm_up:
         how = WarmUpOptions(options, round=Round(first=views))
         write_warm_up(simulate_warm_up(how), folder, temperatures=not currents)
@@ -200,36 +200,10 @@ def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) 
             images=images,
         )
     if touched is not None:
-        write_touches(touched, folder)
+        write_touches({"": touched}, folder)
         truth = truth_of(cell)
-        truth["transforms"] |= touched.transforms
+        truth["transforms"] |= touched.transforms()
         write_truth(folder, truth)
-
-
-def _whole_cell(
-    name: str, folder: Path, options: CellOptions, given: frozenset[str], *, images: bool
-) -> None:
-    """Writes a whole cell; what the user gives comes before what is described."""
-    described = read_cell(name)
-    changes = {"views": "stops", "wrong_views": "stray_images", "seed": "seed"}
-    described = replace(
-        described, **{own: getattr(options, it) for it, own in changes.items() if it in given}
-    )
-    cell = simulate_network(described)
-    if not (cell.sights or cell.readings):
-        raise DataError(
-            f"--cell {name}: nothing in this cell is seen or read.",
-            culprits=[name],
-            next_step="Give it a camera that sees a target, or an instrument and points.",
-        )
-    with shown_progress(quiet=False) as told:
-        count = len(cell.sights)
-        write_network(
-            cell,
-            folder,
-            lambda share: told("render", round(share * count), count),
-            seen="images" if images else "poses",
-        )
 
 
 def _read_by(instrument: Read, options: CellOptions, stops: int) -> Tracked:
@@ -247,23 +221,6 @@ def _read_by(instrument: Read, options: CellOptions, stops: int) -> Tracked:
         payloads=options.payloads,
         seed=options.seed,
     )
-
-
-def _exercise(
-    robot: str, payload_kg: list[float] | None, seed: int, *, currents: bool
-) -> ExerciseOptions:
-    """An arm's motions, empty or with a cube on its flange."""
-    loads = payload_kg or [0.0]
-    if len(loads) > 1:
-        raise DataError(
-            f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
-            culprits=["--payload-kg"],
-            next_step="Make a session of each load, with the same --seed.",
-        )
-    inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
-    load = Body(loads[0], np.array(_CENTRE_M), inertia) if loads[0] else None
-    senses = Senses(gains_nm_a=_GAINS_NM_A if currents else ())
-    return ExerciseOptions(robot, load, senses, seed=seed)
 
 
 def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:

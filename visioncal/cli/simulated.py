@@ -15,11 +15,15 @@ _SINGLE = frozenset(
     )
 )
 _ARM = frozenset(("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"))
+# What a whole cell takes along, which are kinds of their own without one.
+_ALONG = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
     "sweep": _SINGLE | {"clock_offset_ms"},
     "warm_up": _SINGLE | {"currents"},
-    "cell": frozenset(("views", "wrong_views", "images", "seed")),
+    "cell": _ARM
+    | _ALONG
+    | {"views", "wrong_views", "images", "seed", "recording", "camera_moved_mm", "touches"},
     "instrument": _ARM | {"views", "robot", "stiffness_knm", "payload_kg", "seed"},
     "torques": frozenset(("robot", "payload_kg", "currents", "seed")),
 }
@@ -34,6 +38,8 @@ def given_for(context: typer.Context) -> frozenset[str]:
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = frozenset(name for name, it in sources.items() if it and it.name == "COMMANDLINE")
     kinds = [it for it in _TAKES if context.params.get(it)]
+    if "cell" in kinds:
+        kinds = [it for it in kinds if it not in _ALONG]
     if len(kinds) > 1:
         named = [_option(it) for it in kinds]
         raise DataError(
@@ -42,7 +48,10 @@ def given_for(context: typer.Context) -> frozenset[str]:
             next_step="Give one of them, and make the others into folders of their own.",
         )
     kind = kinds[0] if kinds else ""
-    for unfit in sorted(given - _TAKES[kind] - {"folder", kind}):
+    takes = _TAKES[kind]
+    if kind == "cell" and context.params.get("torques"):
+        takes = takes | {"currents", "payload_kg"}
+    for unfit in sorted(given - takes - {"folder", kind}):
         fit = [_option(it) for it, taken in _TAKES.items() if unfit in taken]
         raise DataError(
             f"{_option(unfit)} goes with {' or '.join(fit)}, not with {_option(kind)}.",

@@ -47,7 +47,7 @@ from visioncal.simulation.render import Scene, prepare_scene, render, render_vie
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.seen import Network, Sight
 from visioncal.simulation.sweep import Sweep, SweepOptions, sweep
-from visioncal.simulation.touching import touch, write_touches
+from visioncal.simulation.touching import touch, touch_network, write_touches
 from visioncal.simulation.warmup import (
     Heat,
     Round,
@@ -107,6 +107,7 @@ __all__ = [
     "sweep",
     "sweep_session",
     "touch",
+    "touch_network",
     "truth_path",
     "ur_arm",
     "wide_camera",

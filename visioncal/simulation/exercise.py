@@ -137,16 +137,25 @@ class ExerciseOptions:
     seed: int = 0
 
 
-def write_exercise(options: ExerciseOptions, folder: Path | str) -> Path:
-    """Writes the streams `excite`, `sweeps` and `fresh` of an arm, and its truth beside them.
+@dataclass(frozen=True, eq=False)
+class Exercised:
+    """What a controller recorded.
 
-    Returns:
-        The session's folder.
+    Attributes:
+        streams: The motions `excite`, `sweeps` and `fresh`.
+        arm: The arm as it was built, without its load.
+    """
+
+    streams: Mapping[str, Stream]
+    arm: DynamicArm
+
+
+def exercise(options: ExerciseOptions) -> Exercised:
+    """Moves an arm, and records it.
 
     Raises:
-        DataError: Nothing is known of the arm, or the folder cannot be written.
+        DataError: Nothing is known of the arm.
     """
-    folder = Path(folder)
     empty = real_dynamics(options.robot, np.random.default_rng([options.seed, 0]), stribeck=True)
     built = empty if options.load is None else empty.carrying(options.load)
     rng, count, rate = np.random.default_rng([options.seed, 1]), len(built.bodies), options.rate_hz
@@ -156,8 +165,21 @@ def write_exercise(options: ExerciseOptions, folder: Path | str) -> Path:
         "fresh": multi_sine(count, rng, rate_hz=rate),
     }
     streams = {name: record(built, it, rng, options.senses) for name, it in motions.items()}
-    exercise_session(options.robot, streams, folder.name).save(folder)
-    write_truth(folder, {"schema": 1, "options": asdict(options), "arm": asdict(empty)})
+    return Exercised(streams, empty)
+
+
+def write_exercise(options: ExerciseOptions, folder: Path | str) -> Path:
+    """Writes the streams `excite`, `sweeps` and `fresh` of an arm, and its truth beside them.
+
+    Returns:
+        The session's folder.
+
+    Raises:
+        DataError: Nothing is known of the arm, or the folder cannot be written.
+    """
+    folder, done = Path(folder), exercise(options)
+    exercise_session(options.robot, done.streams, folder.name).save(folder)
+    write_truth(folder, {"schema": 1, "options": asdict(options), "arm": asdict(done.arm)})
     return folder
 
 

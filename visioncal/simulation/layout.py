@@ -100,17 +100,21 @@ class PointAt:
 class InstrumentAt:
     """An instrument that stands upright in the cell and reads every point at every stop.
 
+    Where it reads the rotation of a point, too, that is a probe's, whose axes are the flange's.
+
     Attributes:
         name: What the session calls it.
         place_m: Where it stands [m].
         turn_rad: How far it is turned about the vertical [rad].
         sigma_m: Noise of its readings, per axis [m].
+        sigma_rad: Noise of rotations that it reads, too [rad]; 0 where it reads none.
     """
 
     name: str
     place_m: tuple[float, float, float]
     turn_rad: float = 0.0
     sigma_m: float = 1.5e-5
+    sigma_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -163,6 +167,7 @@ class NetworkOptions:
         moved: What is pushed in the course of the recording.
         swapped_rows: Pairs of rows of one camera and board whose images are exchanged.
         stray_images: Rows whose image is from another stop.
+        recording: Which recording of the same cell: each has stops and noise of its own.
         seed: Of everything random; each source of randomness has a stream of its own.
     """
 
@@ -178,6 +183,7 @@ class NetworkOptions:
     moved: tuple[Moved, ...] = ()
     swapped_rows: int = 0
     stray_images: int = 0
+    recording: int = 0
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DataError
 from visioncal.session import frame_name
@@ -202,10 +203,11 @@ def _read(
     for instrument in cell.options.instruments:
         instrument_from_cell = invert(where[frame_name("instrument", instrument.name)][stop])
         for point in cell.options.points:
-            place = where[frame_name("point", point.name)][stop, :3, 3]
             view = first_view + len(found)
-            noise = stream(cell.options, Stream.READINGS, view).standard_normal(3)
-            at = instrument_from_cell[:3, :3] @ place + instrument_from_cell[:3, 3]
-            at_m = at + instrument.sigma_m * noise
-            found.append(Reading(view, stop, instrument.name, point.name, at_m))
+            rng = stream(cell.options, Stream.READINGS, view)
+            read = instrument_from_cell @ where[frame_name("point", point.name)][stop]
+            read[:3, 3] += instrument.sigma_m * rng.standard_normal(3)
+            turn = instrument.sigma_rad * rng.standard_normal(3)
+            read[:3, :3] = read[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+            found.append(Reading(view, stop, instrument.name, point.name, read))
     return found

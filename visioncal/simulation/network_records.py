@@ -10,10 +10,12 @@ import numpy as np
 from visioncal.session import MemoryImages, Session, View, frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell
+from visioncal.simulation.exercise import Exercised
 from visioncal.simulation.layout import CameraAt
 from visioncal.simulation.network import first_pushed
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import (
+    POSE,
     noisy_pose,
     pose_row,
     target_document,
@@ -24,6 +26,7 @@ from visioncal.simulation.render import Scene, encode, prepare_scene, render
 from visioncal.simulation.second import Shown
 from visioncal.simulation.seen import Network, Sight, board_named, camera_named, sheet_named
 from visioncal.simulation.standing import Stream, stream
+from visioncal.simulation.touching import Touching, write_touches
 from visioncal.types import FloatArray
 
 # What rows have of what was seen: rendered images, the names of images that are not there, or the
@@ -37,6 +40,8 @@ def write_network(
     progress: Callable[[float], None] | None = None,
     *,
     seen: Seen = "images",
+    touched: Mapping[str, Touching] | None = None,
+    exercised: Mapping[str, Exercised] | None = None,
 ) -> Path:
     """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
 
@@ -45,6 +50,8 @@ def write_network(
         folder: The session's folder; it must not hold anything yet.
         progress: Called with the share of the images that is done, 0 to 1.
         seen: What rows have of what was seen.
+        touched: What its robots touched, by their names.
+        exercised: What their controllers recorded of motions; streams are `ROBOT_MOTION`.
 
     Returns:
         The session's folder.
@@ -53,8 +60,21 @@ def write_network(
         DataError: The folder cannot be written, or a target cannot be drawn.
     """
     folder = Path(folder)
-    network_session(cell, folder.name, progress, seen=seen).save(folder)
-    write_truth(folder, _truth_of(cell))
+    streams = {
+        f"{robot}_{motion}": it
+        for robot, done in (exercised or {}).items()
+        for motion, it in done.streams.items()
+    }
+    session = network_session(cell, folder.name, progress, seen=seen)
+    session.with_streams(streams).save(folder)
+    truth = _truth_of(cell)
+    if touched:
+        write_touches(touched, folder)
+        for robot, it in touched.items():
+            truth["transforms"] |= it.transforms(robot)
+    if exercised:
+        truth["dynamics"] = {robot: asdict(it.arm) for robot, it in exercised.items()}
+    write_truth(folder, truth)
     return folder
 
 
@@ -71,11 +91,12 @@ def network_session(
     """
     sights = [it for it in cell.sights if seen != "poses" or it.stop >= 0]
     views = {it.view: _row(cell, it, seen) for it in sights}
+    turned = {it.name for it in cell.options.instruments if it.sigma_rad}
     for reading in cell.readings:
         robot = cell.teller(frame_name("point", reading.point))
-        numbers = dict(
-            zip(("meas_x_m", "meas_y_m", "meas_z_m"), reading.at_m.tolist(), strict=True)
-        )
+        keys = POSE if reading.instrument in turned else POSE[:3]
+        read = pose_row(reading.instrument_from_point)
+        numbers = {f"meas_{key}": read[key] for key in keys}
         text = {"instrument": reading.instrument, "point": reading.point}
         views[reading.view] = _view(cell, reading.view, reading.stop, robot, numbers, text)
     for number, stop, robot in cell.told:
@@ -112,7 +133,10 @@ def _document(cell: Network, name: str) -> dict[str, Any]:
         "frames": {it: on for it, on in cell.parents.items() if not it.startswith("base")},
     }
     if options.instruments:
-        document["instruments"] = {it.name: {"sigma_m": it.sigma_m} for it in options.instruments}
+        document["instruments"] = {
+            it.name: {"sigma_m": it.sigma_m} | ({"sigma_rad": it.sigma_rad} if it.sigma_rad else {})
+            for it in options.instruments
+        }
     return document
 
 
@@ -230,7 +254,7 @@ def _truth_of(cell: Network) -> dict[str, Any]:
     return {
         "schema": 1,
         "parents": cell.parents,
-        "transforms": cell.transforms,
+        "transforms": dict(cell.transforms),
         "wrong_views": cell.wrong_views,
         "moved": [
             {"frame": it.frame, "from_stop": first_pushed(cell.options, it)}

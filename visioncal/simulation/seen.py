@@ -41,13 +41,16 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What an instrument read of a point at a stop: (3,) in the instrument's frame [m]."""
+    """What an instrument read of a point at a stop: (4, 4) in the instrument's frame.
+
+    The rotation counts where the instrument reads any.
+    """
 
     view: int
     stop: int
     instrument: str
     point: str
-    at_m: FloatArray
+    instrument_from_point: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

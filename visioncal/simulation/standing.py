@@ -42,11 +42,17 @@ class Stream(IntEnum):
     SHARE = 107
     LENS = 108
     READINGS = 109
+    TOUCHES = 110
+
+
+# What another recording of the same cell has in common with it.
+_KEPT = (Stream.MOUNTING, Stream.ARM, Stream.LENS)
 
 
 def stream(options: NetworkOptions, purpose: Stream, *index: int) -> np.random.Generator:
     """The generator of one source of randomness; `index` tells things apart."""
-    return np.random.default_rng([options.seed, int(purpose), *index])
+    again = (options.recording,) if options.recording and purpose not in _KEPT else ()
+    return np.random.default_rng([options.seed, int(purpose), *again, *index])
 
 
 def sheet_of(board: BoardAt) -> Sheet:

@@ -2,8 +2,9 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DataError
 from visioncal.files import write_atomically
-from visioncal.simulation.arms import forward, inverse, reach_m
+from visioncal.session import frame_name
+from visioncal.simulation import standing
+from visioncal.simulation.arms import Arm, forward, inverse, reach_m
 from visioncal.simulation.cell import (
     LEAST_DEXTERITY,
     Cell,
@@ -20,7 +23,9 @@ from visioncal.simulation.cell import (
     lowest_m,
     stream,
 )
+from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import pose_row
+from visioncal.simulation.seen import Network
 from visioncal.transforms import compose, exp, invert
 from visioncal.types import FloatArray, Mask
 
@@ -43,6 +48,23 @@ _DRAWN_M = np.array(
 _ROUNDS = 6
 _EXACT = 1e-8
 _TRIES = 40
+
+
+@dataclass(frozen=True, eq=False)
+class _Toucher:
+    """An arm that touches.
+
+    Attributes:
+        options: The robot and its repeatability.
+        arm: The nominal arm.
+        true_arm: The arm as it was built.
+        flange_at: Where the real arm's flange stands (k, 4, 4) at (k, n) joint angles [rad].
+    """
+
+    options: CellOptions
+    arm: Arm
+    true_arm: Arm
+    flange_at: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +100,21 @@ class Touching:
     features: Touched
     points: Touched
 
-    @property
-    def transforms(self) -> dict[str, FloatArray]:
-        """The tool and the fixture, by the names of a result."""
+    def transforms(self, robot: str = "") -> dict[str, FloatArray]:
+        """The tool and the fixture, by the names of a result, in the frames of the robot named."""
         return {
-            "flange_from_tool": self.flange_from_tool,
-            "base_from_fixture": self.base_from_fixture,
+            f"{frame_name('flange', robot)}_from_tool": self.flange_from_tool,
+            f"{frame_name('base', robot)}_from_fixture": self.base_from_fixture,
         }
 
     @property
-    def drawing(self) -> list[list[str]]:
+    def drawing(self) -> list[dict[str, object]]:
         """The drawing's rows: `point`, `x_mm`, `y_mm`, `z_mm`."""
         rows = (1e3 * _DRAWN_M).round(6).tolist()
-        return [[_name(at), *map(str, row)] for at, row in enumerate(rows)]
+        return [
+            {"point": _name(at), "x_mm": x, "y_mm": y, "z_mm": z}
+            for at, (x, y, z) in enumerate(rows)
+        ]
 
 
 def touch(cell: Cell) -> Touching:
@@ -102,11 +126,33 @@ def touch(cell: Cell) -> Touching:
     Raises:
         DataError: The arm does not reach enough postures.
     """
-    rng = stream(cell.options, Stream.TOUCHES)
+    arm = _Toucher(cell.options, cell.arm, cell.true_arm, cell.flange_at)
+    return _touching(arm, stream(cell.options, Stream.TOUCHES))
+
+
+def touch_network(cell: Network) -> dict[str, Touching]:
+    """What each robot of a cell touches: with a tool of its own, a fixture before it.
+
+    Raises:
+        DataError: An arm does not reach enough postures.
+    """
+    found = {}
+    for at, it in enumerate(cell.options.robots):
+        options = CellOptions(
+            robot=it.robot, robot_sigma_m=it.sigma_m, robot_sigma_rad=it.sigma_rad
+        )
+        true_arm = cell.true_arms[it.name]
+        arm = _Toucher(options, cell.arms[it.name], true_arm, partial(forward, true_arm))
+        rng = standing.stream(cell.options, standing.Stream.TOUCHES, at)
+        found[it.name] = _touching(arm, rng)
+    return found
+
+
+def _touching(toucher: _Toucher, rng: np.random.Generator) -> Touching:
     turn = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
     flange_from_tool = compose(turn, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
     lies = Rotation.from_rotvec([*rng.normal(0.0, 0.03, 2), rng.uniform(-0.5, 0.5)]).as_matrix()
-    reach = reach_m(cell.arm)
+    reach = reach_m(toucher.arm)
     base_from_fixture = compose(lies, np.array([0.45 * reach, -0.1 * reach, 0.12 * reach]))
 
     far, aside = rng.uniform(0.08, 0.12, 4), rng.uniform(-0.02, 0.02, 2)
@@ -115,7 +161,7 @@ def touch(cell: Cell) -> Touching:
     in_tool = np.concatenate([np.zeros((10, 3)), along, across])
     corner = np.tile(base_from_fixture[:3, 3] + [0.0, 0.0, 0.05], (len(in_tool), 1))
     kinds = ("point",) * 10 + ("z",) * 2 + ("xz",) * 2
-    tip = _touched(cell, flange_from_tool, corner, in_tool, {"kind": kinds}, rng)
+    tip = _touched(toucher, flange_from_tool, corner, in_tool, {"kind": kinds}, rng)
 
     featured = np.zeros((9, 3))
     featured[3:6, 0], featured[6:, :2] = rng.uniform(0.1, 0.25, 3), rng.uniform(0.1, 0.2, (3, 2))
@@ -123,7 +169,7 @@ def touch(cell: Cell) -> Touching:
 
     def on_fixture(places: FloatArray, columns: Mapping[str, tuple[str, ...]]) -> Touched:
         met = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
-        return _touched(cell, flange_from_tool, met, np.zeros_like(met), columns, rng)
+        return _touched(toucher, flange_from_tool, met, np.zeros_like(met), columns, rng)
 
     names = tuple(_name(at) for at in range(len(_DRAWN_M)))
     return Touching(
@@ -140,7 +186,7 @@ def _name(at: int) -> str:
 
 
 def _touched(
-    cell: Cell,
+    toucher: _Toucher,
     flange_from_tool: FloatArray,
     places: FloatArray,
     in_tool: FloatArray,
@@ -152,10 +198,10 @@ def _touched(
     reached = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     straight = compose(down.as_matrix(), met[0] - down.apply(reached[0]))
-    home = home_posture(cell.options, cell.arm, straight[None], rng)
-    options = cell.options
+    home = home_posture(toucher.options, toucher.arm, straight[None], rng)
+    options = toucher.options
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
-    joints = np.zeros((len(met), cell.arm.a.size))
+    joints = np.zeros((len(met), toucher.arm.a.size))
     left = np.ones(len(met), dtype=bool)
     for _ in range(_TRIES):
         count = int(left.sum())
@@ -169,53 +215,61 @@ def _touched(
         goals[:, :3, 3] = met[left] - turns.apply(reached[left])
         # Once the joints are where they read, the flange stands off by its repeatability.
         goals = goals @ exp(-sigma * rng.standard_normal((count, 6)))
-        found, good = _standing(cell, goals, home)
+        found, good = _standing(toucher, goals, home)
         joints[np.flatnonzero(left)[good]] = found[good]
         left[left] = np.logical_not(good)
         if not left.any():
-            return Touched(columns, forward(cell.arm, joints), joints)
+            return Touched(columns, forward(toucher.arm, joints), joints)
     raise DataError(
-        f"simulation: the {cell.arm.name} reaches {len(met) - int(left.sum())} of {len(met)} "
+        f"simulation: the {toucher.arm.name} reaches {len(met) - int(left.sum())} of {len(met)} "
         "touches.",
         next_step="Take another robot or seed.",
     )
 
 
-def _standing(cell: Cell, goals: FloatArray, home: FloatArray) -> tuple[FloatArray, Mask]:
+def _standing(toucher: _Toucher, goals: FloatArray, home: FloatArray) -> tuple[FloatArray, Mask]:
     """(m, n) joints at which the real arm stands at (m, 4, 4), and (m,) which of them serve."""
     joints, aims = np.tile(home, (len(goals), 1)), goals
     for _ in range(_ROUNDS):
-        reach = inverse(cell.true_arm, aims, joints)
+        reach = inverse(toucher.true_arm, aims, joints)
         joints = reach.joints
-        stands = cell.flange_at(joints)
+        stands = toucher.flange_at(joints)
         aims = goals @ invert(stands) @ aims
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
     good &= np.abs(stands - goals).max(axis=(1, 2)) < _EXACT
-    return joints, good & (lowest_m(cell.arm, joints) > 0.0)
+    return joints, good & (lowest_m(toucher.arm, joints) > 0.0)
 
 
-def write_touches(touched: Touching, folder: Path) -> None:
+def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
     """Writes `touches.csv`, `features.csv`, `points.csv` and the drawing, `cad.csv`.
+
+    Args:
+        touched: By robot; rows tell the robot's name in a column `robot`, where it has one.
+        folder: Where to.
 
     Raises:
         DataError: The folder cannot be written.
     """
-    tables = {"touches": touched.tip, "features": touched.features, "points": touched.points}
-    for name, table in tables.items():
-        poses = [pose_row(it) for it in table.base_from_flange]
-        joints = [f"q{at}_rad" for at in range(1, table.joints.shape[1] + 1)]
-        rows = (
-            [at, *(it[at] for it in table.columns.values()), *poses[at].values(), *q.tolist()]
-            for at, q in enumerate(table.joints)
-        )
-        header = ["view", *table.columns, *poses[0], *joints]
-        write_atomically(folder / f"{name}.csv", _csv(header, rows))
-    write_atomically(folder / "cad.csv", _csv(["point", "x_mm", "y_mm", "z_mm"], touched.drawing))
+    for name, part in {"touches": "tip", "features": "features", "points": "points"}.items():
+        rows = [
+            ({"robot": robot} if robot else {}) | row
+            for robot, it in touched.items()
+            for row in _rows(getattr(it, part))
+        ]
+        numbered: list[dict[str, object]] = [{"view": at} | row for at, row in enumerate(rows)]
+        write_atomically(folder / f"{name}.csv", _csv(numbered))
+    write_atomically(folder / "cad.csv", _csv(next(iter(touched.values())).drawing))
 
 
-def _csv(header: list[str], rows: Iterable[list[object] | list[str]]) -> str:
+def _rows(table: Touched) -> Iterator[dict[str, object]]:
+    for at, (pose, q) in enumerate(zip(table.base_from_flange, table.joints, strict=True)):
+        joints = {f"q{joint}_rad": it for joint, it in enumerate(q.tolist(), start=1)}
+        yield {name: it[at] for name, it in table.columns.items()} | pose_row(pose) | joints
+
+
+def _csv(rows: Sequence[Mapping[str, object]]) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

@@ -1,0 +1,159 @@
+"""Whole cells of `visioncal simulate`, and what is recorded of them beside the cameras' views."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.cli.console import shown_progress
+from visioncal.errors import DataError
+from visioncal.session import frame_name
+from visioncal.simulation import (
+    CellOptions,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    PointAt,
+    RobotAt,
+    read_cell,
+    simulate_network,
+    touch_network,
+    write_network,
+)
+from visioncal.simulation.dynamics import Body
+from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise
+from visioncal.simulation.network_records import seed_of
+from visioncal.simulation.tracked import THREE, Tracked
+
+Read: TypeAlias = Literal["point", "points", "probe"]
+
+# Where the centre of a simulated load is, in the flange's frame [m].
+CENTRE_M = (0.0, 0.0, 0.1)
+# Half of the side of a load that is a cube [m], and torque for a current of each drive [N m/A].
+_HALF_M = 0.05
+_GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
+
+
+@dataclass(frozen=True)
+class Along:
+    """What is recorded of a whole cell beside what its cameras see; as the options have it."""
+
+    touches: bool
+    instrument: Read | None
+    torques: bool
+    currents: bool
+    payload_kg: list[float] | None
+
+
+def whole_cell(
+    name: str,
+    folder: Path,
+    options: CellOptions,
+    given: frozenset[str],
+    along: Along,
+    *,
+    images: bool,
+) -> None:
+    """Writes a whole cell; what the user gives comes before what is described."""
+    described = _described(name, options, given, along.instrument)
+    cell = simulate_network(described)
+    if not (cell.sights or cell.readings):
+        raise DataError(
+            f"--cell {name}: nothing in this cell is seen or read.",
+            culprits=[name],
+            next_step="Give it a camera that sees a target, or an instrument and points.",
+        )
+    exercised = {
+        it.name: exercise(
+            exercise_options(
+                it.robot, along.payload_kg, seed_of(described.seed, at), currents=along.currents
+            )
+        )
+        for at, it in enumerate(described.robots if along.torques else ())
+    }
+    touched = touch_network(cell) if along.touches else {}
+    with shown_progress(quiet=False) as told:
+        count = len(cell.sights)
+        write_network(
+            cell,
+            folder,
+            lambda share: told("render", round(share * count), count),
+            seen="images" if images else "poses",
+            touched=touched,
+            exercised=exercised,
+        )
+
+
+def _described(
+    name: str, options: CellOptions, given: frozenset[str], instrument: Read | None
+) -> NetworkOptions:
+    """A cell as it is described, with what the user gives in its place."""
+    described = read_cell(name)
+    changes = {"views": "stops", "wrong_views": "stray_images", "seed": "seed"}
+    changes |= {"recording": "recording"}
+    described = replace(
+        described, **{own: getattr(options, it) for it, own in changes.items() if it in given}
+    )
+    robots = tuple(_robot(it, options, given) for it in described.robots)
+    described = replace(described, robots=robots)
+    if "camera_moved_mm" in given:
+        if not described.cameras:
+            raise DataError(
+                f"--cell {name}: there is no camera to knock.", culprits=["--camera-moved-mm"]
+            )
+        frame = frame_name("camera", described.cameras[0].name)
+        knocked = Moved(frame, 0, shift_m=options.camera_moved_m, turn_rad=0.0)
+        described = replace(described, moved=(*described.moved, knocked))
+    return described if instrument is None else _tracked_too(name, described, instrument)
+
+
+def _robot(robot: RobotAt, options: CellOptions, given: frozenset[str]) -> RobotAt:
+    """A robot that errs as the user says."""
+    if "robot_sigma_mm" in given:
+        robot = replace(robot, sigma_m=options.robot_sigma_m)
+    if "robot_sigma_mrad" in given:
+        robot = replace(robot, sigma_rad=options.robot_sigma_rad)
+    if "arm_sigma_mm" in given:
+        robot = replace(robot, dh_sigma_m=options.dh_sigma_m)
+    if "arm_sigma_mrad" in given:
+        sigma = options.dh_sigma_rad
+        robot = replace(robot, dh_sigma_rad=sigma, offset_sigma_rad=sigma)
+    return robot
+
+
+def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> NetworkOptions:
+    """A cell with an instrument beside it, which reads every robot's flange."""
+    if described.instruments or described.points:
+        raise DataError(
+            f"--cell {name} has instruments or points of its own.",
+            culprits=["--instrument"],
+            next_step="Leave --instrument out.",
+        )
+    places = THREE if instrument == "points" else THREE[:1]
+    points = tuple(
+        PointAt(f"{robot.name}{at}", robot.name, place)
+        for robot in described.robots
+        for at, place in enumerate(places, start=1)
+    )
+    tracker = InstrumentAt("tracker", (2.5, -1.0, 0.4), 2.5)
+    if instrument == "probe":
+        tracker = replace(tracker, sigma_rad=Tracked.sigma_rad)
+    return replace(described, instruments=(tracker,), points=points)
+
+
+def exercise_options(
+    robot: str, payload_kg: list[float] | None, seed: int, *, currents: bool
+) -> ExerciseOptions:
+    """An arm's motions, empty or with a cube on its flange."""
+    loads = payload_kg or [0.0]
+    if len(loads) > 1:
+        raise DataError(
+            f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
+            culprits=["--payload-kg"],
+            next_step="Make a session of each load, with the same --seed.",
+        )
+    inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
+    load = Body(loads[0], np.array(CENTRE_M), inertia) if loads[0] else None
+    senses = Senses(gains_nm_a=_GAINS_NM_A if currents else ())
+    return ExerciseOptions(robot, load, senses, seed=seed)
