@@ -379,7 +379,7 @@ def test_looking_again_and_again_from_one_stop_adds_no_views(tmp_path):
     again = visioncal.calibrate(folder)
     assert again.verdict.status == "bad"
     assert any("Only 4 stops are used" in it for it in again.verdict.reasons)
-    assert "stops of the robot" in again.validation.method
+    assert "over stops" in again.validation.method
 
 
 def test_images_and_measured_poses_in_one_session(session_copy, result):

@@ -20,6 +20,7 @@ from visioncal.pipeline.elastic import check_loads, with_springs
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
 from visioncal.pipeline.thermal import with_drift
+from visioncal.pipeline.unseen import left_out
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
@@ -48,7 +49,6 @@ from visioncal.stages.seen_joints import (
     lost_zero,
     misread_joints,
 )
-from visioncal.stages.validate import validate
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import Rejection
 
@@ -399,11 +399,7 @@ def _diagnose(known: Known) -> Known:
 
 
 def _validate(known: Known) -> Known:
-    result, data = known.solved, known.closure(known.used)
-    seen = known.seen(known.used)
-    boards = known.shown(known.used)
-    held_out = validate(data, known.stops, result, known.solver, seen, known.free, boards)
-    return replace(known, held_out=held_out)
+    return replace(known, held_out=left_out(known))
 
 
 def _tell(known: Known) -> Known:

@@ -1,4 +1,4 @@
-"""What an arm as stated and the calibrated one make of views that the fit had not seen."""
+"""Views that no fit has seen: left out in turn, and held back, by the arm as stated and by ours."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -7,10 +7,41 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure, Edges, distances
+from visioncal.estimation.closure import Closure
+from visioncal.estimation.problem import State
 from visioncal.pipeline.known import Known
+from visioncal.stages.handeye import refit
 from visioncal.stages.kinematics import Kinematics
-from visioncal.types import FloatArray
+from visioncal.stages.validate import HeldOut, apart, chain_rms_px, validate
+from visioncal.types import FloatArray, IntArray, Mask
+
+
+def left_out(known: Known) -> HeldOut:
+    """Residuals of the used views, each by a fit without its stop."""
+    data, result, stops = known.closure(known.used), known.solved, known.stops
+    problem, boards, seen = data.problem, known.shown(known.used), known.seen(known.used)
+
+    def again(kept: Mask) -> State:
+        numbered = np.unique(stops[kept], return_inverse=True)[1]
+        return refit(data.subset(kept).merged(numbered), result, known.solver).state
+
+    def own(state: State) -> FloatArray:
+        return boards.moved(state.values).first_from_own
+
+    def pixels(rows: IntArray, state: State) -> FloatArray:
+        chosen = np.isin(np.arange(len(problem)), rows)
+        poses = problem.subset(chosen).predicted(state) @ own(state)[rows]
+        return chain_rms_px([seen[it] for it in rows], poses, known.free, state.values)
+
+    needs = [(boards.names[it],) for it in boards.shown]
+    found = validate(problem, stops, needs, again, pixels, own)
+    fit = "whole fit" if data.mount == "instrument" else "hand-eye fit"
+    unknown = np.full(len(problem), np.nan)
+    return replace(
+        found,
+        method=f"{found.method}, of the {fit}",
+        away_rad=found.away_rad if data.guess is None else unknown,
+    )
 
 
 def unseen_views(known: Known, found: Kinematics) -> dict[str, list[dict[str, Any]]]:
@@ -41,22 +72,20 @@ def _held_back(
     stated = replace(known, arm=None, arm_model=None, from_first=known.compared_from_first)
     lost = stated.stated_closure(views)
     data = (stated.closure(views) if lost is None else lost, known.closure(views))
-    nominal = found.fits[0].fit.state
-    edges = (Edges(nominal.edges[0], nominal.edges[1], nominal.values), known.solved.edges)
+    states = (found.fits[0].fit.state, known.solved.edges.state)
     before, after = (
-        _distances(one, two, it, views)
-        for one, two, it in zip((stated, known), data, edges, strict=True)
+        _apart(one, two, it, views)
+        for one, two, it in zip((stated, known), data, states, strict=True)
     )
     return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
 
 
-def _distances(
-    known: Known, data: Closure, edges: Edges, views: Sequence[int]
+def _apart(
+    known: Known, data: Closure, state: State, views: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
     """How far (m,) [m] and (m,) [rad] views place their boards from where the edges do."""
-    own = known.shown(views).moved(edges.shared).first_from_own
-    placed = data.under(edges.shared).placed(edges.x)
-    return distances(placed @ own, edges.z @ own)
+    own = known.shown(views).moved(state.values).first_from_own
+    return apart(data.problem, state, own)
 
 
 def _lengths(twists: FloatArray) -> FloatArray:

@@ -70,7 +70,8 @@ def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, 
     """
     edges, data, shown = known.solved.edges, known.closure(views), known.shown(views)
     own = shown.moved(edges.shared).first_from_own
-    rms_px = chain_rms_px(data, edges, known.seen(views), known.free, own)
+    poses = data.problem.predicted(edges.state) @ own
+    rms_px = chain_rms_px(known.seen(views), poses, known.free, edges.shared)
     means = np.array([mean_transform(it) for it in _placed_by_board(known)])
     placed = data.under(edges.shared).placed(edges.x) @ own
     away_m, away_rad = distances(placed, means[shown.shown])

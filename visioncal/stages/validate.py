@@ -1,32 +1,32 @@
-"""Predicts each view from a fit that has not seen it."""
+"""Predicts each observation from a fit that was made without its stop."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.camera import project
 from visioncal.estimation.appearance import Free
-from visioncal.estimation.boards import Boards
-from visioncal.estimation.closure import Closure, Edges, distances
-from visioncal.stages.handeye import HandEyeResult, refit
+from visioncal.estimation.problem import Problem, State
 from visioncal.threads import one_blas_thread
-from visioncal.types import Camera, Corners, FloatArray, IntArray, SolverName
+from visioncal.transforms import invert, rotation_angle
+from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
-# Up to here every view is left out by itself; beyond, ten groups tell the same.
+# Up to here every stop is left out by itself; beyond, ten groups say the same.
 _MOST_FOLDS_OF_ONE = 30
 _FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Residuals of views that the fit had not seen.
+    """Residuals of observations that the fit had not seen.
 
     Attributes:
-        method: How views were left out, in words.
-        away_m: (m,) distance between where the view and the fit place the target [m].
-        away_rad: (m,) the same in rotation [rad]; NaN where places alone were read.
-        rms_px: (m,) reprojection error through the chain [px]; NaN for views without corners.
+        method: How they were left out, in words.
+        away_m: (n,) distance between where the observation and the fit place what it saw [m]; NaN
+            where the others do not place it.
+        away_rad: (n,) the same in rotation [rad]; NaN where places alone were read.
+        rms_px: (n,) reprojection error through the chain [px]; NaN without corners.
     """
 
     method: str
@@ -36,25 +36,22 @@ class HeldOut:
 
 
 def validate(
-    data: Closure,
+    problem: Problem,
     stops: IntArray,
-    result: HandEyeResult,
-    solver: SolverName,
-    corners: Sequence[Corners | None],
-    free: Free | None,
-    boards: Boards,
+    needs: Sequence[Collection[str]],
+    refit: Callable[[Mask], State],
+    pixels: Callable[[IntArray, State], FloatArray],
+    own: Callable[[State], FloatArray] | None = None,
 ) -> HeldOut:
-    """Leaves stops out, one by one or in ten groups, and predicts their views from the others.
+    """Leaves stops out, one by one or in ten groups, and predicts what was observed there.
 
     Args:
-        data: The used views.
-        stops: (m,) which stop of the robot each was taken at; they are left out together.
-        result: The fit to all of them.
-        solver: The solver to fit again with.
-        corners: Each view's corners, if any.
-        free: Lens and board, if there are corners.
-        boards: What the views show, where there are several boards. A view that alone shows its
-            board cannot be predicted by the others: its residuals are NaN.
+        problem: The n observations in the fit.
+        stops: (n,) the stop of each, numbered from 0; those of one are left out together.
+        needs: (n,) the names of what each observation needs to be placed by others.
+        refit: Fits those of an (n,) mask.
+        pixels: Reprojection errors (m,) [px] of (m,) observations at a state.
+        own: (n, 4, 4) at a state, what was observed in the observed frame; None where that is it.
 
     Returns:
         The residuals.
@@ -63,49 +60,63 @@ def validate(
     folds = count if count <= _MOST_FOLDS_OF_ONE else _FOLDS
     # Strides, so that a group's stops are not neighbours.
     fold = stops % folds
-    away_m, away_rad, rms_px = (np.full(len(data), np.nan) for _ in range(3))
+    away_m, away_rad, rms_px = (np.full(len(problem), np.nan) for _ in range(3))
     with one_blas_thread():
         for left_out in range(folds):
-            held = fold == left_out
-            rest = data.subset(~held).merged(_renumbered(stops[~held]))
-            edges = refit(rest, result, solver)
-            held &= np.isin(boards.shown, boards.shown[~held])
-            left, own = data.subset(held), boards.moved(edges.shared).first_from_own[held]
-            placed = left.under(edges.shared).placed(edges.x)
-            away_m[held], turned = distances(placed @ own, edges.z @ own)
-            away_rad[held] = turned if data.guess is None else np.nan
-            seen = [corners[int(at)] for at in np.flatnonzero(held)]
-            rms_px[held] = chain_rms_px(left, edges, seen, free, own)
+            kept = fold != left_out
+            known = {it for row, its in enumerate(needs) if kept[row] for it in its}
+            held = np.array(
+                [not kept[row] and known.issuperset(it) for row, it in enumerate(needs)]
+            )
+            if not held.any():
+                continue
+            state, rows = refit(kept), np.flatnonzero(held)
+            among = None if own is None else own(state)[held]
+            away_m[held], away_rad[held] = apart(problem.subset(held), state, among)
+            rms_px[held] = pixels(rows, state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
-    fit = "whole fit" if data.mount == "instrument" else "hand-eye fit"
-    unit = "views" if count == len(data) else "stops of the robot"
-    return HeldOut(f"{method} over {unit}, of the {fit}", away_m, away_rad, rms_px)
+    unit = "views" if count == len(problem) else "stops"
+    return HeldOut(f"{method} over {unit}", away_m, away_rad, rms_px)
 
 
-def _renumbered(stops: IntArray) -> IntArray:
-    return np.unique(stops, return_inverse=True)[1].astype(np.int64)
+def apart(
+    problem: Problem, state: State, own: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """How far (n,) [m] and (n,) [rad] observations are from what is predicted.
+
+    Args:
+        problem: The observations.
+        state: The unknowns.
+        own: (n, 4, 4) what was observed in the observed frame; None where that is it.
+    """
+    predicted, measured = problem.predicted(state), problem.measured(state)
+    if own is not None:
+        predicted, measured = predicted @ own, measured @ own
+    turned = rotation_angle(invert(predicted) @ measured)
+    return (
+        np.linalg.norm(measured[:, :3, 3] - predicted[:, :3, 3], axis=1),
+        np.where(problem.observations.has_rotation, turned, np.nan),
+    )
 
 
 def chain_rms_px(
-    data: Closure,
-    edges: Edges,
-    corners: Sequence[Corners | None],
-    free: Free | None,
-    first_from_own: FloatArray,
+    seen: Sequence[Corners | None], poses: FloatArray, free: Free | None, change: FloatArray
 ) -> FloatArray:
-    """Reprojection error of each view through the whole chain, (m,) [px]; NaN where unseen.
+    """Reprojection error of each view's corners, (m,) [px]; NaN where there are none.
 
-    Lens and board are those that the views' poses were made with; the edges carry their change.
-    `first_from_own` (m, 4, 4) is each view's board in the frame of the first.
+    Args:
+        seen: (m,) each view's corners.
+        poses: (m, 4, 4) `cam_from_target` as the chain predicts it.
+        free: Lens and board that the views' poses were made with; None without corners.
+        change: (k,) by how much they changed since.
     """
-    rms = np.full(len(data), np.nan)
+    rms = np.full(len(poses), np.nan)
     if free is None:
         return rms
-    camera, positions = free.after(edges.shared).camera, free.corners_after(edges.shared)
-    poses = data.under(edges.shared).predicted_camera(edges.x, edges.z) @ first_from_own
-    for at, (pose, seen) in enumerate(zip(poses, corners, strict=True)):
-        if seen is not None:
-            away = predict_corners(camera, pose, positions[seen.ids]) - seen.px
+    camera, positions = free.after(change).camera, free.corners_after(change)
+    for at, (pose, it) in enumerate(zip(poses, seen, strict=True)):
+        if it is not None:
+            away = predict_corners(camera, pose, positions[it.ids]) - it.px
             # A corner behind the camera counts as a whole image away.
             away = np.nan_to_num(away, nan=float(max(camera.resolution)))
             rms[at] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
