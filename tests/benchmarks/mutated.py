@@ -19,7 +19,7 @@ from mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
 from mutators import KINDS
 from results import write_section
 
-MUTANTS, QUICK = 2000, 60
+MUTANTS, QUICK = 2000, 30
 # Reasons that are given less often than once in so many mutants share a row.
 RARE = 250
 _COLUMNS = (*KINDS, "file system")
