@@ -6,6 +6,7 @@ from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from visioncal.finders.result import NotFound, Seen
 from visioncal.targets import charuco_board
@@ -18,6 +19,15 @@ _LAYOUT_MISFIT = 0.35
 _LAYOUT_MARKERS = 3
 # A marker and those around it: of this many, some are of the rows above and below.
 _NEIGHBOURS = 9
+
+# Places on a marker's side to which distances are taken.
+_ALONG = 7
+# What a window keeps from a marker's side: its blur, and the pixel beyond that a gradient needs.
+_CLEAR_PX = 2.0
+# Half the side of the windows in which corners are refined: fewer pixels have too few gradients,
+# and in more of them a lens bends the sides of the squares.
+_WINDOWS_PX = (2, 10)
+_ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 
 # (4, 2) corners [px] by a marker's id.
 _Markers: TypeAlias = Mapping[int, FloatArray]
@@ -48,7 +58,28 @@ def find_charuco(image: Image, target: Target) -> Seen | NotFound:
     if np.size(ids) == 0 or px is None:
         return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
     order = np.argsort(ids.ravel())
-    return Seen(ids.ravel()[order].astype(np.int64), px.reshape(-1, 2)[order].astype(np.float64))
+    rough = px.reshape(-1, 2)[order].astype(np.float64)
+    return Seen(ids.ravel()[order].astype(np.int64), _refined(image, rough, marker_px))
+
+
+def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArray:
+    """Refines (n, 2) corners [px] in windows that no marker reaches into.
+
+    OpenCV's windows go by the distance of a marker's corner alone: where squares are small, slanted
+    or bent by a lens, a marker's sides lie in them and draw the corner by up to half a pixel.
+    """
+    corners = np.reshape(np.array(marker_px, dtype=float), (-1, 4, 2))
+    sides = np.roll(corners, -1, axis=1) - corners
+    along = corners[:, :, None] + np.linspace(0.0, 1.0, _ALONG)[:, None] * sides[:, :, None]
+    away, _ = KDTree(along.reshape(-1, 2)).query(px, p=np.inf)
+    windows = np.clip(away - _CLEAR_PX, *_WINDOWS_PX).astype(int)
+    refined = px.astype(np.float32)
+    for window in np.unique(windows).tolist():
+        these = windows == window
+        start = refined[these].reshape(-1, 1, 2).copy()
+        found = cv2.cornerSubPix(image, start, (window, window), (-1, -1), _ENDS)
+        refined[these] = found.reshape(-1, 2)
+    return refined.astype(np.float64)
 
 
 def fitting_layouts(image: Image, target: Target) -> tuple[Target, ...]:
