@@ -32,7 +32,9 @@ def closure_of(model, mount, q, flange=None):
     moved = robot if flange is None else robot_part(flange, mount)
     errors = ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True)
     spread = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
-    return Closure(mount, robot, invert(moved @ X) @ Z, spread, errors.shared(model.values))
+    return Closure(
+        mount, robot, invert(moved @ X) @ Z, spread, (errors.effect("robot", values=model.values),)
+    )
 
 
 def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):

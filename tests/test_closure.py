@@ -18,7 +18,7 @@ from visioncal.estimation.closure import (
     residual_blocks,
     solve_closure,
 )
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import ROBOT, Effect
 from visioncal.estimation.solve import RATIO_PRIOR, left_out_residuals
 from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
@@ -50,13 +50,12 @@ def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
 def doubled(data):
     """Every view twice, as two that know half as much each."""
     again = np.repeat(np.arange(len(data)), 2)
-    shared = data.shared
     return Closure(
         data.mount,
         data.robot[again],
         data.camera[again],
         2.0 * data.camera_covariance[again],
-        replace(shared, by_camera=shared.by_camera[again], by_flange=shared.by_flange[again]),
+        tuple(it.take(again).of_stops(again) for it in data.effects),
     ), again
 
 
@@ -64,8 +63,8 @@ def doubled(data):
 def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
     data, fit = answered(False, views=8, seed=2, mount=mount)
     arm = 1e-3 * np.random.default_rng(0).standard_normal((8, 6, 2))
-    nothing = np.zeros((8, 6, 2))
-    data = data.with_more(Shared(np.eye(2), np.zeros(2), np.zeros(2), nothing, arm))
+    known = Knowledge(np.eye(2), np.zeros(2))
+    data = data.with_more(Effect.free("arm", known, by_flange={ROBOT: arm}))
     once = replace(fit.edges, shared=data.unchanged)
     twice, stops = doubled(data)
     merged = twice.merged(stops)
@@ -82,13 +81,15 @@ def test_views_of_a_stop_move_with_the_lens_by_their_information():
     data, _ = answered(False, views=8, seed=2)
     twice, stops = doubled(data)
     # The second view of each stop knows nothing to speak of, and says nonsense.
-    known, lens = twice.camera_covariance.copy(), twice.shared.by_camera.copy()
+    (effect,) = twice.effects
+    known, lens = twice.camera_covariance.copy(), effect.by_sensor.copy()
     known[1::2] *= 1e12
     lens[1::2] *= -5.0
     lopsided = replace(
-        twice, camera_covariance=known, shared=replace(twice.shared, by_camera=lens)
+        twice, camera_covariance=known, effects=(replace(effect, by_sensor=lens),)
     ).merged(stops)
-    np.testing.assert_allclose(lopsided.shared.by_camera, data.shared.by_camera, rtol=1e-6)
+    (seen,), (before,) = lopsided.effects, data.effects
+    np.testing.assert_allclose(seen.by_sensor, before.by_sensor, rtol=1e-6)
     np.testing.assert_allclose(lopsided.camera_covariance, 2 * data.camera_covariance, rtol=1e-6)
 
 

@@ -20,7 +20,8 @@ from visioncal.estimation.closure import (
     solve_closure,
 )
 from visioncal.estimation.linalg import covariance, damped_step, spectrum
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, exact, measured_poses, simulate
 from visioncal.solvers import SOLVERS
@@ -63,8 +64,9 @@ def test_jacobian_agrees_with_central_differences(mount):
     x, z = some_edges()
     rng = np.random.default_rng(0)
     by_camera, by_flange = rng.normal(size=(2, 5, 6, 3))
-    shared = Shared(np.eye(3), np.zeros(3), np.zeros(3), by_camera, by_flange)
-    data = replace(made_up(some_motion(5), x, z, Noise(0.05, 0.02), mount=mount), shared=shared)
+    known = Knowledge(np.eye(3), np.zeros(3))
+    effect = Effect.free("any", known, by_camera, {ROBOT: by_flange})
+    data = made_up(some_motion(5), x, z, Noise(0.05, 0.02), mount=mount).with_more(effect)
     edges = Edges(x, z, np.zeros(3))
     analytic, step = closure_jacobian(data, edges), 1e-6
     for axis in range(15):
@@ -193,7 +195,7 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
 
 def test_a_stop_counts_once_however_often_it_is_looked_at():
     cell = simulate(CellOptions(seed=4, views=12, pixel_sigma_px=0.1))
-    data = replace(calibrated(cell).closure(range(12)), shared=None)
+    data = replace(calibrated(cell).closure(range(12)), effects=())
     once = solve_hand_eye(data)
     again = np.repeat(np.arange(12), 3)
     thrice = Closure(

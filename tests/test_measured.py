@@ -9,8 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DegenerateError
-from visioncal.estimation.closure import Edges
-from visioncal.estimation.measured import Measured
 from visioncal.pipeline import calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -123,7 +121,7 @@ def test_what_cannot_be_used_is_said():
     session = known_of(cell).session
     document = {**session.document, "prior": {"base_from_cam": prior}}
     elsewhere = Known(replace(session, document=document), "joint")
-    assert elsewhere.measured == ()
+    assert elsewhere.priors == ()
     other = calibrate(scara_with_tilt({"base_from_cam": prior}))
     assert any(
         "[prior.base_from_cam] was not used: what is unknown of this session is flange_from_cam "
@@ -150,26 +148,6 @@ def scara_with_tilt(prior: dict[str, dict[str, float]]) -> Session:
         ]
         row[1:] = [repr(float(it)) for it in np.concatenate(numbers)]
     return Session.assemble(session.document, session.columns, rows, MemoryImages({}))
-
-
-def test_derivatives_are_those_of_the_error():
-    known = Measured(1, (0, 2), (0.1, -0.2), 1e-3)
-    edges = Edges(X, exp(np.array([0.3, 0.2, -0.5, 0.11, 0.3, -0.21])), np.zeros(2))
-    size, step = 14, 1e-6
-
-    def half(by: np.ndarray) -> float:
-        moved = edges.moved(by)
-        return 0.5 * known.cost(moved.x, moved.z)
-
-    pull = [(half(step * it) - half(-step * it)) / (2.0 * step) for it in np.eye(size)]
-    # Central differences: a share of 1e-9 of numbers of some ten thousand.
-    np.testing.assert_allclose(known.pull(edges.x, edges.z, size), pull, atol=1e-3)
-    curved = [
-        (half(step * it) + half(-step * it) - 2.0 * half(0.0 * it)) / step**2 for it in np.eye(size)
-    ]
-    information = known.information(edges.x, edges.z, size)
-    # Second differences of numbers of some thousand lose ten digits of sixteen.
-    np.testing.assert_allclose(np.diag(information), curved, atol=2e3)
 
 
 def test_a_plan_counts_what_was_measured():

@@ -62,7 +62,7 @@ def test_two_exchanged_rows_are_found():
 
 def test_where_nothing_agrees_nothing_is_left_out():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
-    data = replace(known.closure(known.used), shared=None)
+    data = replace(known.closure(known.used), effects=())
     mixed = replace(data, robot=np.roll(data.robot, 1, axis=0))
     assert agree(mixed, range(20), np.arange(20)).mask.all()
 
@@ -71,7 +71,7 @@ def test_a_stop_is_right_or_wrong_as_a_whole():
     cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
     known = calibrated(cell)
     (wrong,) = cell.wrong_views
-    data = replace(known.closure(known.candidates), shared=None)
+    data = replace(known.closure(known.candidates), effects=())
     twice = np.repeat(np.arange(20), 2)
     doubled = Closure(
         data.mount, data.robot[twice], data.camera[twice], data.camera_covariance[twice]
@@ -93,7 +93,7 @@ def looked_at_again(data, times=2, seed=5):
 @pytest.mark.parametrize("measured", [True, False], ids=["covariance unknown", "covariance known"])
 def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    once = replace(known.closure(known.used), shared=None)
+    once = replace(known.closure(known.used), effects=())
     data, stops = looked_at_again(once, times)
     if measured:
         data = replace(data, camera_covariance=None)
@@ -112,7 +112,7 @@ def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, meas
 
 def test_units_are_numbered_as_stops_are():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    data, stops = looked_at_again(replace(known.closure(known.used), shared=None))
+    data, stops = looked_at_again(replace(known.closure(known.used), effects=()))
     np.testing.assert_array_equal(whole_units(data, stops), stops)
     mixed = data.camera.copy()
     mixed[9] = data.camera[30]
@@ -130,7 +130,7 @@ def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
 
 def test_a_square_is_the_distance_from_what_the_others_predict():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
-    problem = replace(known.closure(known.used), shared=None).problem
+    problem = replace(known.closure(known.used), effects=()).problem
     everything = np.ones(12, dtype=bool)
     fit = fit_problem(problem, replace(known.solved.edges, shared=np.zeros(0)).state)
     inside = distances(problem, everything, fit)

@@ -15,7 +15,8 @@ from visioncal.estimation.closure import Closure, closure_information
 from visioncal.estimation.indices import Indices, singular_values
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parameters import free_parameters, parameter_moves
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures, tool_slopes
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.result import result_of
@@ -143,8 +144,8 @@ def test_a_second_board_adds_six_values(mount):
     robot = load_robot("ur5e")
     arm = arm_data(robot, postures(robot)[:40], mount)
     seen = np.where(np.arange(40)[:, None, None] % 2 == 1, np.eye(6), 0.0)
-    place = Shared(np.zeros((6, 6)), np.zeros(6), np.zeros(6), seen, np.zeros_like(seen))
-    data = replace(arm.data, shared=place.joined(arm.data.shared))
+    place = Effect.free("board", Knowledge(np.zeros((6, 6)), np.zeros(6)), seen)
+    data = replace(arm.data, effects=(place, *arm.data.effects))
     edges = replace(arm.result.edges, shared=np.zeros(6 + len(arm.units)))
     spread = covariance(closure_information(data, edges, NOISE))
     result = replace(arm.result, edges=edges, covariance=spread)

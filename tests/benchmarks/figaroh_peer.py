@@ -153,7 +153,7 @@ def fitted(world: World, noise: Noise | None) -> tuple[Edges, ArmModel]:
     model = model.erring(errors)
     while True:
         data = _chain(world, model.robot.base_from_flange(q))
-        arm = replace(errors["links"], basis=model.basis(q)).shared(model.values)
+        arm = replace(errors["links"], basis=model.basis(q)).effect("robot", values=model.values)
         still = replace(edges, shared=np.zeros_like(model.values))
         edges, _ = solve_closure(data.with_more(arm), still, noise)
         model = model.moved(edges.shared)

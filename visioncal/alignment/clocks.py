@@ -11,8 +11,8 @@ import numpy as np
 
 from visioncal.alignment.cell import Cell, robot_key
 from visioncal.errors import VisioncalError
+from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.problem import Effect
-from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.tables import ClockTable
@@ -144,18 +144,9 @@ def _effect(cell: Cell, pair: Pair, clocked: Clocked) -> Effect:
     speeds = clocked.clock.speeds
     concerned = np.array([it.view in speeds for it in cell.rows], dtype=bool)
     robot = robot_key(pair.robot)
-    by_flange = np.zeros((len(cell.poses[robot]), 6, 1))
+    moving = np.zeros((len(cell.poses[robot]), 6))
     for row in cell.rows:
         if row.view in speeds:
-            # The farther the camera's clock is ahead, the earlier the robot's own time.
-            by_flange[row.station, :, 0] = -speeds[row.view]
-    sigma_s = clocked.clock.sigma_s
-    known = Knowledge(np.array([[sigma_s**-2.0]]), np.zeros(1))
-    return Effect(
-        pair.effect,
-        np.zeros(1),
-        known,
-        np.zeros(1, dtype=bool),
-        by_flange={robot: by_flange},
-        concerned=concerned,
-    )
+            moving[row.station] = speeds[row.view]
+    found = clock_effect(moving, clocked.clock.sigma_s, pair.effect, robot)
+    return replace(found, concerned=concerned)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DataError
@@ -11,11 +10,9 @@ from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.tree import Tree
 from visioncal.files import did_you_mean
 from visioncal.session.tables import PriorTable
-from visioncal.stages.measured import Component, axes_of
-from visioncal.types import FloatArray
+from visioncal.stages.measured import axes_of, components
 
 _BETWEEN = "_from_"
-_AXES = ("x_m", "y_m", "z_m")
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
@@ -58,38 +55,6 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     return FramePrior(first, second, axes, values, table.sigma_m, rotation, table.sigma_rad)
 
 
-def prior_components(
-    prior: FramePrior, problem: Problem, solution: Solution, spread: FloatArray
-) -> tuple[Component, ...]:
-    """The measured components of a prior beside what the observations alone say of them.
-
-    Args:
-        prior: A prior, in the problem or left out of it.
-        problem: The observations in the fit.
-        solution: The fit.
-        spread: (p, p) covariance of the unknowns.
-    """
-    used = prior in problem.priors
-    away, slopes = problem.prior_rows(prior, solution.state)
-    sigmas = np.sqrt(np.einsum("dp,pq,dq->d", slopes, spread, slopes)) * prior.sigma_m
-    # Behind those of the rotation, which no word is said of.
-    places = slice(len(away) - len(prior.axes), len(away))
-    found = []
-    for axis, stated, off, sigma in zip(
-        prior.axes,
-        prior.values_m,
-        (away[places] * prior.sigma_m).tolist(),
-        sigmas[places].tolist(),
-        strict=True,
-    ):
-        label = f"{_AXES[axis]} of {prior.first}{_BETWEEN}{prior.second}"
-        if used:
-            found.append(Component.beside(label, stated, prior.sigma_m, off, sigma))
-        else:
-            found.append(Component(label, stated, prior.sigma_m, stated + off, sigma, False))
-    return tuple(found)
-
-
 def most_contradicted(problem: Problem, solution: Solution) -> FramePrior | None:
     """The prior that the observations contradict most; None where they contradict none.
 
@@ -103,7 +68,7 @@ def most_contradicted(problem: Problem, solution: Solution) -> FramePrior | None
     found = [
         (it.contradiction, at)
         for at, prior in enumerate(problem.priors)
-        for it in prior_components(prior, problem, solution, spread)
+        for it in components(problem, solution.state, spread, [prior])
         if it.is_contradicted
     ]
     return problem.priors[max(found)[1]] if found else None

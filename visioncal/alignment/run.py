@@ -27,7 +27,6 @@ from visioncal.alignment.judging import (
     weakest_link,
 )
 from visioncal.alignment.looking import Looked, look_around, stated_camera
-from visioncal.alignment.priors import prior_components
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.alignment.written import corner_residuals, fit_sections
@@ -36,6 +35,7 @@ from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
+from visioncal.stages.measured import components
 from visioncal.stages.offset import Clock
 from visioncal.targets import target_document
 from visioncal.threads import one_blas_thread
@@ -154,11 +154,7 @@ def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
     """Reasons for doubt that are no figure of the result."""
     agreed = solved.agreed
     used = agreed.problem.subset(agreed.used)
-    measured = [
-        it
-        for prior in solved.cell.priors
-        for it in prior_components(prior, used, agreed.fit, spread)
-    ]
+    measured = components(used, agreed.fit.state, spread, solved.cell.priors)
     missing = [
         f"Robot {it} stays as it reports itself: its errors take joint angles and a known model."
         for it in solved.arms.unasked

@@ -9,7 +9,7 @@ The points of a rig are where its table has them, or near there, each by what it
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,10 +19,13 @@ from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.poses import fit_poses
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.targets import corner_positions
 from visioncal.types import Camera, FloatArray, IntArray, Mask, Target
 
+# The effect's name in a problem.
+LENS_AND_BOARD = "lens and board"
 SCALE, ASPECT = 0, 1
 BOARD_NAMES = (
     "scale",
@@ -37,8 +40,6 @@ _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 _ASPECT_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-2
 # A rig of more points is taken for exact: each adds three unknowns that all views share.
 MOST_LOOSE = 100
-# So many times what is known keeps a value in its place against any residuals.
-_ANCHOR = 1e12
 
 
 def board_basis(positions: FloatArray) -> FloatArray:
@@ -146,10 +147,10 @@ class Free:
     information: FloatArray
     pull: FloatArray
 
-    def shared(self, shift: FloatArray) -> Shared:
+    def effect(self, shift: FloatArray) -> Effect:
         """Puts it as the chain takes it, with the (m, 6, k) shifts of its views."""
-        anchor = np.where(self.anchored, _ANCHOR * np.diag(self.information), 0.0)
-        return Shared(self.information, self.pull, anchor, shift, np.zeros_like(shift))
+        known = Knowledge(self.information, self.pull)
+        return replace(Effect.free(LENS_AND_BOARD, known, shift), held=self.anchored)
 
     @property
     def lens_count(self) -> int:

@@ -15,7 +15,6 @@ import numpy as np
 
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.problem import Effect, Noise, Problem, State
-from visioncal.estimation.shared import Shared
 from visioncal.estimation.solve import normal_equations, robot_levels
 from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
@@ -63,14 +62,6 @@ class ArmErrors:
     def is_estimated(self) -> bool:
         """Whether they are unknowns of the fit; others only count in the covariance."""
         return self.of_links and self.is_significant
-
-    def shared(self, values: FloatArray | None = None) -> Shared:
-        """Puts the effects as unknowns of the chain, at their (p,) present values."""
-        size = self.basis.shape[2]
-        nothing = np.zeros(size)
-        at = nothing if values is None else values
-        known = np.eye(size) / self.sigma**2
-        return Shared(known, known @ at, nothing, np.zeros_like(self.basis), self.basis)
 
     def effect(self, robot: str, name: str = "arm", values: FloatArray | None = None) -> Effect:
         """Puts the effects as unknowns of a robot's flange, at their (p,) present values."""

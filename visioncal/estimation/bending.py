@@ -13,7 +13,8 @@ from visioncal.estimation.closure import (
     residual_blocks,
 )
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Loads
 from visioncal.types import FloatArray
 
@@ -95,9 +96,8 @@ def payload_factor(
     robot = model.robot
     more = robot.load_torques(bent, loads) - robot.load_torques(bent)
     moved = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * more)
-    known = np.zeros((1, 1))
-    still = np.zeros((len(data), 6, 1))
-    one = Shared(known, np.zeros(1), np.zeros(1), still, moved[:, :, None])
+    nothing = Knowledge(np.zeros((1, 1)), np.zeros(1))
+    one = Effect.free("loads", nothing, by_flange={ROBOT: moved[:, :, None]})
     widened = data.with_more(one)
     at = replace(edges, shared=np.append(edges.shared, 0.0))
     information, gradient = normal_equations(widened, at, noise)

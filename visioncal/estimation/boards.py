@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.estimation.closure import Closure, Edges, deviations
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, exp, invert
 from visioncal.types import FloatArray, IntArray
 
@@ -64,26 +65,24 @@ class Boards:
             return data
         carry = self.from_first[self.shown]
         carried = adjoint(invert(carry))
-        known, shared = data.camera_covariance, data.shared
+        known = data.camera_covariance
         return replace(
             data,
             camera=data.camera @ carry,
             camera_covariance=None
             if known is None
             else carried @ known @ np.swapaxes(carried, 1, 2),
-            shared=None
-            if shared is None
-            else replace(shared, by_camera=carried @ shared.by_camera),
-        ).with_more(self._shared())
+            effects=tuple(it.carried(carried) for it in data.effects),
+        ).with_more(self._effect())
 
-    def _shared(self) -> Shared:
+    def _effect(self) -> Effect:
         """Where the further boards are, as unknowns of the chain."""
         count = self.unknowns
         moved = np.zeros((len(self.shown), 6, count))
         for board in range(1, len(self.names)):
             moved[self.shown == board, :, 6 * board - 6 : 6 * board] = np.eye(6)
-        nothing = np.zeros(count)
-        return Shared(np.eye(count) / _ANYWHERE**2, nothing, nothing, moved, np.zeros_like(moved))
+        known = Knowledge(np.eye(count) / _ANYWHERE**2, np.zeros(count))
+        return Effect.free("boards", known, moved)
 
     def moved(self, shared: FloatArray) -> "Boards":
         """Returns the boards after a (k,) change of what the views share."""

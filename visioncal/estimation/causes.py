@@ -14,7 +14,8 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from visioncal.estimation.closure import Closure, Edges, Noise, residual_blocks
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.types import FloatArray
 
@@ -192,9 +193,9 @@ def undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
         _stepped(slopes, values) for slopes in (cause.by_camera, cause.by_flange)
     )
     carried = adjoint(invert(by_camera.moved))
-    known, shared = data.camera_covariance, data.shared
-    nothing = np.zeros(len(values))
-    information = np.zeros((len(values), len(values)))
+    known = data.camera_covariance
+    nothing = Knowledge(np.zeros((len(values), len(values))), np.zeros(len(values)))
+    changed = Effect.free("change", nothing, by_camera.slopes, {ROBOT: by_flange.slopes})
     flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
     flange = flange @ by_flange.moved
     return replace(
@@ -202,8 +203,8 @@ def undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
         robot=flange if data.mount == "eye-in-hand" else invert(flange),
         camera=data.camera @ by_camera.moved,
         camera_covariance=None if known is None else carried @ known @ np.swapaxes(carried, 1, 2),
-        shared=None if shared is None else replace(shared, by_camera=carried @ shared.by_camera),
-    ).with_more(Shared(information, nothing, nothing, by_camera.slopes, by_flange.slopes))
+        effects=tuple(it.carried(carried) for it in data.effects),
+    ).with_more(changed)
 
 
 @dataclass(frozen=True, eq=False)

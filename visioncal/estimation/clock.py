@@ -17,8 +17,8 @@ from visioncal.estimation.closure import (
     fit_closure,
     residual_blocks,
 )
+from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.shared import Shared
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
 from visioncal.solvers import SOLVERS
@@ -158,23 +158,8 @@ def clock_closure(robot: Trajectory, frames: Frames, offset_s: float) -> Closure
         poses if frames.mount == "eye-in-hand" else invert(poses),
         frames.cam_from_target,
         frames.covariance,
-        clock_shared(robot.speeds(at_s)),
+        (clock_effect(robot.speeds(at_s)),),
     )
-
-
-def clock_shared(speeds: FloatArray, sigma_s: float = np.inf) -> Shared:
-    """The offset's change [s] as an unknown of the chain.
-
-    Args:
-        speeds: (m, 6) twists a second of the flange, in its own frame; zero where a view's pose
-            does not depend on the clock.
-        sigma_s: How well the offset is known beforehand [s].
-    """
-    nothing = np.zeros(1)
-    # The farther the camera's clock is ahead, the earlier the robot's own time.
-    by_flange = -speeds[:, :, None]
-    known = np.array([[sigma_s**-2.0]])
-    return Shared(known, nothing, nothing, np.zeros_like(by_flange), by_flange)
 
 
 def _sound(data: Closure, edges: Edges, noise: Noise) -> Mask:

@@ -24,12 +24,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.measured import Measured
-from visioncal.estimation.problem import Effect, FramePrior, Observations, Problem, State
+from visioncal.estimation.problem import (
+    ROBOT,
+    Effect,
+    FramePrior,
+    Observations,
+    Problem,
+    State,
+)
 from visioncal.estimation.problem import Noise as Levels
-from visioncal.estimation.shared import Shared
 from visioncal.estimation.solve import (
     fisher_information,
     fit_problem,
@@ -45,8 +51,6 @@ from visioncal.estimation.variance import Components, Knowledge
 from visioncal.transforms import adjoint, exp, invert, log, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
 
-# What the only robot goes by.
-ROBOT = "robot"
 # Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
 _CHOSEN = 1e12
 # Variances of a direction that a pose leaves open are above this [rad^2].
@@ -62,19 +66,19 @@ class Closure:
         robot: (m, 4, 4) the known part of the chain that is the robot's.
         camera: (m, 4, 4) `cam_from_target`.
         camera_covariance: (m, 6, 6) of the camera's right perturbations; None where unknown.
-        shared: What moves all camera poses together; None where they are held.
+        effects: What moves the views together, at each view in place of a stop.
         guess: The edges near which rotations were supplied, where places are all that was measured;
             None where the poses themselves were.
-        measured: What is known of the edges besides.
+        priors: What is known of the edges besides.
     """
 
     mount: Mount
     robot: FloatArray
     camera: FloatArray
     camera_covariance: FloatArray | None = None
-    shared: Shared | None = None
+    effects: tuple[Effect, ...] = ()
     guess: "Edges | None" = None
-    measured: tuple[Measured, ...] = ()
+    priors: tuple[FramePrior, ...] = ()
 
     def __len__(self) -> int:
         return len(self.robot)
@@ -82,61 +86,45 @@ class Closure:
     @cached_property
     def problem(self) -> Problem:
         """The frames and the views as the estimation has them."""
-        camera, target = ("flange", "base") if self.mount == "eye-in-hand" else ("base", "flange")
+        (camera, seer), (target, seen) = (it.split("_from_") for it in edge_names(self.mount))
         poses = self.robot if self.mount == "eye-in-hand" else invert(self.robot)
-        unknown = {"cam": Branch(camera), "target": Branch(target)}
+        unknown = {seer: Branch(camera), seen: Branch(target)}
         tree = Tree("base", {"flange": Branch("base", robot=ROBOT), **unknown})
-        known, shared, count = self.camera_covariance, self.shared, len(self)
+        known, count = self.camera_covariance, len(self)
         observations = Observations(
-            ("cam",) * count,
-            ("target",) * count,
+            (seer,) * count,
+            (seen,) * count,
             np.arange(count),
             np.full(count, -1),
             self.camera,
             np.zeros((count, 6, 6)) if known is None else known,
             np.ones(count, dtype=bool),
         )
-        effects: tuple[Effect, ...] = ()
-        if shared is not None:
-            known_of = Knowledge(shared.information, shared.pull)
-            effects = (
-                Effect(
-                    "shared",
-                    self.unchanged,
-                    known_of,
-                    shared.anchor > 0.0,
-                    shared.by_camera,
-                    {ROBOT: shared.by_flange},
-                ),
-            )
-        hangs = {0: (camera, "cam"), 1: (target, "target")}
         return Problem(
             tree,
             {ROBOT: poses},
             observations,
-            effects,
-            tuple(
-                FramePrior(*hangs[it.edge], it.axes, it.values_m, it.sigma_m)
-                for it in self.measured
-            ),
-            frozenset() if self.guess is None else frozenset({"target"}),
+            # What is shared counts from where it is.
+            tuple(replace(it, values=np.zeros(len(it))) for it in self.effects),
+            self.priors,
+            frozenset() if self.guess is None else frozenset({seen}),
             is_combined=known is None,
         )
 
     @property
     def unchanged(self) -> FloatArray:
         """(k,) no change of what is shared; k = 0 where it is held."""
-        return np.zeros(0 if self.shared is None else len(self.shared.information))
+        return np.zeros(sum(map(len, self.effects)))
 
     def subset(self, chosen: Mask) -> "Closure":
         """Returns the views of an (m,) mask."""
-        known, shared = self.camera_covariance, self.shared
+        known = self.camera_covariance
         return replace(
             self,
             robot=self.robot[chosen],
             camera=self.camera[chosen],
             camera_covariance=None if known is None else known[chosen],
-            shared=None if shared is None else shared.subset(chosen),
+            effects=tuple(it.of_stops(chosen).take(np.flatnonzero(chosen)) for it in self.effects),
         )
 
     @property
@@ -146,13 +134,23 @@ class Closure:
             return np.full(len(self), 6)
         return np.asarray(np.sum(np.linalg.eigvalsh(self.camera_covariance) < _OPEN, axis=1))
 
-    def with_more(self, more: Shared) -> "Closure":
+    def with_more(self, *more: Effect) -> "Closure":
         """Returns the views with more unknowns that they share, behind those that are there."""
-        return replace(self, shared=more if self.shared is None else self.shared.joined(more))
+        return replace(self, effects=(*self.effects, *(it for it in more if len(it))))
+
+    def only(self, columns: slice) -> "Closure":
+        """Returns the views with some of the unknowns that they share, and no others."""
+        places, found, at = np.arange(len(self.unchanged))[columns], [], 0
+        for it in self.effects:
+            mine = places[(places >= at) & (places < at + len(it))] - at
+            at += len(it)
+            if len(mine):
+                found.append(it.only(slice(mine[0], mine[-1] + 1)))
+        return replace(self, effects=tuple(found))
 
     def with_first(self, count: int) -> "Closure":
         """Returns the views with the first of the unknowns that they share, and no others."""
-        return replace(self, shared=None if self.shared is None else self.shared.only(slice(count)))
+        return self.only(slice(count))
 
     def merged(self, stops: IntArray) -> "Closure":
         """Makes one view of all that were taken at one stop of the robot.
@@ -170,14 +168,14 @@ class Closure:
 
     def under(self, change: FloatArray) -> "Closure":
         """Returns the views as they look when what is shared changes by (k,)."""
-        if self.shared is None or not len(change):
+        if not len(change):
             return self
-        flange = exp(self.shared.by_flange @ change)
-        if self.mount == "eye-in-hand":
-            robot = self.robot @ flange
-        else:
-            robot = invert(invert(self.robot) @ flange)
-        return replace(self, robot=robot, camera=self.camera @ exp(self.shared.by_camera @ change))
+        robot, by_flange = self.robot, self.problem.by_flange.get(ROBOT)
+        if by_flange is not None:
+            flange = exp(by_flange @ change)
+            hand = self.mount == "eye-in-hand"
+            robot = robot @ flange if hand else invert(invert(robot) @ flange)
+        return replace(self, robot=robot, camera=self.camera @ exp(self.problem.by_sensor @ change))
 
     def placed(self, x: FloatArray) -> FloatArray:
         """Where each view places the target: (m, 4, 4) `robot * x * camera`."""
@@ -188,9 +186,21 @@ class Closure:
         return invert(self.robot @ x) @ z
 
 
+def edge_names(mount: Mount) -> tuple[str, str]:
+    """Names of the two unknown edges, in the order x, z."""
+    if mount == "instrument":
+        return "base_from_instrument", "flange_from_probe"
+    if mount == "eye-in-hand":
+        return "flange_from_cam", "base_from_target"
+    return "base_from_cam", "flange_from_target"
+
+
 def _joined(groups: Sequence[Closure]) -> Closure:
+    """One view of each group; what its views disagree on tells of all that they share together."""
     robot, camera, spreads, shifts, arms = [], [], [], [], []
-    shared = groups[0].shared
+    known_of = [it.known for it in groups[0].effects]
+    information_of = np.asarray(block_diag(np.zeros((0, 0)), *(it.information for it in known_of)))
+    pull = np.concatenate([np.zeros(0), *(it.pull for it in known_of)])
     for group in groups:
         first = group.camera[0]
         known = group.camera_covariance
@@ -202,22 +212,24 @@ def _joined(groups: Sequence[Closure]) -> Closure:
         mean = np.einsum("mij,mj->i", shares, away)
         camera.append(first @ exp(mean))
         spreads.append(spread)
-        if group.shared is None or shared is None:
-            continue
-        shift = np.einsum("mij,mjk->ik", shares, group.shared.by_camera)
+        by_sensor, by_flange = group.problem.by_sensor, group.problem.by_flange
+        shift = np.einsum("mij,mjk->ik", shares, by_sensor)
         shifts.append(shift)
-        arms.append(group.shared.by_flange[0])
+        arms.append(by_flange[ROBOT][0] if by_flange else np.zeros_like(shift))
         if known is not None and len(group) > 1:
-            shared = shared.told(information, group.shared.by_camera - shift, away - mean)
+            slopes = by_sensor - shift
+            weighted = np.swapaxes(slopes, 1, 2) @ information
+            information_of = information_of + np.sum(weighted @ slopes, axis=0)
+            pull = pull + np.einsum("mij,mj->i", weighted, away - mean)
+    held = np.concatenate([np.zeros(0, dtype=bool), *(it.held for it in groups[0].effects)])
+    both, flange = Knowledge(information_of, pull), {ROBOT: np.array(arms)}
     return replace(
         groups[0],
         robot=np.array(robot),
         camera=np.array(camera),
         camera_covariance=None if groups[0].camera_covariance is None else np.array(spreads),
-        shared=None
-        if shared is None
-        else replace(shared, by_camera=np.array(shifts), by_flange=np.array(arms)),
-    )
+        effects=(),
+    ).with_more(Effect("all", np.zeros(len(pull)), both, held, np.array(shifts), flange))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from visioncal.estimation.boards import Boards
 from visioncal.estimation.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.measured import Measured
+from visioncal.estimation.problem import ROBOT, FramePrior
 from visioncal.targets import first_corners, numbered_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
 
@@ -83,7 +83,7 @@ class Arm:
         of_links: Whether these are errors of its own links.
         boards: What the views show, where there are several boards.
         errors: Their size, where they are free.
-        measured: What is known of the edges besides.
+        priors: What is known of the edges besides.
     """
 
     robot: FloatArray
@@ -92,7 +92,7 @@ class Arm:
     of_links: bool
     boards: Boards
     errors: ArmErrors | None = None
-    measured: tuple[Measured, ...] = ()
+    priors: tuple[FramePrior, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,12 +380,12 @@ def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
         arm.robot,
         seen.compressed.cam_from_target,
         floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
-        free.shared(seen.compressed.by_shared[:, :, free.columns]),
-        measured=arm.measured,
+        (free.effect(seen.compressed.by_shared[:, :, free.columns]),),
+        priors=arm.priors,
     )
     data = arm.boards.brought(data)
     if arm.errors is not None:
-        data = data.with_more(arm.errors.shared())
+        data = data.with_more(arm.errors.effect(ROBOT))
     return data.merged(arm.stops)
 
 

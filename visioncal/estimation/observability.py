@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
 from visioncal.estimation.boards import Boards, place
-from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
+from visioncal.estimation.closure import Closure, Edges, Noise, closure_information, edge_names
 from visioncal.estimation.linalg import Spectrum, covariance, spectrum
 from visioncal.figures import figure
 from visioncal.transforms import invert, rotation_angle
@@ -61,15 +61,6 @@ class Direction:
         return f"{figure(self.sigma * scale)} {unit} (limit {figure(self.limit * scale)})"
 
 
-def edge_names(mount: Mount) -> tuple[str, str]:
-    """Names of the two unknown edges, in the order x, z."""
-    if mount == "instrument":
-        return "base_from_instrument", "flange_from_probe"
-    if mount == "eye-in-hand":
-        return "flange_from_cam", "base_from_target"
-    return "base_from_cam", "flange_from_target"
-
-
 def title(mount: Mount) -> str:
     """What messages about both edges begin with."""
     return "instrument" if mount == "instrument" else "hand-eye"
@@ -96,9 +87,9 @@ def check_observability(
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
     refuse_too_few(data)
-    held, still = replace(data, shared=None), replace(edges, shared=np.zeros(0))
-    if data.shared is not None and boards.unknowns:
-        held = replace(data, shared=data.shared.only(boards.places))
+    held, still = replace(data, effects=()), replace(edges, shared=np.zeros(0))
+    if data.effects and boards.unknowns:
+        held = data.only(boards.places)
         still = replace(edges, shared=edges.shared[boards.places])
     spread = spectrum(closure_information(held, still, noise))
     if spread.ratio < _NULL_RATIO:

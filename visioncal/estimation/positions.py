@@ -14,8 +14,9 @@ import numpy as np
 from visioncal.estimation.closure import Closure, Edges
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
+from visioncal.estimation.problem import Effect
 from visioncal.estimation.procrustes import align
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, compose, exp, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -130,21 +131,11 @@ def point_columns(points: IntArray, count: int) -> FloatArray:
     return columns
 
 
-def points_shared(columns: FloatArray) -> Shared:
-    """Puts the further points' places as unknowns of the chain, of which nothing is known.
-
-    Args:
-        columns: (m, 6, k) of `point_columns`.
-    """
-    size = columns.shape[2]
-    nothing = np.zeros(size)
-    return Shared(np.zeros((size, size)), nothing, nothing, columns, np.zeros_like(columns))
-
-
 def with_places(data: Closure, mounting: Mounting, columns: FloatArray) -> Closure:
     """Tells a chain of supplied poses what they were supplied from."""
-    data = replace(data, guess=mounting.edges)
-    return data.with_more(points_shared(columns)) if columns.shape[2] else data
+    size = columns.shape[2]
+    nothing = Knowledge(np.zeros((size, size)), np.zeros(size))
+    return replace(data, guess=mounting.edges).with_more(Effect.free("points", nothing, columns))
 
 
 def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:

@@ -14,6 +14,7 @@ free, or held: it then stays where it is, has no column in the solver, and count
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -31,6 +32,8 @@ _NOT_MEASURED = 1.0
 _OPEN = 0.05
 # Variance of a flange's error where nothing was observed of it [rad^2 and m^2]: nothing is known.
 ANYTHING = 1e4
+# What the only robot of a cell is called.
+ROBOT = "robot"
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +119,18 @@ class Effect:
     by_flange: Mapping[str, FloatArray] = field(default_factory=dict)
     concerned: Mask | None = None
 
+    @classmethod
+    def free(
+        cls,
+        name: str,
+        known: Knowledge,
+        by_sensor: FloatArray | None = None,
+        by_flange: Mapping[str, FloatArray] = MappingProxyType({}),
+    ) -> "Effect":
+        """An effect of free values, linearised where they are zero."""
+        size = len(known.pull)
+        return cls(name, np.zeros(size), known, np.zeros(size, dtype=bool), by_sensor, by_flange)
+
     def __len__(self) -> int:
         return len(self.values)
 
@@ -126,6 +141,26 @@ class Effect:
             by_sensor=None if self.by_sensor is None else self.by_sensor[rows],
             concerned=None if self.concerned is None else self.concerned[rows],
         )
+
+    def only(self, columns: slice) -> "Effect":
+        """Returns some of its values alone, as if nothing were open about the others."""
+        return replace(
+            self,
+            values=self.values[columns],
+            known=Knowledge(self.known.information[columns, columns], self.known.pull[columns]),
+            held=self.held[columns],
+            by_sensor=None if self.by_sensor is None else self.by_sensor[:, :, columns],
+            by_flange={name: it[:, :, columns] for name, it in self.by_flange.items()},
+        )
+
+    def carried(self, by: FloatArray) -> "Effect":
+        """Returns it for poses measured elsewhere on what was observed, by (n, 6, 6) adjoints."""
+        return self if self.by_sensor is None else replace(self, by_sensor=by @ self.by_sensor)
+
+    def of_stops(self, chosen: Mask) -> "Effect":
+        """Returns it for the stops of an (s,) mask."""
+        by_flange = {name: it[chosen] for name, it in self.by_flange.items()}
+        return replace(self, by_flange=by_flange)
 
     def flange_slopes(self, robot: str, stops: IntArray) -> FloatArray:
         """(n, 6, k) how a robot's flange moves at observations of (n,) stops."""
@@ -156,6 +191,11 @@ class FramePrior:
     sigma_m: float
     rotation: FloatArray | None = None
     sigma_rad: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """What `[prior.NAME]` calls it."""
+        return f"{self.first}_from_{self.second}"
 
     @property
     def matrix(self) -> FloatArray | None:

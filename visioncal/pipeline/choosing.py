@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel, blocks_of
-from visioncal.estimation.closure import ROBOT, Edges, distances
+from visioncal.estimation.closure import Edges, distances
+from visioncal.estimation.problem import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.estimation.arm import misfit_slopes
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import ROBOT
+from visioncal.estimation.problem import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
 from visioncal.types import FloatArray, IntArray

@@ -15,7 +15,7 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.boards import Boards
 from visioncal.estimation.closure import Closure, Noise
 from visioncal.estimation.joint import Scene
-from visioncal.estimation.measured import Measured
+from visioncal.estimation.problem import ROBOT, FramePrior
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
@@ -29,7 +29,7 @@ from visioncal.stages.handeye import HandEyeResult, robot_part
 from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
-from visioncal.stages.measured import measured_of
+from visioncal.stages.measured import priors_of
 from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
@@ -251,9 +251,9 @@ class Known:
         )
 
     @property
-    def measured(self) -> tuple[Measured, ...]:
+    def priors(self) -> tuple[FramePrior, ...]:
         """What is known of the edges besides; a closed form has no use for it."""
-        return measured_of(self.session) if self.solver == "joint" else ()
+        return priors_of(self.session) if self.solver == "joint" else ()
 
     def closure(self, views: Sequence[int]) -> Closure:
         """The chain's known parts for some views, each with its first or chosen pose."""
@@ -263,7 +263,7 @@ class Known:
             mount,
             robot_part(robot, mount),
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
-            measured=self.measured,
+            priors=self.priors,
         )
         if self.readings is not None and poses:
             data = self.readings.told_to(data, poses)
@@ -272,20 +272,20 @@ class Known:
             data = replace(
                 data,
                 camera_covariance=np.array([pose.covariance[0] for pose in poses]),
-                shared=None if self.free is None else self.free.shared(np.array(shift)),
+                effects=() if self.free is None else (self.free.effect(np.array(shift)),),
             )
         elif self.free is not None and len(self.free.columns):
             # Poses that others have measured do not move with lens and board.
             still = np.zeros((len(poses), 6, len(self.free.columns)))
-            data = replace(data, shared=self.free.shared(still))
+            data = data.with_more(self.free.effect(still))
         data = self.shown(views).brought(data)
         if self.clock is not None and self.clock.speeds and poses:
-            data = data.with_more(self.clock.shared(views))
+            data = data.with_more(self.clock.effect(views))
         if self.thermal is not None and self.heated_by is not None and poses:
-            data = data.with_more(self.thermal.shared(self._thermal_stops(views), self.heated_by))
+            data = data.with_more(self.thermal.effect(self._thermal_stops(views), self.heated_by))
         if self.arm is not None and self.arm.is_estimated and poses:
             errors = replace(self.arm, basis=self.arm_basis(views))
-            data = data.with_more(errors.shared(self.arm_values))
+            data = data.with_more(errors.effect(ROBOT, values=self.arm_values))
         return data
 
     def shown(self, views: Sequence[int]) -> Boards:

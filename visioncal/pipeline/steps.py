@@ -35,8 +35,7 @@ from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Findings, judge
 from visioncal.stages.kinematics import check_asked
-from visioncal.stages.measured import doubts as doubts_of_measured
-from visioncal.stages.measured import remarks as remarks_on_measured
+from visioncal.stages.measured import components
 from visioncal.stages.motion import waits_for_clock
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
@@ -307,7 +306,7 @@ def _arm(known: Known) -> Arm:
         known.arm_basis(known.used),
         known.joints_rad is not None,
         known.shown(known.used),
-        measured=known.measured,
+        priors=known.priors,
     )
 
 
@@ -355,11 +354,10 @@ def _hand_eye(known: Known) -> Known:
             known = replace(known, arm_model=model.moved(step[: known.arm_size]))
         if readings is not None:
             known = known.with_readings(readings.moved(result.edges))
-    if not known.measured:
-        return known
-    notes = remarks_on_measured(known.session, known.solved)
+    found = components(data.problem, known.solved.edges.state, known.solved.covariance)
+    notes = (it.remark for it in found if not it.is_contradicted)
     known = replace(known, notes=(*known.notes, *notes))
-    return known.noting((), doubts_of_measured(known.session, known.solved))
+    return known.noting((), (it.doubt for it in found if it.is_contradicted))
 
 
 def _is_aimed(known: Known) -> bool:

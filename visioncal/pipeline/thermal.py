@@ -7,7 +7,8 @@ import numpy as np
 
 from visioncal.estimation.arm import find_arm_errors
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import ROBOT, Edges, flange_to_residual, residual_blocks
+from visioncal.estimation.closure import Edges, flange_to_residual, residual_blocks
+from visioncal.estimation.problem import ROBOT
 from visioncal.estimation.solve import starting_noise
 from visioncal.pipeline.known import Known
 from visioncal.robot import Robot
@@ -116,7 +117,7 @@ def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
     noise, basis = starting_noise(problem), model.columns("links", q[first])
     links = find_arm_errors(problem, edges.state, noise, ROBOT, basis, of_links=True)
     if links is not None:
-        data = data.with_more(links.shared())
+        data = data.with_more(links.effect(ROBOT))
         edges = replace(edges, shared=data.unchanged)
     stops = Stops(q[first], _stamps(known))
     return fit_thermal(data, edges, model.robot, stops, inputs, robot)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from visioncal.errors import DataError
-from visioncal.estimation.observability import edge_names
+from visioncal.estimation.closure import edge_names
 from visioncal.pipeline.known import Known
 
 
@@ -11,7 +11,7 @@ def not_used(known: Known) -> Iterator[str]:
     """Says what the session declares and this version leaves aside."""
     session = known.session
     names = edge_names(session.mount)
-    used = [names[it.edge] for it in known.measured]
+    used = [it.name for it in known.priors]
     for edge in session.declaration.prior:
         if edge in used:
             continue

@@ -25,7 +25,8 @@ from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.closure import Closure, Edges, Noise, whitened_slopes
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import ROBOT, Effect, State
+from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import pose_slopes, postures, tool_slopes
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.purposes import Purpose
@@ -71,8 +72,8 @@ class Recorded:
     @property
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
-        shared = self.data.shared
-        return np.zeros((0, 0)) if shared is None else shared.information
+        known = (it.known.information for it in self.data.effects)
+        return np.asarray(block_diag(np.zeros((0, 0)), *known))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +180,7 @@ def stop_factors(
             robot_part(cell.robot.base_from_flange(q[seen]), cell.mount),
             poses[seen],
             floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
-            _shared(known, [found.by_shared[:, :, free.columns], elsewhere]),
+            (_effect(known, [found.by_shared[:, :, free.columns], elsewhere]),),
         )
         factors[seen] = _factors(cell, purpose, data, q[seen], cell.noise)
     return factors
@@ -244,8 +245,11 @@ def _world(
     if recorded is not None:
         rows = _recorded_factors(cell, purpose, recorded).reshape(-1, len(prior))
         known = rows.T @ rows
-        for it in recorded.data.measured:
-            known += it.information(cell.x, cell.z, len(known))
+        problem = recorded.data.problem
+        state = State(np.stack([cell.x, cell.z]), problem.start_values)
+        for it in problem.priors:
+            of_edges = problem.prior_rows(it, state)[1][:, :12]
+            known[:12, :12] += of_edges.T @ of_edges
     of_looks = np.sqrt(np.diag(covariance(shared))) if looks else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
@@ -273,13 +277,13 @@ def _factors(
 ) -> FloatArray:
     if purpose.blocks:
         basis = _model(cell.robot, purpose).basis(q)
-        data = data.with_more(ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).shared())
+        data = data.with_more(ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).effect(ROBOT))
     return whitened_slopes(data, Edges(cell.x, cell.z, data.unchanged), noise)
 
 
-def _shared(known: FloatArray, moved: list[FloatArray]) -> Shared:
-    by_camera, nothing = np.concatenate(moved, axis=2), np.zeros(len(known))
-    return Shared(known, nothing, nothing, by_camera, np.zeros_like(by_camera))
+def _effect(known: FloatArray, moved: list[FloatArray]) -> Effect:
+    beforehand = Knowledge(known, np.zeros(len(known)))
+    return Effect.free("lens and boards", beforehand, np.concatenate(moved, axis=2))
 
 
 def _model(robot: Robot, purpose: Purpose) -> ArmModel:

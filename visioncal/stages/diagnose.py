@@ -10,10 +10,11 @@ from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
 from visioncal.estimation.boards import Boards
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
-from visioncal.estimation.closure import ROBOT, Closure, fit_closure
+from visioncal.estimation.closure import Closure, fit_closure
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.estimation.problem import ROBOT
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray
@@ -137,9 +138,9 @@ def _sources(
         owners["temperature"] = np.arange(before, before + drifting)
     if arm is not None and arm.is_estimated:
         owners["arm"] = np.arange(shared - errors, shared)
-    first = 6 * len(data.problem.unknown)
+    first, observers = 6 * len(data.problem.unknown), data.problem.observations.observers
     return Sources(
-        {"cam": "instrument" if data.mount == "instrument" else "pixels"},
+        dict.fromkeys(observers, "instrument" if data.mount == "instrument" else "pixels"),
         {"robot": "poses" if data.camera_covariance is None else "robot"},
         {name: first + places for name, places in owners.items()},
     )

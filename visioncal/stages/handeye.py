@@ -9,7 +9,6 @@ from visioncal.errors import ConvergenceError
 from visioncal.estimation.arm import ArmErrors, misfit_covariance
 from visioncal.estimation.boards import Boards
 from visioncal.estimation.closure import (
-    ROBOT,
     Closure,
     ClosureFit,
     Edges,
@@ -28,6 +27,7 @@ from visioncal.estimation.observability import (
     refuse_too_few,
     title,
 )
+from visioncal.estimation.problem import ROBOT
 from visioncal.solvers import SOLVERS
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert

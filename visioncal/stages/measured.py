@@ -1,23 +1,24 @@
 """What a session knows of its unknown edges beforehand, and what it did to the answer, in words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.measured import Measured
-from visioncal.estimation.observability import SIGMA_LIMIT_M, edge_names
+from visioncal.estimation.closure import edge_names
+from visioncal.estimation.observability import SIGMA_LIMIT_M
+from visioncal.estimation.problem import FramePrior, Problem, State
 from visioncal.figures import figure
 from visioncal.session import Session
 from visioncal.session.tables import PriorTable
-from visioncal.stages.handeye import HandEyeResult
+from visioncal.types import FloatArray
 
 _COMPONENTS = ("x_m", "y_m", "z_m")
 # What was measured is contradicted by so many standard deviations.
 _CONTRADICTION = 3.0
 
 
-def measured_of(session: Session) -> tuple[Measured, ...]:
+def priors_of(session: Session) -> tuple[FramePrior, ...]:
     """The components of edges that a session states in [prior.EDGE].
 
     With several boards the target's edge is that of none in particular: it is left aside.
@@ -27,7 +28,8 @@ def measured_of(session: Session) -> tuple[Measured, ...]:
         prior = session.declaration.prior.get(edge)
         if prior is None or (place == 1 and len(session.boards) > 1):
             continue
-        found.append(Measured(place, *axes_of(prior), prior.sigma_m))
+        first, second = edge.split("_from_")
+        found.append(FramePrior(first, second, *axes_of(prior), prior.sigma_m))
     return tuple(found)
 
 
@@ -107,22 +109,40 @@ class Component:
         )
 
 
-def remarks(session: Session, result: HandEyeResult) -> Iterator[str]:
-    """Says which measured components the answer rests on."""
-    return (it.remark for it in _components(session, result) if not it.is_contradicted)
+def components(
+    problem: Problem,
+    state: State,
+    spread: FloatArray,
+    priors: Sequence[FramePrior] | None = None,
+) -> tuple[Component, ...]:
+    """The measured components of priors beside what the observations alone say of them.
+
+    Args:
+        problem: The observations in the fit.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
+        priors: Priors, in the problem or left out of it; None for those in it.
+    """
+    chosen = problem.priors if priors is None else priors
+    return tuple(it for prior in chosen for it in _components(prior, problem, state, spread))
 
 
-def doubts(session: Session, result: HandEyeResult) -> Iterator[str]:
-    """Says which measured components the views contradict."""
-    return (it.doubt for it in _components(session, result) if it.is_contradicted)
-
-
-def _components(session: Session, result: HandEyeResult) -> Iterator[Component]:
-    """Takes what was measured out of the answer again, one component after the other."""
-    edges = result.edges
-    for known in measured_of(session):
-        away = known.away_m(edges.x, edges.z)
-        found = known.sigmas_m(result.covariance, edges.x, edges.z)
-        for axis, stated, off, sigma in zip(known.axes, known.values_m, away, found, strict=True):
-            label = f"{_COMPONENTS[axis]} of {edge_names(session.mount)[known.edge]}"
-            yield Component.beside(label, stated, known.sigma_m, float(off), float(sigma))
+def _components(
+    prior: FramePrior, problem: Problem, state: State, spread: FloatArray
+) -> Iterator[Component]:
+    away, slopes = problem.prior_rows(prior, state)
+    sigmas = np.sqrt(np.einsum("dp,pq,dq->d", slopes, spread, slopes)) * prior.sigma_m
+    # Behind those of the rotation, which no word is said of.
+    places = slice(len(away) - len(prior.axes), len(away))
+    for axis, stated, off, sigma in zip(
+        prior.axes,
+        prior.values_m,
+        (away[places] * prior.sigma_m).tolist(),
+        sigmas[places].tolist(),
+        strict=True,
+    ):
+        label = f"{_COMPONENTS[axis]} of {prior.name}"
+        if prior in problem.priors:
+            yield Component.beside(label, stated, prior.sigma_m, off, sigma)
+        else:
+            yield Component(label, stated, prior.sigma_m, stated + off, sigma, False)

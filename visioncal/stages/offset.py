@@ -7,8 +7,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.clock import ClockFit, clock_shared
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.clock import ClockFit
+from visioncal.estimation.effects.clock import clock_effect
+from visioncal.estimation.problem import Effect
 from visioncal.estimation.turned import Match
 from visioncal.figures import figure
 from visioncal.session import View
@@ -48,7 +49,7 @@ class Clock:
     correlation: float | None
     speeds: Mapping[int, FloatArray]
 
-    def shared(self, views: Sequence[int]) -> Shared:
+    def effect(self, views: Sequence[int]) -> Effect:
         """The offset's error as an unknown of the chain of some views.
 
         It is known beforehand as well as it was told: the few used views, slow ones, count twice in
@@ -56,7 +57,7 @@ class Clock:
         """
         still = np.zeros(6)
         speeds = np.array([self.speeds.get(view, still) for view in views]).reshape(-1, 6)
-        return clock_shared(speeds, self.sigma_s)
+        return clock_effect(speeds, self.sigma_s)
 
     def document(self) -> dict[str, object]:
         """What calibration.json says of it."""

@@ -13,7 +13,7 @@ from visioncal.estimation.appearance import (
     compress,
 )
 from visioncal.estimation.arm import ArmErrors, find_arm_errors
-from visioncal.estimation.closure import ROBOT, Closure, Edges, fit_closure
+from visioncal.estimation.closure import Closure, Edges, fit_closure
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.joint import (
     Arm,
@@ -32,6 +32,7 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import worst_directions
+from visioncal.estimation.problem import ROBOT
 from visioncal.estimation.solve import left_out_residuals
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses

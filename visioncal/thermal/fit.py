@@ -18,14 +18,14 @@ from visioncal.estimation.closure import (
     closure_information,
     estimate_noise,
     fit_closure,
-    knowledge_of,
     noise_likelihood,
     normal_equations,
     residual_blocks,
 )
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import covariance, damped_step
-from visioncal.estimation.shared import Shared
+from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.thermal.heating import Heating, Inputs, Kind
 from visioncal.thermal.model import ThermalModel
@@ -47,8 +47,6 @@ LEAST_RISE_K, LEAST_SHARE = 3.0, 0.15
 # A parameter counts as told where its sigma is at most this share of its prior's.
 _TOLD = 0.8
 _ROUNDS, _SETTLED = 5, 1e-6
-# Information that holds a parameter against any residuals; what is known beforehand is one.
-_HELD = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +95,14 @@ class ThermalFit:
         names = parameter_names(self.model)
         return tuple(it for it, share in zip(names, self.told, strict=True) if share > _TOLD)
 
-    def shared(self, stops: Stops, inputs: Inputs) -> Shared:
+    def effect(self, stops: Stops, inputs: Inputs) -> Effect:
         """What is open about the parameters, as unknowns of the chain of some stops.
 
         They stay where they were found, and count in the covariance with what was known of them
         beforehand: what the stops tell of them the chain says itself.
         """
-        free = _shared(self.model, self.values, self.sigmas, stops, inputs)
-        return replace(free, anchor=np.full(len(self.values), _HELD))
+        free = _effect(self.model, self.values, self.sigmas, stops, inputs)
+        return replace(free, held=np.ones(len(self.values), dtype=bool))
 
 
 def parameter_names(model: ThermalModel) -> tuple[str, ...]:
@@ -233,10 +231,7 @@ class _Problem:
         information, gradient = normal_equations(seen, at, noise)
         whitened = np.linalg.solve(spread, residuals[:, :, None])[:, :, 0]
         cost = float(np.sum(residuals * whitened) + state.values @ state.values)
-        cost += sum(it.cost(at.x, at.z) for it in seen.measured)
-        if self.data.shared is not None:
-            known = knowledge_of(self.data, state.edges).pull[12:]
-            cost += float(state.edges.shared @ (self.data.shared.pull + known))
+        cost += seen.problem.cost_of_knowledge(at.state)
 
         def step(damping: float) -> _State:
             by = damped_step(information, gradient, damping)
@@ -250,19 +245,19 @@ class _Problem:
         model, stops = self.model(values), self.stops
         links = model.heating.links_c(self.inputs, stops.stamps_s)
         moved = moved_robot(self.data, model.motion(stops.q, links))
-        more = _shared(model, values, self.sigmas, stops, self.inputs)
+        more = _effect(model, values, self.sigmas, stops, self.inputs)
         return replace(self.data, robot=moved).with_more(more)
 
 
-def _shared(
+def _effect(
     model: ThermalModel, values: FloatArray, sigmas: FloatArray, stops: Stops, inputs: Inputs
-) -> Shared:
+) -> Effect:
     """The parameters as unknowns of a chain, in units of (p,) sigmas, at their (p,) values."""
     links = model.heating.links_c(inputs, stops.stamps_s)
     heated = model.heating.slopes(inputs, stops.stamps_s)
     basis = model.basis(stops.q, links, heated) * sigmas
-    size = len(values)
-    return Shared(np.eye(size), values, np.zeros(size), np.zeros_like(basis), basis)
+    known = Knowledge(np.eye(len(values)), values)
+    return Effect.free("temperature", known, by_flange={ROBOT: basis})
 
 
 def moved_robot(data: Closure, motion: FloatArray) -> FloatArray:
