@@ -10,7 +10,9 @@ from whole_cells import FLOOR, LATER, misfit, part, recorded, saved, simulated, 
 
 import visioncal as package
 from visioncal.calibration import Alignment, Calibration, RobotResult, to_document
+from visioncal.camera import project
 from visioncal.errors import DataError
+from visioncal.figures import significant
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -21,6 +23,7 @@ from visioncal.simulation import (
     simulate_network,
 )
 from visioncal.stored import load_result
+from visioncal.targets import corner_positions
 from visioncal.transforms import invert, log
 from visioncal.verification import verify
 
@@ -69,6 +72,59 @@ def test_the_file_has_the_sections_of_one_camera_by_name(folder):
     assert 0.02 < view["rms_px"] < 1.0
     assert written["rms"]["px"] > 0.0
     assert "null" not in (folder / "out" / "calibration.json").read_text()
+
+
+def test_the_file_says_what_each_frame_is_uncertain_by(folder, found):
+    budgets = json.loads((folder / "out" / "calibration.json").read_text())["uncertainty"]
+    assert budgets["budget_mm"].keys() == found.edges.keys()
+    for name, parts in budgets["budget_mm"].items():
+        assert parts["total"] == pytest.approx(found.edges[name].sigma_mm, rel=1e-6)
+        squares = [mm**2 for source, mm in parts.items() if source != "total"]
+        # Of lens and board, one may count for less than nothing, which is written as nothing.
+        assert sum(squares) == pytest.approx(parts["total"] ** 2, rel=0.05)
+        assert {"pixels of cam_left", "pixels of cam_hand", "robot a", "robot b"} <= parts.keys()
+    of_hand = budgets["budget_mm"]["flange_a_from_cam_hand"]
+    assert of_hand["pixels of cam_hand"] > of_hand["pixels of cam_left"]
+    html = (folder / "out" / "report.html").read_text()
+    assert "Where the uncertainty comes from" in html
+    assert f"{significant(of_hand['total'])}</td>" in html
+
+
+def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, folder):
+    session = Session.load(folder / "session")
+    stop = 7
+    rest = replace(session, views=tuple(it for it in session.views if it.stop != stop))
+    corners = session.corner_table.of_views([it.number for it in rest.views])
+    again = package.calibrate(replace(rest, corner_table=corners)).cell
+    mine = [it for it in found.cell.sights if it.stop == stop and it.left_out_px is not None]
+    away = []
+    for it in mine:
+        robots = {name: cell.base_from_flange[name][stop] for name in ("a", "b")}
+        pose = again.between(it.seer, it.seen, robots).matrix
+        seen = session.corners[it.view]
+        positions = corner_positions(session.plates[it.seen.removeprefix("target_")])
+        camera = again.cameras[it.seer].camera
+        off = project(camera, positions[seen.ids] @ pose[:3, :3].T + pose[:3, 3]) - seen.px
+        rms = np.sqrt(np.mean(np.sum(off**2, axis=1)))
+        away.append((it.left_out_px - rms, it.rms_px - rms))
+    # That fit has levels of noise of its own; they differ by a stop's share of what they rest on.
+    left_out, fitted = np.sum(np.abs(away), axis=0)
+    assert left_out < 0.2 * fitted
+
+
+def test_what_was_left_out_is_told_by_camera_and_target(folder, found):
+    written = json.loads((folder / "out" / "calibration.json").read_text())["validation"]
+    assert written["method"] == "leave-one-out over stops"
+    assert {(it["camera"], it["target"]) for it in written["pairs"]} >= {
+        ("left", "plate_a"),
+        ("left", "plate_b"),
+        ("hand", "floor"),
+    }
+    # Unseen views are off by more than those that were fitted, but not by much with 20 stops.
+    assert 1.0 < written["held_out"]["px"] / found.rms.px < 1.3
+    one = found.of("hand", target="floor").validation
+    pair = next(it for it in written["pairs"] if it["camera"] == "hand" and it["target"] == "floor")
+    assert (one.method, one.held_out.mm) == (written["method"], pair["mm"])
 
 
 def test_it_reads_back_as_it_was_written(found, folder, tmp_path):

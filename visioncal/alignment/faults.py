@@ -13,6 +13,7 @@ from visioncal.estimation.closure import deviations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import by_noise_alone
 from visioncal.figures import figure
+from visioncal.stages.validate import apart
 from visioncal.transforms import mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -190,9 +191,8 @@ def _stop(solved: Solved, row: int) -> int:
 
 def residuals(solved: Solved) -> FloatArray:
     """Distance (n, 2) of each observation from what is predicted [mm], [deg]."""
-    problem, state = solved.agreed.problem, solved.agreed.fit.state
-    pairs = zip(problem.predicted(state), problem.measured(state), strict=True)
-    return np.array([pose_difference(a, b) for a, b in pairs]).reshape(-1, 2)
+    away_m, away_rad = apart(solved.agreed.problem, solved.agreed.fit.state)
+    return np.stack([1e3 * away_m, np.rad2deg(away_rad)], axis=1)
 
 
 def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:

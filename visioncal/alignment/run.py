@@ -29,6 +29,7 @@ from visioncal.alignment.judging import (
 from visioncal.alignment.looking import Looked, look_around, stated_camera
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
+from visioncal.alignment.unseen import budget_mm, left_out
 from visioncal.alignment.written import corner_residuals, fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
@@ -37,6 +38,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.measured import components
 from visioncal.stages.offset import Clock
+from visioncal.stages.validate import HeldOut
 from visioncal.targets import target_document
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, Progress
@@ -109,7 +111,11 @@ def alignment_of(
         for name, it in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
-    moved, noise = movements(solved), _noise(solved)
+    moved, noise, held_out = movements(solved), _noise(solved), left_out(solved)
+    budget = {
+        f"{parents[it.name]}_from_{it.name}": mm
+        for it, mm in ((named[key], mm) for key, mm in budget_mm(solved).items())
+    }
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
     return Alignment(
         session_name=session.name,
@@ -122,7 +128,8 @@ def alignment_of(
         joint_covariance=spread[: 6 * len(edges), : 6 * len(edges)],
         cameras=_cameras(solved, looked, spread, len(edges)),
         noise=noise,
-        sights=_sights(cell, solved),
+        sights=_sights(cell, solved, held_out),
+        left_out=held_out.method if np.isfinite(held_out.away_m).any() else "",
         moved=moved,
         untied=untied,
         weakest=weakest_link(solved.cell, last),
@@ -138,7 +145,10 @@ def alignment_of(
         details=_details(clocks, solved, spread),
         arms=_arms(session),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
-        stages=fit_sections(session, solved, spread, len(edges)),
+        stages={
+            **fit_sections(session, solved, spread, len(edges)),
+            "uncertainty": {"budget_mm": budget},
+        },
     )
 
 
@@ -288,29 +298,30 @@ def _cameras(
     return found
 
 
-def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
+def _sights(cell: Cell, solved: Solved, held_out: HeldOut) -> tuple[Sight, ...]:
     """What became of each observation, in the order of the session's rows."""
-    away, why, corners = residuals(solved), reasons(solved), corner_residuals(solved)
-    found = {
-        row.view: Sight(
+    rows, used = solved.cell.rows, solved.agreed.used
+    away, why = residuals(solved), reasons(solved)
+    corners = corner_residuals(solved, solved.agreed.fit.state, np.arange(len(rows)))
+    unseen = np.full((len(rows), 3), np.nan)
+    unseen[used] = np.stack(
+        [1e3 * held_out.away_m, np.rad2deg(held_out.away_rad), held_out.rms_px], axis=1
+    )
+    found = {}
+    for at, row in enumerate(rows):
+        mm, deg = _known(away[at])
+        found[row.view] = Sight(
             row.view,
             solved.cell.stops[row.station],
             row.seer,
             row.seen,
-            bool(used),
+            bool(used[at]),
             why.get(row.view, ""),
-            float(mm),
-            float(deg) if turned else None,
+            mm,
+            deg,
             *corners.get(row.view, (None, None)),
+            *_known(unseen[at]),
         )
-        for row, used, turned, (mm, deg) in zip(
-            solved.cell.rows,
-            solved.agreed.used,
-            solved.agreed.problem.observations.has_rotation,
-            away,
-            strict=True,
-        )
-    }
     lost = solved.cell.reasons
     for it in cell.session.observations:
         number = it.view.number
@@ -318,3 +329,8 @@ def _sights(cell: Cell, solved: Solved) -> tuple[Sight, ...]:
             stop = cell.stops[it.station] if it.station < len(cell.stops) else number
             found[number] = Sight(number, stop, it.seer, it.seen, False, lost.get(number, ""))
     return tuple(found[it] for it in (view.number for view in cell.session.views) if it in found)
+
+
+def _known(figures: FloatArray) -> list[float | None]:
+    """Figures, None in the place of those that are not known."""
+    return [it if np.isfinite(it) else None for it in figures.tolist()]

@@ -48,9 +48,13 @@ class Solved:
     @property
     def looks(self) -> Looks | None:
         """Lenses and boards as they were found; None without images."""
+        return self.looks_at(self.agreed.fit.state)
+
+    def looks_at(self, state: State) -> Looks | None:
+        """Lenses and boards as some state has them; None without images."""
         if self.seen is None:
             return None
-        found = self.agreed.problem.values_of(LENSES, self.agreed.fit.state)
+        found = self.agreed.problem.values_of(LENSES, state)
         return self.seen.looks.with_values(self.seen.free, found)
 
     def columns_of(self, places: IntArray) -> IntArray:

@@ -7,19 +7,26 @@ import numpy as np
 from visioncal.alignment.solving import Solved
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.estimation.corners import reproject
+from visioncal.estimation.problem import State
 from visioncal.session import Session
 from visioncal.session.frames import thing_name
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
 
 
-def corner_residuals(solved: Solved) -> dict[int, tuple[int, float]]:
-    """By view, how many corners its image has, and how far they are off the whole chain [px]."""
-    seen, looks = solved.seen, solved.looks
-    if seen is None or looks is None:
+def corner_residuals(solved: Solved, state: State, rows: IntArray) -> dict[int, tuple[int, float]]:
+    """By view, how many corners its image has, and how far they are off the whole chain [px].
+
+    Args:
+        solved: The fit.
+        state: Its unknowns, or those of another fit to a part of the observations.
+        rows: (m,) the observations.
+    """
+    looks = solved.looks_at(state)
+    if looks is None:
         return {}
-    problem = solved.agreed.problem
-    chain = problem.predicted(solved.agreed.fit.state)
-    predicted = {row.view: it for row, it in zip(solved.cell.rows, chain, strict=True)}
+    chosen = np.isin(np.arange(len(solved.cell.rows)), rows)
+    chain = solved.agreed.problem.subset(chosen).predicted(state)
+    predicted = {solved.cell.rows[at].view: it for at, it in zip(rows.tolist(), chain, strict=True)}
     shaped = np.concatenate(looks.corners)
     found: dict[int, tuple[int, float]] = {}
     for name, corners in looks.problems.items():

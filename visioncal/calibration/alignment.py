@@ -56,6 +56,9 @@ class Sight:
         residual_deg: The same in rotation [deg]; None where a place alone was read.
         corners: How many corners were found in its image.
         rms_px: Reprojection error through the whole chain of frames [px].
+        left_out_mm: How far it is from what a fit predicts that was made without its stop [mm].
+        left_out_deg: The same in rotation [deg].
+        left_out_px: Reprojection error by such a fit [px].
     """
 
     view: int
@@ -68,6 +71,9 @@ class Sight:
     residual_deg: float | None = None
     corners: int | None = None
     rms_px: float | None = None
+    left_out_mm: float | None = None
+    left_out_deg: float | None = None
+    left_out_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -126,7 +132,9 @@ class Alignment:
         arms: The robots by name; one that has no name goes by `robot`.
         targets: What was printed, by name as it is described.
         placed: Tools and fixtures by the transform that places them, as `flange_a_from_tool`.
-        stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`.
+        stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`,
+            `uncertainty`.
+        left_out: How observations were left out of fits in turn, in words; empty where none was.
     """
 
     session_name: str
@@ -149,6 +157,7 @@ class Alignment:
     targets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     placed: Mapping[str, Frame] = field(default_factory=dict)
     stages: Mapping[str, Any] = field(default_factory=dict)
+    left_out: str = ""
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:

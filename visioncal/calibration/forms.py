@@ -105,6 +105,8 @@ WHOLE: Form = MappingProxyType(
         "frames?": {"": FRAME},
         "details": {},
         "boards?": {"": _BOARD},
+        "validation?": {"method": str, "held_out": _RMS, "pairs": [_RMS]},
+        "uncertainty?": {"budget_mm": {"": {"": float}}},
         "joint_fit?": {"cameras": {"": [int]}, "targets": {"": [int]}, "covariance": [[float]]},
     }
 )

@@ -1,17 +1,17 @@
 """The calibration of one camera, one robot and one target out of that of a whole cell."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.calibration.alignment import Alignment
+from visioncal.calibration.alignment import Alignment, Sight
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame
 from visioncal.calibration.parts import CameraResult, Rms, RobotResult, Validation, Verdict
-from visioncal.calibration.whole import rms_of, view_results
+from visioncal.calibration.whole import left_out_rms, rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
 from visioncal.transforms import adjoint, invert
@@ -36,7 +36,7 @@ def whole_fields(cell: Alignment) -> dict[str, Any]:
         "noise": {},
         "views": view_results(cell.sights),
         "rms": rms,
-        "validation": Validation(NOT_LEFT_OUT, rms),
+        "validation": _validation(cell, cell.sights),
         "verdict": cell.verdict,
         "frames": cell.placed,
         "cell": cell,
@@ -71,7 +71,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "noise": _noise(cell, chosen, rms),
         "views": view_results(sights),
         "rms": rms,
-        "validation": Validation(NOT_LEFT_OUT, rms),
+        "validation": _validation(cell, sights),
         "verdict": _verdict(cell),
         "camera": _camera(cell.cameras.get(chosen.camera), slopes),
         "robot": arm.model,
@@ -79,6 +79,13 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "stages": {**arm.stages, **_shapes(cell, chosen), **_joint_fit(cell, chosen, slopes)},
         "cell": None,
     }
+
+
+def _validation(cell: Alignment, sights: Sequence[Sight]) -> Validation:
+    """Residuals of some observations by fits that were made without them."""
+    if not cell.left_out:
+        return Validation(NOT_LEFT_OUT, rms_of(sights))
+    return Validation(cell.left_out, left_out_rms(sights))
 
 
 def placed_name(cell: Alignment, choice: Choice, needs: Collection[Part], name: str) -> str:

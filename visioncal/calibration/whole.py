@@ -5,6 +5,7 @@ What differs: `tree` says what each frame hangs on, `reference` which frame the 
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -30,6 +31,7 @@ from visioncal.version import __version__
 _OF_ROBOTS = ("kinematics", "elastic", "thermal", "arm_errors")
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "created", "session", "reference", "tree", "transforms", "noise"}
+    | {"validation"}
     | {"joint_covariance", "cameras", "robots", "targets", "views", "rms", "moved", "untied"}
     | {"weakest", "verdict", "frames", "details"}
 )
@@ -68,6 +70,8 @@ def whole_document(cell: Alignment) -> dict[str, Any]:
         "verdict": {"status": cell.verdict.status, "reasons": list(cell.verdict.reasons)},
         "details": dict(cell.details),
     }
+    if cell.left_out:
+        document["validation"] = _validation_document(cell)
     if cell.placed:
         document["frames"] = frames_document(cell.placed)
     return document | dict(cell.stages)
@@ -109,7 +113,44 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
         targets={name: dict(it) for name, it in document["targets"].items()},
         placed=read_frames(document.get("frames", {})),
         stages={name: value for name, value in document.items() if name not in _OWN_KEYS},
+        left_out=document.get("validation", {}).get("method", ""),
     )
+
+
+def _validation_document(cell: Alignment) -> dict[str, Any]:
+    """Residuals of what was left out of fits in turn: of all, and by camera and target."""
+    pairs: dict[tuple[str, str], list[Sight]] = {}
+    for it in cell.sights:
+        if it.left_out_mm is not None:
+            pairs.setdefault((it.seer, it.seen), []).append(it)
+    return {
+        "method": cell.left_out,
+        "held_out": present(vars(left_out_rms(cell.sights))),
+        "pairs": [
+            {
+                **_seer_and_seen(mine[0]),
+                "views": len(mine),
+                **present(vars(left_out_rms(mine))),
+            }
+            for mine in pairs.values()
+        ],
+    }
+
+
+def _seer_and_seen(sight: Sight) -> dict[str, str]:
+    """What saw, and what was seen, by their kinds."""
+    seer = "camera" if sight.seer in frames_of_kind([sight.seer], "camera") else "instrument"
+    seen = "target" if sight.seen in frames_of_kind([sight.seen], "target") else "point"
+    return {seer: thing_name(sight.seer, seer), seen: thing_name(sight.seen, seen)}
+
+
+def left_out_rms(sights: Iterable[Sight]) -> Rms:
+    """Root mean square residuals of observations by fits that were made without them."""
+    unseen = (
+        replace(it, residual_mm=it.left_out_mm, residual_deg=it.left_out_deg, rms_px=it.left_out_px)
+        for it in sights
+    )
+    return rms_of(unseen)
 
 
 def rms_of(sights: Iterable[Sight]) -> Rms:
@@ -156,13 +197,10 @@ def _arm(document: Mapping[str, Any]) -> RobotResult:
 
 def _view_document(cell: Alignment, sight: Sight) -> dict[str, Any]:
     """One observation: its thing that sees, what is seen, and the robots that part them."""
-    seer = "camera" if sight.seer in frames_of_kind([sight.seer], "camera") else "instrument"
-    seen = "target" if sight.seen in frames_of_kind([sight.seen], "target") else "point"
     both = {sight.seer, sight.seen} <= cell.frames.keys()
     robots = robots_between(cell.frames, sight.seer, sight.seen) if both else ()
     figures = {name: it for name, it in vars(sight).items() if name not in ("seer", "seen")}
-    named = {seer: thing_name(sight.seer, seer), seen: thing_name(sight.seen, seen)}
-    of = {"view": sight.view, "stop": sight.stop, **named}
+    of = {"view": sight.view, "stop": sight.stop, **_seer_and_seen(sight)}
     return present(of | {"robots": [it or "robot" for it in robots]} | figures)
 
 

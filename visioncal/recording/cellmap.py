@@ -23,6 +23,8 @@ class Pair:
         left_out: How many it did not.
         rms_mm: Root mean square of what those used are off [mm]; None where none was used.
         rms_deg: The same in rotation [deg].
+        unseen_mm: The same of fits that were made without their stops [mm].
+        unseen_deg: And in rotation [deg].
     """
 
     seer: str
@@ -31,6 +33,8 @@ class Pair:
     left_out: int
     rms_mm: float | None
     rms_deg: float | None
+    unseen_mm: float | None
+    unseen_deg: float | None
 
 
 def pairs(found: Alignment) -> tuple[Pair, ...]:
@@ -41,7 +45,12 @@ def pairs(found: Alignment) -> tuple[Pair, ...]:
     listed = []
     for (seer, seen), mine in rows.items():
         used = [found.sights[at] for at in mine if found.sights[at].used]
-        rms = (_rms([it.residual_mm for it in used]), _rms([it.residual_deg for it in used]))
+        rms = (
+            _rms([it.residual_mm for it in used]),
+            _rms([it.residual_deg for it in used]),
+            _rms([it.left_out_mm for it in used]),
+            _rms([it.left_out_deg for it in used]),
+        )
         listed.append(Pair(seer, seen, len(used), len(mine) - len(used), *rms))
     return tuple(listed)
 

@@ -19,6 +19,8 @@ from visioncal.version import __version__
 
 _DEG = "\N{DEGREE SIGN}"
 _WIDE_IN = 9.2
+# Of a frame's sigma, as it counts in its square.
+_LEAST_SHARE = 0.1
 _KINDS = {
     "robot": "flange",
     "camera": "cam",
@@ -87,6 +89,7 @@ def render_cell(found: Alignment) -> str:
         tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
         edges=cards,
         frames=tools.frame_cards(Calibration.whole(found)),
+        sources=source_table(found),
         noise=_noise_facts(found),
         arms=_arm_facts(found),
         lenses=[(name, _lens_facts(it)) for name, it in found.cameras.items()],
@@ -133,6 +136,8 @@ def _link_row(pair: cellmap.Pair) -> dict[str, str | int]:
         "left_out": pair.left_out,
         "mm": significant(pair.rms_mm),
         "deg": significant(pair.rms_deg),
+        "unseen_mm": significant(pair.unseen_mm),
+        "unseen_deg": significant(pair.unseen_deg),
     }
 
 
@@ -166,6 +171,29 @@ def _between(found: Alignment, first: str, second: str) -> str:
 def _is_turned(found: Alignment, frame: str) -> bool:
     """Whether a frame's rotation was measured, or is what others are told in."""
     return frame in (*found.robots, found.reference) or found.edge_of(frame).oriented
+
+
+def source_table(found: Alignment) -> PairTable | None:
+    """What each frame's place is uncertain by, source by source [mm]; None where that is unknown.
+
+    A source that counts for less than a hundredth of every frame's variance is left out.
+    """
+    budgets: Mapping[str, Mapping[str, float]] = found.stages.get("uncertainty", {}).get(
+        "budget_mm", {}
+    )
+    if not budgets:
+        return None
+    names = dict.fromkeys(name for it in budgets.values() for name in it)
+    shown = [
+        name
+        for name in names
+        if any(it.get(name, 0.0) > _LEAST_SHARE * it["total"] for it in budgets.values())
+    ]
+    rows = tuple(
+        PairRow(edge, tuple(significant(it.get(name)) for name in shown))
+        for edge, it in budgets.items()
+    )
+    return PairTable("", tuple(shown), rows)
 
 
 def _noise_facts(found: Alignment) -> list[Fact]:

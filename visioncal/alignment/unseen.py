@@ -1,0 +1,85 @@
+"""Observations of a whole cell that no fit has seen, and what its uncertainty is made of."""
+
+import numpy as np
+
+from visioncal.alignment.solving import Solved
+from visioncal.alignment.written import corner_residuals
+from visioncal.estimation.appearance import shape_slices
+from visioncal.estimation.budget import Sources, covariance_by_source
+from visioncal.estimation.effects.lenses import LENSES
+from visioncal.estimation.problem import State
+from visioncal.estimation.solve import solve_problem
+from visioncal.stages.validate import HeldOut, validate
+from visioncal.types import FloatArray, IntArray, Mask
+
+
+def left_out(solved: Solved) -> HeldOut:
+    """Residuals of the used observations, each by a fit without its stop."""
+    fit, used = solved.agreed.fit, np.flatnonzero(solved.agreed.used)
+    problem = solved.agreed.problem.subset(solved.agreed.used)
+    needs = [frozenset[str]()] * len(problem)
+    for group in problem.groups:
+        frames = frozenset(it.frame for it in group.path if it.frame in problem.unknown)
+        for row in group.rows.tolist():
+            needs[row] = frames
+
+    def again(kept: Mask) -> State:
+        return solve_problem(problem.subset(kept), fit.state, fit.noise)[0]
+
+    def pixels(rows: IntArray, state: State) -> FloatArray:
+        found, every = corner_residuals(solved, state, used[rows]), solved.cell.rows
+        return np.array([found.get(every[it].view, (0, np.nan))[1] for it in used[rows].tolist()])
+
+    stops = np.unique(problem.observations.stops, return_inverse=True)[1]
+    return validate(problem, stops, needs, again, pixels)
+
+
+def budget_mm(solved: Solved) -> dict[str, dict[str, float]]:
+    """Sigmas of each unknown frame's place in its parent, by source and as a `total` [mm]."""
+    fit, part = solved.agreed.fit, solved.agreed.problem.subset(solved.agreed.used)
+    parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
+    parts["total"] = sum(parts.values(), np.zeros((6 * len(part.unknown),) * 2))
+    found: dict[str, dict[str, float]] = {}
+    for key in part.unknown:
+        at = part.edge_columns(key).start
+        place = slice(at + 3, at + 6)
+        squares = {name: float(np.trace(it[place, place])) for name, it in parts.items()}
+        # Of two that make up for each other, one may count for less than nothing.
+        found[key] = {name: 1e3 * max(it, 0.0) ** 0.5 for name, it in squares.items()}
+    return found
+
+
+def _sources(solved: Solved) -> Sources:
+    """What makes the result uncertain, by camera, robot and board."""
+    problem = solved.agreed.problem
+    of_corners = () if solved.looks is None else tuple(solved.looks.problems)
+    columns = {
+        name: np.arange(problem.size)[it]
+        for name, it in problem.effect_columns.items()
+        if name != LENSES
+    }
+    return Sources(
+        {
+            frame: f"pixels of {frame}" if frame in of_corners else f"readings of {frame}"
+            for frame in problem.observations.observers
+        },
+        {robot: f"robot {robot}" for robot in problem.robots},
+        columns | _looks(solved),
+    )
+
+
+def _looks(solved: Solved) -> dict[str, IntArray]:
+    """Columns of each lens and each board, as far as they are free."""
+    seen, looks = solved.seen, solved.looks
+    if seen is None or looks is None:
+        return {}
+    boards = solved.cell.session.boards
+    places = {f"intrinsics of {name}": it for name, it in looks.lenses.items()}
+    slices = shape_slices(tuple(boards.values()), looks.boards.start)
+    for name, it in zip(boards, slices, strict=True):
+        places[f"board {name}".strip()] = it
+    free = {
+        name: seen.free[(seen.free >= it.start) & (seen.free < it.stop)]
+        for name, it in places.items()
+    }
+    return {name: solved.columns_of(it) for name, it in free.items() if len(it)}
