@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from visioncal.estimation.clock import clock_closure
-from visioncal.estimation.closure import Edges, closure_jacobian
+from visioncal.estimation.clock import clock_problem
+from visioncal.estimation.problem import State
 from visioncal.estimation.trajectory import Samples, Trajectory
 from visioncal.estimation.turned import Frames
 from visioncal.transforms import exp, invert, log
@@ -78,11 +78,11 @@ def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
     moved, at_s = sampled(500), np.linspace(0.5, 9.5, 40)
     robot = swung(at_s) if mount == "eye-in-hand" else invert(swung(at_s))
     frames = Frames(mount, at_s, invert(robot @ x) @ z @ exp(1e-3 * rng.normal(size=(40, 6))))
-    edges, step_s = Edges(x, z, np.zeros(1)), 1e-4
+    state, step_s = State(np.stack([x, z]), np.zeros(1)), 1e-4
     residuals = [
-        log(invert(z) @ clock_closure(moved, frames, it).placed(x)) for it in (-step_s, step_s)
+        clock_problem(moved, frames, it).linear(state).residuals for it in (-step_s, step_s)
     ]
-    column = closure_jacobian(clock_closure(moved, frames, 0.0), edges)[:, :, 12]
+    column = clock_problem(moved, frames, 0.0).linear(state).jacobian[:, :, 12]
     difference = (residuals[1] - residuals[0]) / (2 * step_s)
     # Speeds are means over 0.04 s: 2e-3 of the fastest, which a lever of metres enlarges.
     np.testing.assert_allclose(column, difference, atol=4e-3 * np.abs(difference).max())

@@ -9,21 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    closure_information,
-    fit_closure,
-    residual_blocks,
-)
+from visioncal.estimation.chain import chain
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.linalg import covariance
+from visioncal.estimation.outliers import closed_form
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import Solution, fisher_information, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
-from visioncal.solvers import SOLVERS
 from visioncal.threads import one_blas_thread
-from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray, Mask
 
 # A start from more frames is no better; a fit of more takes long.
@@ -44,15 +38,13 @@ class ClockFit:
     Attributes:
         offset_s: What the camera's clock is ahead of the robot's [s].
         sigma_s: Its standard deviation [s]; very large where the motion does not tell it.
-        edges: Both edges, as the moving frames have them.
-        noise: What is left between them.
+        fit: Both edges, as the moving frames have them, and the noise.
         frames: How many frames it rests on.
     """
 
     offset_s: float
     sigma_s: float
-    edges: Edges
-    noise: Noise
+    fit: Solution
     frames: int
 
 
@@ -99,7 +91,7 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
 
 def _left(fit: ClockFit) -> float:
     """What a fit leaves of rotations and positions, as its likelihood has it."""
-    return fit.noise.sigma_rad * fit.noise.sigma_m
+    return float(fit.fit.noise.robots.prod())
 
 
 def _evenly(count: int, most: int) -> IntArray:
@@ -112,36 +104,30 @@ def _fitted(robot: Trajectory, frames: Frames, offset_s: float) -> ClockFit | No
     if fit is None:
         return None
     near = _covered(robot, frames, fit.offset_s)
-    data = clock_closure(robot, near, fit.offset_s)
-    sound = _sound(data, fit.edges, fit.noise)
-    return fit if sound.all() else _settled(robot, near.only(sound), fit.offset_s, fit.edges)
+    sound = _sound(clock_problem(robot, near, fit.offset_s), fit.fit)
+    return fit if sound.all() else _settled(robot, near.only(sound), fit.offset_s, fit.fit.state)
 
 
 def _settled(
-    robot: Trajectory, frames: Frames, offset_s: float, start: Edges | None
+    robot: Trajectory, frames: Frames, offset_s: float, start: State | None
 ) -> ClockFit | None:
     """Moves the offset and both edges until they rest; None where too few frames are covered."""
     for _ in range(_ROUNDS):
         near = _covered(robot, frames, offset_s)
         if len(near) < _FEWEST_FRAMES:
             return None
-        data = clock_closure(robot, near, offset_s)
-        at = _start(data) if start is None else start
-        fit = fit_closure(data, replace(at, shared=data.unchanged))
+        problem = clock_problem(robot, near, offset_s)
+        at = closed_form(problem, _evenly(len(near), _START_FRAMES)) if start is None else start
+        if at is None:
+            raise RuntimeError("no closed form gives a start")
+        found = fit_problem(problem, State(at.edges, problem.start_values))
         # A step farther than angles are compared over is a slope that misleads.
-        step_s = float(np.clip(fit.edges.shared[0], -WINDOW_S, WINDOW_S))
-        start, offset_s = fit.edges, offset_s + step_s
+        step_s = float(np.clip(found.state.values[0], -WINDOW_S, WINDOW_S))
+        start, offset_s = found.state, offset_s + step_s
         if abs(step_s) < _SETTLED_S:
             break
-    edges = replace(fit.edges, shared=data.unchanged)
-    sigma_s = _sigma_s(data, edges, fit.noise, near.stamps_s)
-    return ClockFit(offset_s, sigma_s, edges, fit.noise, len(near))
-
-
-def _start(data: Closure) -> Edges:
-    part = _evenly(len(data), _START_FRAMES)
-    closed = SOLVERS["park"](data.robot[part], data.camera[part])
-    return Edges(closed.x, closed.z, data.unchanged)
+    fit = replace(found, state=State(found.state.edges, problem.start_values))
+    return ClockFit(offset_s, _sigma_s(problem, fit, near.stamps_s), fit, len(near))
 
 
 def _covered(robot: Trajectory, frames: Frames, offset_s: float) -> Frames:
@@ -149,27 +135,27 @@ def _covered(robot: Trajectory, frames: Frames, offset_s: float) -> Frames:
     return frames.only(robot.covers(frames.stamps_s - offset_s, margin_s))
 
 
-def clock_closure(robot: Trajectory, frames: Frames, offset_s: float) -> Closure:
-    """The chain of some frames at an offset, with the offset's change [s] as what they share."""
+def clock_problem(robot: Trajectory, frames: Frames, offset_s: float) -> Problem:
+    """The problem of some frames at an offset, with the offset's change [s] as an effect."""
     at_s = frames.stamps_s - offset_s
-    poses = robot.at(at_s)
-    return Closure(
+    return chain(
         frames.mount,
-        poses if frames.mount == "eye-in-hand" else invert(poses),
+        robot.at(at_s),
         frames.cam_from_target,
         frames.covariance,
-        (clock_effect(robot.speeds(at_s)),),
+        effects=[clock_effect(robot.speeds(at_s))],
     )
 
 
-def _sound(data: Closure, edges: Edges, noise: Noise) -> Mask:
+def _sound(problem: Problem, fit: Solution) -> Mask:
     """Which frames agree with the others."""
-    residuals, _, spread = residual_blocks(data, edges, noise)
+    linear = problem.linear(fit.state)
+    residuals, spread = linear.residuals, problem.total_covariance(linear, fit.noise)
     squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(spread), residuals)
     return np.asarray(squares <= _OUTLYING**2 * float(np.median(squares)))
 
 
-def _sigma_s(data: Closure, edges: Edges, noise: Noise, stamps_s: FloatArray) -> float:
+def _sigma_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> float:
     """The offset's standard deviation: the larger of two.
 
     One takes the errors of all frames for independent. The other takes those of a stretch of time
@@ -177,13 +163,15 @@ def _sigma_s(data: Closure, edges: Edges, noise: Noise, stamps_s: FloatArray) ->
     (Liang and Zeger 1986, the sandwich over clusters).
     """
     # A direction without information has a very large variance here.
-    spread = covariance(closure_information(data, edges, noise))
+    spread = covariance(fisher_information(problem, fit.state, fit.noise))
     independent = float(spread[12, 12])
     stretches = np.unique((stamps_s - stamps_s[0]) // _STRETCH_S, return_inverse=True)[1]
     count = int(stretches.max()) + 1
     if count < _FEWEST_STRETCHES:
         return float(np.sqrt(independent))
-    residuals, jacobian, blocks = residual_blocks(data, edges, noise)
+    linear = problem.linear(fit.state)
+    residuals, jacobian = linear.residuals, linear.jacobian
+    blocks = problem.total_covariance(linear, fit.noise)
     weighted = np.linalg.solve(blocks, residuals[:, :, None])[:, :, 0]
     scores = np.zeros((count, jacobian.shape[2]))
     np.add.at(scores, stretches, np.einsum("mij,mi->mj", jacobian, weighted))

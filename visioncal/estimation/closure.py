@@ -26,15 +26,9 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.estimation.chain import chain
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import (
-    ROBOT,
-    Effect,
-    FramePrior,
-    Observations,
-    Problem,
-    State,
-)
+from visioncal.estimation.problem import ROBOT, Effect, FramePrior, Problem, State
 from visioncal.estimation.problem import Noise as Levels
 from visioncal.estimation.solve import (
     fisher_information,
@@ -46,7 +40,6 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.solve import (
     normal_equations as information_and_gradient,
 )
-from visioncal.estimation.tree import Branch, Tree
 from visioncal.estimation.variance import Components, Knowledge
 from visioncal.transforms import adjoint, exp, invert, log, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
@@ -86,29 +79,15 @@ class Closure:
     @cached_property
     def problem(self) -> Problem:
         """The frames and the views as the estimation has them."""
-        (camera, seer), (target, seen) = (it.split("_from_") for it in edge_names(self.mount))
-        poses = self.robot if self.mount == "eye-in-hand" else invert(self.robot)
-        unknown = {seer: Branch(camera), seen: Branch(target)}
-        tree = Tree("base", {"flange": Branch("base", robot=ROBOT), **unknown})
-        known, count = self.camera_covariance, len(self)
-        observations = Observations(
-            (seer,) * count,
-            (seen,) * count,
-            np.arange(count),
-            np.full(count, -1),
+        return chain(
+            self.mount,
+            self.robot if self.mount == "eye-in-hand" else invert(self.robot),
             self.camera,
-            np.zeros((count, 6, 6)) if known is None else known,
-            np.ones(count, dtype=bool),
-        )
-        return Problem(
-            tree,
-            {ROBOT: poses},
-            observations,
+            self.camera_covariance,
             # What is shared counts from where it is.
-            tuple(replace(it, values=np.zeros(len(it))) for it in self.effects),
-            self.priors,
-            frozenset() if self.guess is None else frozenset({seen}),
-            is_combined=known is None,
+            effects=[replace(it, values=np.zeros(len(it))) for it in self.effects],
+            priors=self.priors,
+            turned_by_choice=self.guess is not None,
         )
 
     @property
@@ -184,15 +163,6 @@ class Closure:
     def predicted_camera(self, x: FloatArray, z: FloatArray) -> FloatArray:
         """The (m, 4, 4) `cam_from_target` that the edges and the robot predict."""
         return invert(self.robot @ x) @ z
-
-
-def edge_names(mount: Mount) -> tuple[str, str]:
-    """Names of the two unknown edges, in the order x, z."""
-    if mount == "instrument":
-        return "base_from_instrument", "flange_from_probe"
-    if mount == "eye-in-hand":
-        return "flange_from_cam", "base_from_target"
-    return "base_from_cam", "flange_from_target"
 
 
 def _joined(groups: Sequence[Closure]) -> Closure:

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
 from visioncal.estimation.boards import Boards, place
-from visioncal.estimation.closure import Closure, Edges, Noise, closure_information, edge_names
+from visioncal.estimation.chain import edge_names
+from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimation.linalg import Spectrum, covariance, spectrum
 from visioncal.figures import figure
 from visioncal.transforms import invert, rotation_angle

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.estimation.arm import pose_basis
-from visioncal.estimation.closure import edge_names
+from visioncal.estimation.chain import edge_names
 from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import Camera, FloatArray, Mount
 

@@ -12,7 +12,7 @@ from visioncal.errors import DataError, VisioncalError
 from visioncal.estimation.appearance import BOARD_NAMES, Free, shape_slices
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.boards import Placed, place
-from visioncal.estimation.closure import edge_names
+from visioncal.estimation.chain import edge_names
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.arm import kinematics_document
 from visioncal.pipeline.elastic import elastic_document

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from visioncal.errors import DataError
-from visioncal.estimation.closure import edge_names
+from visioncal.estimation.chain import edge_names
 from visioncal.pipeline.known import Known
 
 

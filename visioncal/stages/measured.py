@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.closure import edge_names
+from visioncal.estimation.chain import edge_names
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.problem import FramePrior, Problem, State
 from visioncal.figures import figure

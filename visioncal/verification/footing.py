@@ -17,7 +17,8 @@ from visioncal.estimation.appearance import (
     boards_basis,
 )
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import Edges, Noise, edge_names
+from visioncal.estimation.chain import edge_names
+from visioncal.estimation.closure import Edges, Noise
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document

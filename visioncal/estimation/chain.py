@@ -1,0 +1,75 @@
+"""The problem of one robot and one camera: a chain of frames with a robot in it.
+
+    eye-in-hand   base -> flange -> cam,  base -> target
+    eye-to-hand   base -> flange -> target,  base -> cam
+
+A measuring instrument that reads a probe on the flange is a camera that stands still, and the probe
+its target.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from visioncal.estimation.problem import ROBOT, Effect, FramePrior, Observations, Problem
+from visioncal.estimation.tree import Branch, Tree
+from visioncal.types import FloatArray, IntArray, Mount
+
+BASE, FLANGE = "base", "flange"
+
+
+def edge_names(mount: Mount) -> tuple[str, str]:
+    """Names of the edges that place the camera and an only target."""
+    if mount == "instrument":
+        return "base_from_instrument", "flange_from_probe"
+    if mount == "eye-in-hand":
+        return "flange_from_cam", "base_from_target"
+    return "base_from_cam", "flange_from_target"
+
+
+def chain(
+    mount: Mount,
+    base_from_flange: FloatArray,
+    cam_from_target: FloatArray,
+    covariance: FloatArray | None = None,
+    *,
+    stops: IntArray | None = None,
+    targets: Sequence[str] = (),
+    effects: Sequence[Effect] = (),
+    priors: Sequence[FramePrior] = (),
+    turned_by_choice: bool = False,
+) -> Problem:
+    """Puts the problem of one robot and one camera.
+
+    Args:
+        mount: Where the camera is.
+        base_from_flange: (s, 4, 4) where the robot was, at each stop.
+        cam_from_target: (m, 4, 4) what the views measured.
+        covariance: (m, 6, 6) of its right perturbations; None where nothing is known of it.
+        stops: (m,) the stop of each view, numbered from 0; None where each has its own.
+        targets: (m,) the frame of the target that each view shows; empty for an only one.
+        effects: What moves views together.
+        priors: What was measured of frames by hand.
+        turned_by_choice: Whether the targets' rotation is a matter of choice, as of points.
+    """
+    count = len(cam_from_target)
+    (camera, observer), (target, only) = (it.split("_from_") for it in edge_names(mount))
+    observed = tuple(targets) or (only,) * count
+    unknown = {observer: Branch(camera), **{it: Branch(target) for it in observed or (only,)}}
+    return Problem(
+        Tree(BASE, {FLANGE: Branch(BASE, robot=ROBOT), **unknown}),
+        {ROBOT: base_from_flange},
+        Observations(
+            (observer,) * count,
+            observed,
+            np.arange(count) if stops is None else stops,
+            np.full(count, -1),
+            cam_from_target,
+            np.zeros((count, 6, 6)) if covariance is None else covariance,
+            np.ones(count, dtype=bool),
+        ),
+        tuple(it for it in effects if len(it)),
+        tuple(priors),
+        frozenset(observed) if turned_by_choice else frozenset(),
+        is_combined=covariance is None,
+    )
