@@ -1,23 +1,19 @@
-"""Which groups of residuals agree: wrong touches and points, told from noise.
+"""Which groups of residuals are outliers: wrong touches and points, told from noise."""
 
-The start is a consensus of small sets under least trimmed squares (Rousseeuw 1984); what follows
-are F tests on deletion residuals (Cook and Weisberg 1982, section 2.2), one group at a time.
-"""
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 from typing import Generic
 
 import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
-from visioncal.estimation.groups import GroupFit, GroupProblem, Groups, State, descended, fit_groups
+from visioncal.estimation.groups import GroupFit, GroupProblem, State, descended, fit_groups
 from visioncal.estimation.linalg import covariance, gram, squared_lengths
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
+from visioncal.types import FloatArray, Mask
 
 # Noise leaves sound groups out in one set of a thousand.
 _FALSE_ALARM = 1e-3
-_REFINED, _ROUNDS = 5, 10
 # Where fewer than this share of the groups agree, nothing tells which of them are right.
 _LEAST_SHARE = 0.5
 # One group is called wrong when that is so many times as likely as any other being it.
@@ -70,145 +66,74 @@ def agreeing_groups(
     count = len(everything.used)
     fit, doubtful = everything, np.zeros(count, dtype=bool)
     if everything.freedom > 1:
-        first = _widened(problem, *_core(problem)) if start is None else fit_groups(problem, *start)
-        fit = _settled(problem, first)
+        first = _core(problem, count) if start is None else fit_groups(problem, *start)
+        fit = settled(_Search(problem), first.used, first, fewest=1, suspect=0.0)[1]
         if fit.used.sum() < max(_LEAST_SHARE * count, 1) or fit.freedom < 1:
             fit = everything
         doubtful = _doubtful(fit)
         if doubtful.any():
             fit = fit_groups(problem, fit.used | doubtful, fit.state)
-    surprise, limit = _judged(fit, int(np.sum(~fit.used)))
+    away = distances(fit)
+    per = np.maximum(away.directions, 1)
     explained = not doubtful.any() and (
         expected_sigma is None or _is_explained(fit, expected_sigma)
     )
-    return Agreement(fit, fit.used, surprise, limit, doubtful, explained)
+    return Agreement(fit, fit.used, away.squares / per, away.limit / per, doubtful, explained)
 
 
-def surprises(fit: GroupFit[State]) -> tuple[FloatArray, IntArray]:
-    """Squared Mahalanobis distance of each group from what the other groups predict.
+@dataclass(frozen=True, eq=False)
+class _Search(Generic[State]):
+    """The search among the groups of a problem."""
+
+    problem: GroupProblem[State]
+
+    def fit(self, used: Mask, start: GroupFit[State]) -> GroupFit[State]:
+        return fit_groups(self.problem, used, start.state)
+
+    def distances(self, used: Mask, fit: GroupFit[State]) -> Distances:
+        found = distances(fit)
+        # Without any freedom, nothing contradicts anything.
+        return found if fit.freedom > 0 else replace(found, squares=np.zeros(len(used)))
+
+
+def distances(fit: GroupFit[State]) -> Distances:
+    """How far each group is from what the other groups predict.
 
     For a group inside the fit this is the deletion residual's, by the identity of Cook and Weisberg
     (1982, section 2.2): its covariance is that of the noise less what the fit has taken.
-
-    Returns:
-        (m,) squared distances, and (m,) in how many directions the others predict the group.
     """
     groups = fit.groups
     spread = groups.spread(fit.sigma)
     taken = groups.jacobian @ fit.covariance @ np.swapaxes(groups.jacobian, 1, 2)
     left = spread + np.where(fit.used, -1.0, 1.0)[:, None, None] * taken
     squares, directions = squared_lengths(groups.residuals, left, spread)
-    absent = np.sum(~groups.observed, axis=1)
-    return squares, np.asarray(directions - absent)
+    directions = directions - np.sum(~groups.observed, axis=1)
+    # The level is estimated from the residuals that stay, which gives the squares the tails of an F
+    # distribution; and the sets that stay were chosen for their small level among all of their
+    # size. Half of the false alarms go to the first group that is left out, a quarter to the next.
+    excluded = int(np.sum(~fit.used))
+    share = _FALSE_ALARM / 2.0**excluded / comb(len(fit.used), excluded)
+    there = np.maximum(directions, 1)
+    limit = there * f_limit(share, there, max(fit.freedom, 1))
+    return Distances(squares, directions, np.where(directions > 0, limit, np.inf))
 
 
-def _limits(directions: IntArray, freedom: int, excluded: int) -> FloatArray:
-    """Largest surprise that noise may give, corrected for the number of ways to exclude groups.
-
-    The level is estimated from the residuals that stay, which gives the surprise the tails of an F
-    distribution; and the sets that stay were chosen for their small level among all of their size.
-    """
-    # Half of the false alarms go to the first group that is left out, a quarter to the second ...
-    share = _FALSE_ALARM / 2.0**excluded / comb(len(directions), excluded)
-    predicted = np.maximum(directions, 1)
-    limit = f_limit(share, predicted, max(freedom, 1))
-    return np.where(directions > 0, limit, np.inf)
-
-
-def _judged(fit: GroupFit[State], excluded: int) -> tuple[FloatArray, FloatArray]:
-    """Surprise (m,) of each group per direction, and what it may be."""
-    squares, directions = surprises(fit)
-    limits = _limits(directions, fit.freedom, excluded)
-    return squares / np.maximum(directions, 1), limits
-
-
-def _core(problem: GroupProblem[State]) -> tuple[Mask, State]:
-    """The half of the groups that agree best, and the state that they agree on."""
-    found = []
-    for guess in problem.guesses():
-        away = _distances(problem.linearise(guess))
-        half = (len(away) + 1) // 2 + 1
-        found.append((float(np.sort(away)[:half].sum()), guess, away))
-    found.sort(key=lambda item: item[0])
-    refined = [_concentrated(problem, guess, away) for _, guess, away in found[:_REFINED]]
-    _, chosen, state = min(refined, key=lambda item: item[0])
-    return chosen, state
-
-
-def _concentrated(
-    problem: GroupProblem[State], state: State, away: FloatArray
-) -> tuple[float, Mask, State]:
-    """Solves from the nearest half, again and again (Rousseeuw and Van Driessen 1999)."""
-    count = len(away)
-    half = (count + 1) // 2 + 1
-    chosen = np.argsort(away)[:half]
-    mask = np.zeros(count, dtype=bool)
-    mask[chosen] = True
-    even = np.eye(problem.linearise(state).residuals.shape[1])[None].repeat(count, axis=0)
-    for _ in range(_ROUNDS):
-        state, _ = descended(problem, state, mask, even)
-        away = _distances(problem.linearise(state))
-        before, mask = mask, np.zeros(count, dtype=bool)
-        mask[np.argsort(away)[:half]] = True
-        if np.array_equal(before, mask):
-            break
-    return float(away[mask].sum()), mask, state
-
-
-def _distances(groups: Groups) -> FloatArray:
-    """Squared distances (m,), comparable between groups of different size."""
+def _core(problem: GroupProblem[State], count: int) -> GroupFit[State]:
+    """The trimmed start, and all groups within its reach."""
+    groups = problem.linearise(next(iter(problem.guesses())))
+    even = np.eye(groups.residuals.shape[1])[None].repeat(count, axis=0)
+    # So that groups of different size compare.
     typical = chi2_limit(0.5, np.maximum(groups.observed.sum(axis=1), 1))
-    return np.asarray(np.sum(groups.residuals**2, axis=1) / typical)
 
+    def away(state: State) -> FloatArray:
+        return np.asarray(np.sum(problem.linearise(state).residuals ** 2, axis=1) / typical)
 
-def _widened(problem: GroupProblem[State], core: Mask, state: State) -> GroupFit[State]:
-    """Grows the core to all groups within reach of its noise, which is scaled by the median.
+    def solve(mask: Mask, state: State) -> State:
+        return descended(problem, state, mask, even)[0]
 
-    The noise of the half that agrees best is less than that of all.
-    """
-    fit = fit_groups(problem, core, state)
-    for _ in range(_ROUNDS):
-        squares, directions = surprises(fit)
-        there = np.maximum(directions, 1)
-        scale = max(float(np.median(squares / chi2_limit(0.5, there))), 1.0)
-        agrees = (squares < chi2_limit(0.001, there) * scale) | (directions < 1)
-        if np.array_equal(agrees, fit.used) or agrees.sum() < core.sum():
-            break
-        fit = fit_groups(problem, agrees, fit.state)
-    return fit
-
-
-def _settled(problem: GroupProblem[State], fit: GroupFit[State]) -> GroupFit[State]:
-    """Takes groups in and out one at a time, with the noise estimated anew, until none moves."""
-    for _ in range(2 * len(fit.used)):
-        excluded = int(np.sum(~fit.used))
-        surprise, limit = _judged(fit, excluded)
-        over = surprise / limit
-        outside = np.flatnonzero(~fit.used & (over < 1.0))
-        if len(outside):
-            agrees = fit.used.copy()
-            agrees[outside[over[outside].argmin()]] = True
-            fit = fit_groups(problem, agrees, fit.state)
-            continue
-        without = _without_the_worst(problem, fit, over)
-        if without is None:
-            break
-        fit = without
-    return fit
-
-
-def _without_the_worst(
-    problem: GroupProblem[State], fit: GroupFit[State], over: FloatArray
-) -> GroupFit[State] | None:
-    """Leaves the worst group out where noise that it has no say in does not explain it."""
-    worst = int(np.where(fit.used, over, -1.0).argmax())
-    fewer = fit.used.copy()
-    fewer[worst] = False
-    again = fit_groups(problem, fewer, fit.state)
-    if again.freedom < 1:
-        return None
-    surprise, limit = _judged(again, int(np.sum(~fewer)))
-    return again if surprise[worst] > limit[worst] else None
+    mask, state = trimmed_start(problem.guesses(), away, solve, half_of(count))
+    fit = fit_groups(problem, mask, state)
+    return widened(_Search(problem), mask, fit, np.ones(count, dtype=bool))[1]
 
 
 def _doubtful(fit: GroupFit[State]) -> Mask:
