@@ -16,6 +16,7 @@ from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
 from visioncal.estimation.problem import Effect
 from visioncal.estimation.procrustes import align
+from visioncal.estimation.robust import half_of, trimmed_start
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, compose, exp, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
@@ -27,7 +28,6 @@ _SETTLED = 1e-14
 # Sets of stops to start from, and how many: with 30 % of the stops wrong, all of them contain a
 # wrong one with probability 1e-5.
 _SET_SIZE, _SETS = 5, 60
-_REFINED, _ROUNDS = 5, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,24 +141,24 @@ def with_places(data: Closure, mounting: Mounting, columns: FloatArray) -> Closu
 def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:
     """Finds where the instrument stands and the points sit, although some stops may be wrong.
 
-    The least trimmed sum of distances (Rousseeuw 1984) over small sets of stops.
-
     Args:
         places: The readings.
 
     Returns:
         The mounting, and the (m,) distances [m] between read and predicted places.
     """
-    count = int(places.stops.max()) + 1
-    half = (count + 1) // 2 + 1
-    found = []
-    for start in _starts(places, count):
-        mounting = fit_mounting(places.subset(start), None, int(places.points.max()) + 1)
-        away = _by_stop(places, mounting)
-        found.append((float(np.sort(away)[:half].sum()), mounting, away))
-    found.sort(key=lambda it: it[0])
-    refined = [_concentrated(places, it, half) for it in found[:_REFINED]]
-    best = min(refined, key=lambda it: it[0])[1]
+    count, points = int(places.stops.max()) + 1, int(places.points.max()) + 1
+    starts = (fit_mounting(places.subset(it), None, points) for it in _starts(places, count))
+
+    def solve(stops: Mask, start: Mounting) -> Mounting:
+        return fit_mounting(places.subset(stops[places.stops]), start, points)
+
+    def by_stop(at: Mounting) -> FloatArray:
+        away = np.zeros(count)
+        np.maximum.at(away, places.stops, distances(places, at))
+        return away
+
+    best = trimmed_start(starts, by_stop, solve, half_of(count))[1]
     return best, distances(places, best)
 
 
@@ -173,29 +173,6 @@ def _starts(places: Places, count: int) -> Iterator[Mask]:
         chosen = np.isin(places.stops, rng.choice(count, _SET_SIZE, replace=False))
         if len(np.unique(places.points[chosen])) == points:
             yield chosen
-
-
-def _concentrated(
-    places: Places, found: tuple[float, Mounting, FloatArray], half: int
-) -> tuple[float, Mounting]:
-    """Solves from the nearest half, again and again (Rousseeuw and Van Driessen 1999)."""
-    best, mounting, away = found
-    for _ in range(_ROUNDS):
-        chosen = np.isin(places.stops, np.argsort(away)[:half])
-        mounting_then = fit_mounting(places.subset(chosen), mounting, len(mounting.on_flange))
-        away = _by_stop(places, mounting_then)
-        then = float(np.sort(away)[:half].sum())
-        if then >= best:
-            break
-        best, mounting = then, mounting_then
-    return best, mounting
-
-
-def _by_stop(places: Places, mounting: Mounting) -> FloatArray:
-    """The largest distance of each stop [m]."""
-    away = np.zeros(int(places.stops.max()) + 1)
-    np.maximum.at(away, places.stops, distances(places, mounting))
-    return away
 
 
 def distances(places: Places, mounting: Mounting) -> FloatArray:

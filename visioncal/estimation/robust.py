@@ -18,8 +18,7 @@ from visioncal.types import FloatArray, Mask
 Fit = TypeVar("Fit")
 State = TypeVar("State")
 
-# Of the starts, so many are followed up by concentration steps.
-_REFINED, _ROUNDS = 5, 10
+_ROUNDS = 10
 # A sound unit beside the core is missed with this chance, until units are looked at one by one.
 _MISSED = 1e-3
 
@@ -78,6 +77,7 @@ def trimmed_start(
     away: Callable[[State], FloatArray],
     solve: Callable[[Mask, State], State],
     count: int,
+    followed: int = 5,
 ) -> tuple[Mask, State]:
     """Finds the units that are nearest to what they alone say.
 
@@ -86,13 +86,14 @@ def trimmed_start(
         away: Gives the distances (m,) of all units under a state, in any unit.
         solve: Solves from the units of an (m,) mask, near a state.
         count: How many units are taken for inliers.
+        followed: How many of the starts are followed up by concentration steps, the best first.
 
     Returns:
         (m,) mask of these units, and the state that they agree on.
     """
     found = [(it, away(it)) for it in starts]
     found.sort(key=lambda it: trimmed_sum(it[1], count))
-    refined = [_concentrated(*it, away, solve, count) for it in found[:_REFINED]]
+    refined = [_concentrated(*it, away, solve, count) for it in found[:followed]]
     return min(refined, key=lambda it: it[0])[1:]
 
 
@@ -103,15 +104,18 @@ def _concentrated(
     solve: Callable[[Mask, State], State],
     count: int,
 ) -> tuple[float, Mask, State]:
-    """Solves from the nearest units, again and again; the sum of their distances comes first."""
-    mask = nearest(distances, count)
+    """Solves from the nearest units while that brings them nearer; gives how near they are first.
+
+    What is solved for may be another measure than the distances: their sum may rise.
+    """
+    least, mask = trimmed_sum(distances, count), nearest(distances, count)
     for _ in range(_ROUNDS):
-        state = solve(mask, state)
-        distances = away(state)
-        before, mask = mask, nearest(distances, count)
-        if np.array_equal(before, mask):
+        then = solve(mask, state)
+        distances = away(then)
+        if (lower := trimmed_sum(distances, count)) >= least:
             break
-    return trimmed_sum(distances, count), mask, state
+        least, mask, state = lower, nearest(distances, count), then
+    return least, mask, state
 
 
 def widened(

@@ -2,8 +2,7 @@
 
 The unit of rejection is the image as a whole: the 6-vector by which it puts the target away from
 where the others put it. The start is the one image about which most others gather (least median,
-Rousseeuw 1984), over all poses that each of them allows; what follows takes images in and out one
-at a time by squared Mahalanobis distances.
+Rousseeuw 1984), over all poses that each of them allows.
 """
 
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimation.linalg import covariance, squared_lengths
+from visioncal.estimation.robust import Distances, settled
 from visioncal.frames.sight import Place
 from visioncal.transforms import exp, invert, log
 from visioncal.types import FloatArray, IntArray, Mask
@@ -105,34 +105,26 @@ def agreeing(sights: Sights) -> Agreement:
     Where no more than half agree, nothing tells which are right: all stay.
     """
     picks, agrees = _core(sights)
-    count = len(picks)
-    for _ in range(2 * count):
-        now = _judged(sights, picks, agrees)
-        moved = _moved(sights, now)
-        if moved is None:
-            break
-        agrees = moved
-    else:
-        now = _judged(sights, picks, agrees)
-    if 2 * int(now.agrees.sum()) <= count:
-        now = _judged(sights, picks, np.ones(count, dtype=bool))
-    return now
+    search = _Search(sights, picks)
+    agrees, found = settled(search, agrees, _judged(sights, picks, agrees), fewest=2, suspect=0.0)
+    if 2 * int(agrees.sum()) <= len(picks):
+        return _judged(sights, picks, np.ones(len(picks), dtype=bool))
+    return found
 
 
-def _moved(sights: Sights, now: Agreement) -> Mask | None:
-    """Takes one image in that belongs to the others, or one out that does not."""
-    outside = np.flatnonzero(~now.agrees & (now.surprise < now.variance * now.limit))
-    moved = now.agrees.copy()
-    if len(outside):
-        moved[outside[now.surprise[outside].argmin()]] = True
-        return moved
-    if now.agrees.sum() <= 2:
-        return None
-    moved[int(np.where(now.agrees, now.surprise, -1.0).argmax())] = False
-    # Judged by noise that the image in question has no say in.
-    without = _judged(sights, now.picks, moved)
-    beyond = without.surprise > without.variance * without.limit
-    return moved if bool(np.any(beyond & now.agrees)) else None
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search among images, each with one of its poses."""
+
+    sights: Sights
+    picks: IntArray
+
+    def fit(self, used: Mask, _: Agreement) -> Agreement:
+        return _judged(self.sights, self.picks, used)
+
+    def distances(self, _: Mask, fit: Agreement) -> Distances:
+        six = np.full(len(self.picks), 6.0)
+        return Distances(fit.surprise, six, fit.variance * fit.limit * np.ones_like(six))
 
 
 def _core(sights: Sights) -> tuple[IntArray, Mask]:

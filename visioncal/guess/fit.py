@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.estimation.robust import trimmed_start
 from visioncal.solvers import SOLVERS
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, IntArray
@@ -18,7 +19,6 @@ KEPT_SHARE = 0.7
 # Fewer views than this would agree with any reading.
 _FEWEST_KEPT = 5
 _SUBSET = 4
-_STEPS = 6
 # Turns about a second axis that are smaller, than the largest or at all, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the numbers that a view gives.
@@ -93,36 +93,23 @@ def no_fit(rows: int) -> Fit:
 def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
     """Solves `robot * x * camera = z` by the views that agree best.
 
-    Least trimmed squares by concentration steps (Rousseeuw and Van Driessen 2006, "Computing LTS
-    regression for large data sets"), from all views and from random small sets of them.
-
     Args:
         robot: (n, 4, 4) the robot's part of the chain.
         camera: (n, 4, 4) `cam_from_target`.
         starts: How many small sets to start from, besides all views.
     """
     lever = max(float(np.median(np.linalg.norm(camera[:, :3, 3], axis=1))), 1e-12)
-    best = _settled(robot, camera, lever, np.arange(len(robot)))
-    rng = np.random.default_rng(0)
-    for _ in range(starts if len(robot) > _SUBSET else 0):
-        rows = rng.choice(len(robot), _SUBSET, replace=False)
-        fit = _settled(robot, camera, lever, rows)
-        best = min(best, fit, key=lambda it: it.score)
-    return best
-
-
-def _settled(robot: FloatArray, camera: FloatArray, lever: float, rows: IntArray) -> Fit:
-    """Solves from some rows, then from those that agree best, until they stay the same."""
-    fit = _fit(robot, camera, lever, rows)
-    for _ in range(_STEPS):
-        kept = np.sort(fit.kept)
-        if np.array_equal(kept, rows):
-            break
-        after = _fit(robot, camera, lever, kept)
-        if after.score >= fit.score:
-            break
-        fit, rows = after, kept
-    return fit
+    rng, count = np.random.default_rng(0), len(robot)
+    sets = [np.arange(count)]
+    if count > _SUBSET:
+        sets += [rng.choice(count, _SUBSET, replace=False) for _ in range(starts)]
+    return trimmed_start(
+        (_fit(robot, camera, lever, rows) for rows in sets),
+        lambda it: it.away**2,
+        lambda mask, _: _fit(robot, camera, lever, np.flatnonzero(mask)),
+        kept_count(count),
+        len(sets),
+    )[1]
 
 
 def _fit(robot: FloatArray, camera: FloatArray, lever: float, rows: IntArray) -> Fit:
