@@ -237,17 +237,32 @@ def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Sol
 
     def solve(mask: Mask, state: State) -> State:
         found = closed_form(part, np.flatnonzero(mask))
+        if found is not None:
+            return found
         # Noise is estimated once what is wrong by far is out: it would pass for noise of a robot.
-        return solve_problem(part.subset(mask), state, noise)[0] if found is None else found
+        return solve_problem(part.subset(_of_pairs(part, mask, state)), state, noise)[0]
 
     starts = _starts(part, state)
     mask, start = trimmed_start(starts, lambda it: _away(part, it), solve, half_of(len(rows)))
+    mask = _of_pairs(part, mask, start)
     mask, fit = widened(
         _Search(part), mask, fit_problem(part.subset(mask), start), np.ones(len(rows), dtype=bool)
     )
     used = among.copy()
     used[rows] = mask
     return used, fit
+
+
+def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
+    """The observations of a mask, and of each pair of frames the nearest half.
+
+    The nearest half of all may be of few pairs, such as the still boards of still cameras: frames
+    that only others see would be free.
+    """
+    away, found = _away(problem, state), mask.copy()
+    for group in problem.groups if len(problem.groups) > 1 else ():
+        found[group.rows[np.argsort(away[group.rows])][: (len(group.rows) + 1) // 2]] = True
+    return found
 
 
 def _starts(problem: Problem, state: State | None) -> Iterator[State]:
