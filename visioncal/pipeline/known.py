@@ -394,18 +394,17 @@ class Known:
         """(m,) which stop of the robot each view was taken at, numbered from 0.
 
         Views of one stop share the robot's error. Where the session does not number its stops,
-        views with the same reported pose and load are of one. Poses that were measured by others
-        are not told apart from the robot's: of several boards, each has stops of its own then.
+        views with the same reported pose and load are of one, and those between which the robot
+        stood still. Poses that were measured by others are not told apart from the robot's: of
+        several boards, each has stops of its own then.
         """
-        declared = self._visits
+        visited = self._visits
         loads = self.loads(views).rows
         keys: dict[object, int] = {}
         stops = np.array(
             [
                 keys.setdefault(
-                    self.base_from_flange[view].tobytes() + load.tobytes()
-                    if (stop := declared[view]) is None
-                    else stop,
+                    (visit, load.tobytes()) if isinstance(visit := visited[view], tuple) else visit,
                     len(keys),
                 )
                 for view, load in zip(views, loads, strict=True)

@@ -1,7 +1,8 @@
 """The rows of a session as what they are observations of: who saw what, and how robots stood."""
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,10 @@ from visioncal.transforms import pose_difference
 
 # Reports of one robot at one stop that are farther apart are of two poses [mm, deg, rad].
 _APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.1, 2e-3
+# Reports of a robot that stands still differ by what its readings tremble: no motion is as small.
+_STILL_M, _STILL_RAD = 1e-4, 1e-4
+# Views of one pose that were taken farther apart than this are of different visits [s].
+LONG_S = 120.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +100,42 @@ def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mappi
     return found
 
 
+def still_since(views: Iterable[View]) -> dict[int, int]:
+    """Of each row of one robot, by its view: the row since which the robot has not moved.
+
+    Args:
+        views: Rows that tell its pose and name no stop, in their order.
+    """
+    found: dict[int, int] = {}
+    first = last = None
+    for view in views:
+        if first is None or last is None or _moved(first, view) or _long(last, view):
+            first = view
+        last, found[view.number] = view, first.number
+    return found
+
+
+def _moved(first: View, second: View) -> bool:
+    """Whether two rows tell poses that differ by more than readings of one pose do."""
+    before, after = ([it.numbers.get(name, math.nan) for name in POSE] for it in (first, second))
+    if not math.isnan(before[0] + after[0]):
+        units = [[it / math.hypot(*pose[3:]) for it in pose[3:]] for pose in (before, after)]
+        # A quaternion and its negative are the same rotation, by twice the angle between them.
+        chord = min(math.dist(units[0], [sign * it for it in units[1]]) for sign in (1.0, -1.0))
+        return math.dist(before[:3], after[:3]) > _STILL_M or 2.0 * chord > _STILL_RAD
+    joints = first.joints_rad, second.joints_rad
+    if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:
+        return True
+    return bool(np.abs(joints[0] - joints[1]).max() > _STILL_RAD)
+
+
+def _long(first: View, second: View) -> bool:
+    """Whether so much time lies between two rows that the robot may have been elsewhere."""
+    if first.stamp_s is None or second.stamp_s is None:
+        return False
+    return abs(second.stamp_s - first.stamp_s) > LONG_S
+
+
 def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
     """Words rows that tell another pose of a robot than the rest of their stop."""
     for stop in _stops(declaration, views):
@@ -110,10 +151,16 @@ def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[s
 
 
 def _stops(declaration: Declaration, views: Sequence[View]) -> list[_Stop]:
-    """Groups rows by their stop; a row without one is a stop of its own."""
+    """Groups rows by their stop; without one, by runs in which their robot stood still."""
     groups: dict[tuple[int, int], list[View]] = {}
+    telling: dict[str, list[View]] = {}
     for view in views:
-        key = (1, view.number) if view.stop is None or view.is_of_lens else (0, view.stop)
+        if view.stop is None and not view.is_of_lens and tells_robot(view):
+            telling.setdefault(name_of(declaration, "robot", view), []).append(view)
+    since = {row: first for mine in telling.values() for row, first in still_since(mine).items()}
+    for view in views:
+        alone = view.stop is None or view.is_of_lens
+        key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
         groups.setdefault(key, []).append(view)
     return [_Stop(tuple(rows), _told(declaration, rows)) for rows in groups.values()]
 
