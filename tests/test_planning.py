@@ -312,7 +312,7 @@ def test_two_stops_need_a_guess():
         begin(found)
     x, z = cell.transforms.values()
     begun = begin(found, guess=Guess(x, z, 0.1, 0.03))
-    assert len(begun.recorded.data) == 2
+    assert len(begun.recorded.problem) == 2
 
 
 def test_what_cannot_be_is_refused(views):

@@ -347,16 +347,6 @@ def weighted_slopes(
     return np.asarray(np.linalg.solve(total, jacobian), dtype=float), camera, total - camera
 
 
-def whitened_slopes(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
-    """Derivatives (m, 6, 12 + k) of residuals of unit covariance, where the chain closes exactly.
-
-    Their squares, summed over the views, are all of `closure_information` but what is known of the
-    shared unknowns without the robot.
-    """
-    jacobian, _, total = _where_it_closes(data, edges, noise)
-    return np.asarray(np.linalg.solve(np.linalg.cholesky(total), jacobian))
-
-
 def _where_it_closes(
     data: Closure, edges: Edges, noise: Noise
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.estimation.armmodel import block_size
+from visioncal.estimation.problem import ROBOT
 from visioncal.figures import figure
 from visioncal.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.planning.cell import Box, PlanCell
@@ -122,8 +123,7 @@ def helps(
     """
     there, known = np.zeros((0, 4, 4)), []
     if begun is not None:
-        data = begun.recorded.data
-        there = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
+        there = begun.recorded.problem.poses[ROBOT]
         known = [f"view {it}" for it in begun.views]
     poses = cell.robot.base_from_flange(q[design.rows])
     before = world.covariance([])

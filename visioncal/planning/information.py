@@ -22,16 +22,17 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
-from visioncal.estimation.closure import Closure, Edges, Noise, whitened_slopes
+from visioncal.estimation.chain import chain
+from visioncal.estimation.closure import Edges, Noise
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import ROBOT, Effect, State
+from visioncal.estimation.problem import ROBOT, Effect, Problem, State
+from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import pose_slopes, postures, tool_slopes
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
-from visioncal.stages.handeye import robot_part
 from visioncal.targets import corner_positions
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, skew
@@ -55,15 +56,15 @@ class Recorded:
     """Stops that were recorded already.
 
     Attributes:
-        data: The chain at each stop, without errors of the arm.
-        free: Lens and boards as the views see them. What they leave open comes first of what is
-            shared in `data`; behind it, where further boards are.
-        q: (m, n) joint angles of the stops [rad]; None where they are not known.
+        problem: The stops, without errors of the arm. Of its effects, what lens and boards leave
+            open comes first, and behind it where further boards are.
+        free: Lens and boards as the views see them.
+        q: (s, n) joint angles of the stops [rad]; None where they are not known.
         noise: Of the robot at the stops.
         first_corner: The number of the first corner of the board that is planned for.
     """
 
-    data: Closure
+    problem: Problem
     free: Free
     q: FloatArray | None
     noise: Noise
@@ -72,8 +73,7 @@ class Recorded:
     @property
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
-        known = (it.known.information for it in self.data.effects)
-        return np.asarray(block_diag(np.zeros((0, 0)), *known))
+        return _of_effects(self.problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,14 +175,17 @@ def stop_factors(
     factors = np.zeros((len(q), 6, size))
     if seen.any():
         found = compress(stack, free.basis, free.appearance, poses[seen])
-        data = Closure(
+        problem = chain(
             cell.mount,
-            robot_part(cell.robot.base_from_flange(q[seen]), cell.mount),
+            cell.robot.base_from_flange(q[seen]),
             poses[seen],
             floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
-            (_effect(known, [found.by_shared[:, :, free.columns], elsewhere]),),
+            effects=[_effect(known, [found.by_shared[:, :, free.columns], elsewhere])],
         )
-        factors[seen] = _factors(cell, purpose, data, q[seen], cell.noise)
+        problem, state = _erring(cell, purpose, problem, q[seen])
+        linear = problem.linear(state, ideal=True)
+        root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise.levels))
+        factors[seen] = np.linalg.solve(root, linear.jacobian)
     return factors
 
 
@@ -243,13 +246,7 @@ def _world(
     prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm))
     known = np.zeros_like(prior)
     if recorded is not None:
-        rows = _recorded_factors(cell, purpose, recorded).reshape(-1, len(prior))
-        known = rows.T @ rows
-        problem = recorded.data.problem
-        state = State(np.stack([cell.x, cell.z]), problem.start_values)
-        for it in problem.priors:
-            of_edges = problem.prior_rows(it, state)[1][:, :12]
-            known[:12, :12] += of_edges.T @ of_edges
+        known = _recorded_information(cell, purpose, recorded)
     of_looks = np.sqrt(np.diag(covariance(shared))) if looks else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
@@ -260,7 +257,8 @@ def _world(
     return World(factors, prior, known, counted, place, turn, units, looks)
 
 
-def _recorded_factors(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> FloatArray:
+def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> FloatArray:
+    """(p, p) of the stops and of what was measured by hand, what is known of effects aside."""
     q = recorded.q
     if q is None and purpose.blocks:
         raise DataError(
@@ -268,17 +266,29 @@ def _recorded_factors(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> F
             culprits=["q1_rad"],
             next_step="Record q1_rad ..., or plan without the recorded session.",
         )
-    at = np.zeros((len(recorded.data), cell.robot.joint_count)) if q is None else q
-    return _factors(cell, purpose, recorded.data, at, recorded.noise)
+    stops = len(recorded.problem.poses[ROBOT])
+    at = np.zeros((stops, cell.robot.joint_count)) if q is None else q
+    problem, state = _erring(cell, purpose, recorded.problem, at)
+    found = fisher_information(problem, state, recorded.noise.levels)
+    found[12:, 12:] -= _of_effects(problem)
+    return found
 
 
-def _factors(
-    cell: PlanCell, purpose: Purpose, data: Closure, q: FloatArray, noise: Noise
-) -> FloatArray:
+def _erring(
+    cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray
+) -> tuple[Problem, State]:
+    """The problem with the errors of the arm that a purpose is about, and the cell as guessed."""
     if purpose.blocks:
         basis = _model(cell.robot, purpose).basis(q)
-        data = data.with_more(ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).effect(ROBOT))
-    return whitened_slopes(data, Edges(cell.x, cell.z, data.unchanged), noise)
+        errors = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).effect(ROBOT)
+        problem = problem.with_effects([*problem.effects, errors])
+    return problem, State(np.stack([cell.x, cell.z]), problem.start_values)
+
+
+def _of_effects(problem: Problem) -> FloatArray:
+    """(k, k) what is known of a problem's effects beforehand."""
+    known = (it.known.information for it in problem.effects)
+    return np.asarray(block_diag(np.zeros((0, 0)), *known))
 
 
 def _effect(known: FloatArray, moved: list[FloatArray]) -> Effect:

@@ -6,15 +6,11 @@ import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    closure_information,
-    fit_closure,
-    normal_equations,
-)
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.closure import Noise
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.problem import Noise as Levels
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import fisher_information, fit_problem, normal_equations
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.cell import Box, Limits, PlanCell
@@ -133,20 +129,20 @@ def begin(
     first = np.unique(stops, return_index=True)[1]
     arm = _arm(known, robot)
     # The arm's own errors are the purpose's business: they are put in again with its priors.
-    data = _without_arm(known).merged(stops)
+    problem = replace(known, arm=None).closure(views).merged(stops).problem
     with one_blas_thread():
-        edges, noise = _start(known, data, guess)
-        nearest, spread = _nearest(data, edges, noise, guess)
+        state, noise = _start(known, problem, guess)
+        nearest, spread = _nearest(problem, state, noise.levels, known.session.mount, guess)
     sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
-        raise _too_vague(known, len(data))
+        raise _too_vague(known, len(first))
     cell = PlanCell(
         known.session.mount,
         arm,
         free.appearance.camera,
         targets[known.boards[0]],
-        nearest.x,
-        nearest.z,
+        nearest.edges[0],
+        nearest.edges[1],
         float(sigmas[0]),
         float(sigmas[1]),
         noise,
@@ -157,7 +153,7 @@ def begin(
     )
     q = None if known.joints_rad is None else known.joints(views)[first]
     corner = int(first_corners(targets)[known.boards[0]])
-    recorded = Recorded(data, free, q, noise, corner)
+    recorded = Recorded(problem, free, q, noise, corner)
     return Begun(cell, recorded, found.refusal, tuple(views[at] for at in first.tolist()))
 
 
@@ -170,43 +166,38 @@ def _arm(known: Known, robot: Robot) -> Robot:
     return ArmModel.of(robot, known.joints(known.used), known.flange_poses(known.used)).robot
 
 
-def _without_arm(known: Known) -> Closure:
-    return replace(known, arm=None).closure(known.used)
-
-
-def _start(known: Known, data: Closure, guess: Guess | None) -> tuple[Edges, Noise]:
+def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, Noise]:
+    still = problem.start_values
     if known.hand_eye is not None:
-        found, noise = known.hand_eye.edges, known.hand_eye.noise
+        found, noise = known.hand_eye.edges.state, known.hand_eye.noise.sigmas
     elif known.agreed is not None:
-        agreed = known.agreed.edges
-        fit = fit_closure(data, Edges(agreed.x, agreed.z, data.unchanged))
-        found, noise = fit.edges, fit.noise
+        fit = fit_problem(problem, State(known.agreed.edges.state.edges, still))
+        found, noise = fit.state, fit.noise.robots[0]
     elif guess is not None:
-        return Edges(guess.x, guess.z, data.unchanged), _TYPICAL
+        return State(np.stack([guess.x, guess.z]), still), _TYPICAL
     else:
-        raise _too_vague(known, len(data))
-    at_least = Noise(
-        max(noise.sigma_rad, _LEAST_NOISE.sigma_rad), max(noise.sigma_m, _LEAST_NOISE.sigma_m)
-    )
-    return Edges(found.x, found.z, data.unchanged), at_least
+        raise _too_vague(known, len(problem))
+    return State(found.edges, still), Noise(*np.maximum(noise, _LEAST_NOISE.sigmas).tolist())
 
 
 def _nearest(
-    data: Closure, edges: Edges, noise: Noise, guess: Guess | None
-) -> tuple[Edges, FloatArray]:
+    problem: Problem, state: State, noise: Levels, mount: Mount, guess: Guess | None
+) -> tuple[State, FloatArray]:
     """The likeliest edges with what is known beforehand, and their covariance (12, 12)."""
-    size = 12 + len(data.unchanged)
-    weights = np.zeros((size, size))
-    weights[:12, :12] = np.diag(_weights(data.mount, guess))
+    weights = np.zeros((problem.size, problem.size))
+    weights[:12, :12] = np.diag(_weights(mount, guess))
     for _ in range(_STEPS):
-        information, gradient = normal_equations(data, edges, noise)
-        away = np.zeros(size)
-        away[:12] = _away(edges, guess)
+        information, gradient = normal_equations(problem, state, noise)
+        away = np.zeros(problem.size)
+        away[:12] = _away(state.edges, guess)
+        step = -covariance_among(information + weights, problem.moving) @ (
+            gradient + weights @ away
+        )
         # What is shared has settled before; it may follow, but it does not move.
-        step = -covariance(information + weights) @ (gradient + weights @ away)
-        edges = edges.moved(np.concatenate([step[:12], np.zeros(size - 12)]))
-    spread = covariance(closure_information(data, edges, noise) + weights)
-    return edges, spread[:12, :12]
+        step[12:] = 0.0
+        state = state.moved(step)
+    spread = covariance_among(fisher_information(problem, state, noise) + weights, problem.counted)
+    return state, spread[:12, :12]
 
 
 def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
@@ -217,11 +208,11 @@ def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
     return weights.ravel()
 
 
-def _away(edges: Edges, guess: Guess | None) -> FloatArray:
-    """(12,) steps from what is known beforehand to the edges."""
+def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
+    """(12,) steps from what is known beforehand to the edges (2, 4, 4)."""
     if guess is not None:
-        return np.concatenate([log(invert(guess.x) @ edges.x), log(invert(guess.z) @ edges.z)])
-    local = [it[:3, :3].T @ it[:3, 3] for it in (edges.x, edges.z)]
+        return np.asarray(log(invert(np.stack([guess.x, guess.z])) @ edges).ravel())
+    local = [it[:3, :3].T @ it[:3, 3] for it in edges]
     return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
 
 
