@@ -115,6 +115,10 @@ def _of_alignment(result) -> Answer:
         "moved": [f"{it.frame} {it.last_stop} {it.first_stop}" for it in result.moved],
         "untied": sorted(it.frame for it in result.untied),
         "status": result.verdict.status,
+        "levels": {
+            name: it.stages.get("kinematics", {}).get("level", "")
+            for name, it in result.arms.items()
+        },
     }
     edges = {name: (it.matrix, it.covariance) for name, it in result.edges.items()}
     return Answer(words, edges, _flat(result.noise))
@@ -153,12 +157,12 @@ def _swept(options: CellOptions, how: SweepOptions) -> Callable[[], Answer]:
     return lambda: _of_calibration(calibrate(sweep_session(sweep(options, how), "sweep")))
 
 
-def _network(arms: str = "reported", **options) -> Callable[[], Answer]:
+def _network(level: str = "auto", **options) -> Callable[[], Answer]:
     def case() -> Answer:
         cell = simulate_network(NetworkOptions(**options))
         session: Session = network_session(cell, "network", seen="names")
         corners = {it.view: it for it in cell.corners}
-        return _of_alignment(align(session, arms=arms, corners=corners))
+        return _of_alignment(align(session, level=level, corners=corners))
 
     return case
 
@@ -239,7 +243,8 @@ def cases() -> dict[str, Callable[[], Answer]]:
         RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
         RobotAt("b", (0.6, 0.05, 0.02), dh_sigma_m=3e-4, dh_sigma_rad=3e-4),
     )
-    found["cell, wrong arms as reported"] = _network(**half, robots=arms, seed=8)
+    found["cell, wrong arms"] = _network(**half, robots=arms, seed=8)
+    found["cell, wrong arms as reported"] = _network("hand-eye", **half, robots=arms, seed=8)
     found["cell, offsets"] = _network("offsets", **half, robots=arms, seed=8)
     found["cell, kinematics"] = _network("kinematics", **half, robots=arms, seed=8)
     points = (PointAt("ball_a", "a", (0.0, 0.05, 0.1)), PointAt("nest", "cell", (0.4, 0.4, 0.2)))

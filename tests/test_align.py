@@ -11,6 +11,7 @@ from commands import visioncal
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.errors import DataError, DegenerateError
+from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, charuco_target, simulate
 from visioncal.simulation.layout import (
@@ -251,20 +252,24 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
     cell = simulate_network(NetworkOptions(robots=ERRING, stops=STOPS))
     session = network_session(cell, "cell", seen="names")
     corners = {it.view: it for it in cell.corners}
-    reported = align(session, corners=corners)
-    assert sum("--arms offsets" in it for it in reported.verdict.reasons) == 2
-    found = align(session, corners=corners, arms="offsets")
-    assert not any("--arms" in it for it in found.verdict.reasons)
+    reported = align(session, corners=corners, level="hand-eye")
+    assert sum("follow the arm's posture" in it for it in reported.verdict.reasons) == 2
+    found = align(session, corners=corners)
+    assert found.verdict.status == "good"
     for robot in ("a", "b"):
-        told = found.details["arms"][robot]
-        true = (cell.true_arms[robot].offset - cell.arms[robot].offset)[1:-1]
-        # What the first joint and the last could take is the base's and the flange's.
-        away = np.abs(np.array(told["values"]) - true)
-        assert np.all(away < 5 * np.array(told["sigmas"]))
-        assert np.max(told["sigmas"]) < 2e-4
-        assert found.noise[robot]["translation_mm"] < 0.5 * reported.noise[robot]["translation_mm"]
+        kinematics = found.arms[robot].stages["kinematics"]
+        assert kinematics["level"] == "offsets"
+        true = cell.true_arms[robot].offset - cell.arms[robot].offset
+        arm = Robot.from_document(kinematics["robot"])
+        told = arm.chain.functions[:, 0] - load_robot("ur5e").chain.functions[:, 0]
+        # What the first joint and the last could take is the base's and the flange's; others are
+        # known to some 0.05 mrad by this many stops.
+        assert told[[0, -1]] == pytest.approx(0.0, abs=1e-9)
+        assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
     assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
-    assert off(cell, reported, "cam_left", "cam_right")[1] > 22.0
+    assert found.edges["cell_from_cam_left"].sigma_mm < 0.4 * (
+        reported.edges["cell_from_cam_left"].sigma_mm
+    )
 
 
 def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
@@ -280,10 +285,10 @@ def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
         target_document=session.target_document,
         robot_document=session.robot_document,
     )
-    found = align(bare, corners={it.view: it for it in cell.corners}, arms="offsets")
+    found = align(bare, corners={it.view: it for it in cell.corners}, level="offsets")
     assert sum("stays as it reports itself" in it for it in found.verdict.reasons) == 2
-    with pytest.raises(DataError, match="arms is 'all'"):
-        align(bare, arms="all")
+    with pytest.raises(DataError, match="level 'all'"):
+        align(bare, level="all")
 
 
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():

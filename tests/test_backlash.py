@@ -23,7 +23,7 @@ def worn():
 
 def test_play_is_told_and_is_no_stiffness(worn):
     assert worn.kinematics.level == "elastic"
-    plays = plays_of(worn.arm_model, worn.solved)
+    plays = plays_of(worn.arm_model, worn.arm_spread)
     for play, true in zip(plays, PLAY, strict=True):
         assert play.is_sure
         # Six draws, at three and a half sigma.
@@ -43,7 +43,7 @@ def test_play_is_in_the_result(worn):
 def test_an_arm_that_is_right_but_for_its_play():
     known = calibrated(simulate(replace(GOOD, views=40, backlash_rad=PLAY, seed=3)))
     assert known.kinematics.level == "backlash"
-    told = [it.deadband_rad for it in plays_of(known.arm_model, known.solved)]
+    told = [it.deadband_rad for it in plays_of(known.arm_model, known.arm_spread)]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
     q = known.joints(known.used)
@@ -57,4 +57,4 @@ def test_an_arm_that_is_right_but_for_its_play():
 def test_stops_from_one_side_tell_no_play():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     known = calibrated(replace(cell, approach=np.ones(len(cell.approach))))
-    assert plays_of(known.arm_model, known.solved) == ()
+    assert plays_of(known.arm_model, known.arm_spread) == ()

@@ -202,7 +202,7 @@ def test_transforms_of_one_robot_are_exported(place):
     refused = visioncal("export", place / "out", "--to", "robot-dh")
     assert "several robots (a, b)" in refused.err
     refused = visioncal("export", place / "out", "--to", "robot-dh", "--robot", "b")
-    assert "writes the calibrated arm, and this calibration has none" in refused.err
+    assert "writes the calibrated arm, and this calibration kept the nominal one" in refused.err
 
 
 def test_targets_are_corrected_for_the_robot_that_is_named(place, tmp_path):

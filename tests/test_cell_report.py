@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from aligned_cells import made_up_cell
 
-from visioncal.calibration import Moved, Sight, Untied
+from visioncal.calibration import Moved, RobotResult, Sight, Untied
 from visioncal.figures import significant
 from visioncal.recording.cellmap import pairs, weakest_frame
 from visioncal.report.cells import pair_table, render_cell, write_cell_report
@@ -55,9 +55,14 @@ def test_the_table_has_any_frame_in_any_other():
 
 
 def test_errors_of_robots_are_told_where_they_were_estimated():
-    found = replace(CELL, details={"arms": {"a": {"values": [2.2e-4], "sigmas": [1.4e-4]}}})
-    assert "robot a 0.22 \N{PLUS-MINUS SIGN} 0.14" in text_of(render_cell(found))
-    assert "Errors of the robots" not in render_cell(CELL)
+    levels = [
+        {"level": name, "unknowns": 6, "rms_mm": mm, "held_out_mm": mm, "likelihood_ratio": 0.0}
+        for name, mm in (("nominal", 0.31), ("offsets", 0.17))
+    ]
+    arm = RobotResult(stages={"kinematics": {"level": "offsets", "levels": levels}})
+    words = text_of(render_cell(replace(CELL, arms={"a": arm})))
+    assert "robot a offsets stops left out: 0.17 mm, as stated 0.31 mm" in words
+    assert "The robots themselves" not in render_cell(CELL)
 
 
 def test_what_moved_and_what_is_untied_is_told(tmp_path):

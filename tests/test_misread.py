@@ -173,7 +173,8 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
 def test_zeros_that_differ_between_poses_and_joints_are_named():
     told = Told.of(IN_HAND, with_poses=True)
     off = np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
-    matched = match_joints(replace(told, joints=told.joints - off).session, load_robot("ur5e"))
+    session = replace(told, joints=told.joints - off).session
+    matched = match_joints(session.views, load_robot("ur5e"))
     assert matched.zero.zeros == pytest.approx(off, abs=1e-4)  # the search stops at 1e-6 rad
     assert matched.arm.base_from_flange(told.joints - off) == pytest.approx(told.poses, abs=1e-4)
     assert "moved by 10.00 deg" in matched.warnings[0]

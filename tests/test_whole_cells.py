@@ -294,7 +294,7 @@ def test_the_result_of_one_pair_replaces_that_of_the_cell(folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("asked", "words"),
-    [({"solver": "park"}, "solver park cannot be asked"), ({"level": "elastic"}, "level elastic")],
+    [({"solver": "park"}, "solver park cannot be asked"), ({"level": "thermal"}, "level thermal")],
 )
 def test_what_a_whole_cell_does_not_have_is_refused(cell, asked, words):
     with pytest.raises(DataError, match=words):

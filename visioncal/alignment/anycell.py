@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from visioncal import pipeline
-from visioncal.alignment.arms import ArmsAsked
+from visioncal.alignment.arms import LEVELS
 from visioncal.alignment.run import align
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
@@ -11,14 +11,6 @@ from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell
 from visioncal.types import Progress, SolverName
-
-# What of a whole cell's arms is estimated at a level.
-_ARMS: dict[str, ArmsAsked] = {
-    "auto": "reported",
-    "hand-eye": "reported",
-    "offsets": "offsets",
-    "kinematics": "kinematics",
-}
 
 
 def calibrate(
@@ -40,8 +32,7 @@ def calibrate(
         solver: `joint` for the fit of both edges, or the name of a closed form.
         level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
             arm, `offsets` of its joints, its `kinematics`, `elastic` for joints that bend, too, or
-            `thermal` for its drift with temperature, too. Of a whole cell the arms stay as they
-            report themselves, but for `offsets` and `kinematics`.
+            `thermal` for its drift with temperature, too, which a whole cell does not have.
         convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         progress: Told of long work.
@@ -56,30 +47,29 @@ def calibrate(
     """
     loaded = session if isinstance(session, Session) else Session.load(session)
     if is_whole_cell(loaded):
-        arms = arms_asked(solver, level, convention)
-        return Calibration.whole(align(loaded, arms=arms, progress=progress))
+        check_whole(solver, level, convention)
+        return Calibration.whole(align(loaded, level=level, progress=progress))
     return pipeline.calibrate(
         loaded, solver=solver, level=level, convention=convention, progress=progress
     )
 
 
-def arms_asked(solver: SolverName, level: str, convention: Convention | None) -> ArmsAsked:
-    """What is estimated of a whole cell's arms.
+def check_whole(solver: SolverName, level: str, convention: Convention | None) -> None:
+    """Refuses what is not asked of a whole cell.
 
     Raises:
         DataError: A whole cell is not calibrated that way.
     """
     given = {
         "solver": solver if solver != "joint" else "",
-        "level": level if level not in _ARMS else "",
+        "level": level if level not in LEVELS else "",
         "convention": convention or "",
     }
     wrong = [f"{name} {it}" for name, it in given.items() if it]
     if wrong:
         raise DataError(
             f"{' and '.join(wrong)} cannot be asked of a whole cell: it has the joint solver, and "
-            f"the levels {', '.join(_ARMS)}.",
+            f"the levels {', '.join(LEVELS)}.",
             culprits=[f"--{name}" for name, it in given.items() if it],
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )
-    return _ARMS[level]

@@ -1,171 +1,154 @@
-"""The robots' own errors in a whole cell: unknowns beside the frames, where they are asked for.
+"""The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
 
-What the first joint's place could take up is the base's, and what the last one's could is the
-flange's: both are frames of the cell already.
-"""
-
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from visioncal.alignment.cell import Cell, robot_key
-from visioncal.estimation.joint import chance_limit
-from visioncal.estimation.problem import Effect, Noise, Problem, State
-from visioncal.estimation.solve import normal_equations, score_gain
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.arm import misfit_covariance, stops_of
+from visioncal.estimation.misfit import Drift, Neighbours, drift, inflation, neighbours
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.robot import Robot
-from visioncal.transforms import adjoint, invert
+from visioncal.session import View
+from visioncal.session.loads import loads_of
+from visioncal.stages.arms import RobotArm
+from visioncal.stages.diagnose import FEWEST_STOPS, misfit_words
+from visioncal.stages.joints import Matched, match_joints
+from visioncal.stages.kinematics import ASKED, doubts, findings
+from visioncal.stages.loads import check_elastic, check_poses
 from visioncal.types import FloatArray
 
-# What of the arms is estimated: nothing, the offsets of their joints, or all of their geometry.
-ArmsAsked: TypeAlias = Literal["reported", "offsets", "kinematics"]
-ARMS_ASKED: tuple[ArmsAsked, ...] = get_args(ArmsAsked)
-# What is known of any arm: its joints' zeros [rad], and each link's place in the one before.
-_OFFSET_SIGMA, _LINK_SIGMA_RAD, _LINK_SIGMA_M = 0.02, 2e-3, 1e-3
+# How far the arms of a whole cell may be calibrated.
+LEVELS = (*(it for it in ASKED if it != "thermal"), "hand-eye")
 
 
 @dataclass(frozen=True, eq=False)
-class ArmsErrors:
-    """Unknowns of the arms.
+class Misfit:
+    """What the residuals of one robot's stops show beyond noise.
 
     Attributes:
-        effects: One a robot, by how its flange moves at every station.
-        robots: The robots, in that order.
-        unasked: Robots whose errors cannot be asked for, because joints or models are missing.
+        alike: Whether neighbouring stops err alike.
+        moved: How its base or what it looks at crept; None where noise explains it.
     """
 
-    effects: tuple[Effect, ...] = ()
-    robots: tuple[str, ...] = ()
-    unasked: tuple[str, ...] = ()
-
-    @property
-    def values(self) -> FloatArray:
-        """(k,) all of them, of arms as they are stated."""
-        return np.concatenate([np.zeros(0), *(it.values for it in self.effects)])
-
-    def document(self, problem: Problem, state: State, spread: FloatArray) -> dict[str, Any]:
-        """What was found of each arm, as it stands on disk.
-
-        Args:
-            problem: The problem that has these effects.
-            state: The unknowns.
-            spread: (p, p) their covariance.
-        """
-        sigmas = np.sqrt(np.diag(spread))
-        return {
-            robot: {
-                "values": problem.values_of(it.name, state).tolist(),
-                "sigmas": sigmas[problem.effect_columns[it.name]].tolist(),
-            }
-            for robot, it in zip(self.robots, self.effects, strict=True)
-        }
+    alike: Neighbours
+    moved: Drift | None
 
 
-def arms_errors(cell: Cell, asked: ArmsAsked) -> ArmsErrors:
-    """Sets up what is asked of the arms.
+def arms_of(cell: Cell) -> dict[str, RobotArm]:
+    """Reads the arms of a cell, as they are stated."""
+    return {
+        robot_key(name): _arm(cell, name)
+        for name in cell.session.robots
+        if robot_key(name) in cell.poses
+    }
 
-    Args:
-        cell: The cell.
-        asked: `offsets` for the zeros of all joints between the first and the last, in their
-            order; `kinematics` for the place of each link in the one before, too, in six numbers
-            each (rotation, translation).
+
+def _arm(cell: Cell, name: str) -> RobotArm:
+    session, key = cell.session, robot_key(name)
+    rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
+    reported = cell.poses[key]
+    stood = np.isfinite(reported[:, 0, 0])
+    views = [rows[it] for it in np.flatnonzero(stood).tolist()]
+    loads = loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views])
+    document = session.robot_documents.get(name)
+    matched = None if document is None else match_joints(views, Robot.from_document(document))
+    joints = None if matched is None else _joints(views, matched)
+    return RobotArm(key, reported, stood, joints, loads, matched)
+
+
+def _joints(views: Sequence[View], matched: Matched) -> FloatArray | None:
+    """(m, n) joints of some views; None where one has none that belong to the model."""
+    known = [matched.joints_rad.get(it.number) for it in views]
+    found = [it for it in known if it is not None]
+    return np.array(found) if found and len(found) == len(known) else None
+
+
+def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
+    """Refuses loads that determine nothing.
+
+    Raises:
+        DataError: Springs are asked for that nothing bends.
+        DegenerateError: Loads change while an arm stands still.
     """
-    effects: dict[str, Effect] = {}
-    unasked = []
-    for name in cell.session.robots if asked != "reported" else ():
-        key, document = robot_key(name), cell.session.robot_documents.get(name)
-        if key not in cell.poses:
-            continue
-        joints = _joints(cell, name)
-        if document is None or joints is None:
-            unasked.append(name or "the robot")
-            continue
-        robot = Robot.from_document(document)
-        sigmas = _sigmas(robot, asked)
-        effects[key] = Effect(
-            f"arm {key}",
-            np.zeros(len(sigmas)),
-            Knowledge(np.diag(sigmas**-2.0), np.zeros(len(sigmas))),
-            np.zeros(len(sigmas), dtype=bool),
-            by_flange={key: _moves(robot, joints, cell.poses[key], asked)},
-        )
-    return ArmsErrors(tuple(effects.values()), tuple(effects), tuple(unasked))
+    for arm in arms.values():
+        check_poses(arm.loads, arm.reported[arm.stood])
+        check_elastic(asked, None if arm.matched is None else arm.matched.robot, arm.loads)
 
 
-def erring_arms(cell: Cell, problem: Problem, state: State, noise: Noise) -> dict[str, ArmsAsked]:
-    """Robots whose errors follow their posture, by Rao's score test, and what explains them.
-
-    Args:
-        cell: The cell.
-        problem: The observations that agree, robots being as they report themselves.
-        state: The fit.
-        noise: Its noise.
-
-    Returns:
-        By robot, `offsets` where these explain its errors as well as chance asks, else
-        `kinematics`.
-    """
-    offsets, links = (_gains(cell, problem, state, noise, it) for it in ARMS_ASKED[1:])
-    found: dict[str, ArmsAsked] = {}
-    for robot, (gain, count) in links.items():
-        of_offsets, fewer = offsets[robot]
-        if gain - of_offsets > chance_limit(count - fewer):
-            found[robot] = "kinematics"
-        elif of_offsets > chance_limit(fewer):
-            found[robot] = "offsets"
-    return found
-
-
-def _gains(
-    cell: Cell, problem: Problem, state: State, noise: Noise, asked: ArmsAsked
-) -> dict[str, tuple[float, int]]:
-    """By how much each robot's errors would lower the squared error, and how many they are."""
-    arms = arms_errors(cell, asked)
-    wider = problem.with_effects([*problem.effects, *arms.effects])
-    there = State(state.edges, np.concatenate([state.values, arms.values]))
-    information, gradient = normal_equations(wider, there, noise)
-    now = np.zeros(wider.size, dtype=bool)
-    now[: problem.size] = problem.moving
+def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
+    """Tests the residuals of each robot's stops for what is no noise."""
     found = {}
-    for robot, it in zip(arms.robots, arms.effects, strict=True):
-        more = now.copy()
-        more[wider.effect_columns[it.name]] = True
-        found[robot] = score_gain(information, gradient, more, now), len(it)
+    for robot in problem.robots:
+        if len(stops_of(problem, robot)) >= FEWEST_STOPS:
+            fitted = (problem, fit.state, fit.noise, robot)
+            found[robot] = Misfit(neighbours(*fitted), drift(*fitted))
     return found
 
 
-def _joints(cell: Cell, name: str) -> FloatArray | None:
-    """(s, n) joints by station, not a number where unknown; None where a known pose has none."""
-    told = {it.station: it.robots[name] for it in cell.session.observations if name in it.robots}
-    angles = {station: view.joints_rad for station, view in told.items()}
-    known = [it for it in angles.values() if it is not None]
-    if not known or len(known) < len(angles) or len({len(it) for it in known}) > 1:
-        return None
-    joints = np.full((len(cell.poses[robot_key(name)]), len(known[0])), np.nan)
-    for station, values in angles.items():
-        joints[station] = values
-    return joints
+def covariance_with_arms(
+    problem: Problem,
+    fit: Solution,
+    arms: Mapping[str, RobotArm],
+    found: Mapping[str, Misfit],
+) -> FloatArray:
+    """Covariance (p, p) of a fit, with what is no noise of its robots.
+
+    Args:
+        problem: The observations that agree.
+        fit: Their fit.
+        arms: The arms; errors that are no unknowns count.
+        found: What their residuals show.
+    """
+    spread = covariance_of(problem, fit)
+    for robot, arm in arms.items():
+        if arm.errors is not None and not arm.errors.is_estimated:
+            spread = spread + misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
+    for robot, it in found.items():
+        if it.alike.is_significant:
+            more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
+            spread = spread + more
+    return spread
 
 
-def _moves(robot: Robot, joints: FloatArray, poses: FloatArray, asked: ArmsAsked) -> FloatArray:
-    """(s, 6, k) how the reported flange moves; zero where no joints are known."""
-    stood = np.isfinite(joints).all(axis=1) & np.isfinite(poses[:, 0, 0])
-    q = joints[stood]
-    moves = robot.joint_jacobian(q)[:, :, 1:-1]
-    if asked == "kinematics":
-        links = robot.placement_jacobian(q)[:, :, 6:-6]
-        moves = np.concatenate([moves, links], axis=2)
-    # Where the reported frame sits on the model's flange.
-    mounted = invert(robot.base_from_flange(q)) @ poses[stood]
-    found = np.zeros((len(joints), 6, moves.shape[2]))
-    found[stood] = adjoint(invert(mounted)) @ moves
-    return found
+def doubts_of_arms(
+    arms: Mapping[str, RobotArm], found: Mapping[str, Misfit], asked: str
+) -> Iterator[str]:
+    """Words what speaks against the robots."""
+    for robot, arm in arms.items():
+        for words in _doubts(arm, found.get(robot), asked):
+            yield _of_robot(robot, words)
 
 
-def _sigmas(robot: Robot, asked: ArmsAsked) -> FloatArray:
-    offsets = np.full(robot.joint_count - 2, _OFFSET_SIGMA)
-    if asked == "offsets":
-        return offsets
-    link = np.repeat([_LINK_SIGMA_RAD, _LINK_SIGMA_M], 3)
-    return np.concatenate([offsets, np.tile(link, robot.joint_count - 1)])
+def notes_on_arms(arms: Mapping[str, RobotArm]) -> Iterator[str]:
+    """Words what was found of the arms and is no reason for doubt."""
+    for robot, arm in arms.items():
+        notes = () if arm.matched is None else arm.matched.notes
+        chosen = () if arm.kinematics is None else findings(arm.kinematics)
+        for words in (*notes, *chosen):
+            yield _of_robot(robot, words)
+
+
+def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
+    if arm.matched is not None:
+        yield from arm.matched.warnings
+    if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
+        yield "It stays as it reports itself: its errors take joint angles and a known model."
+    if arm.kinematics is not None:
+        yield from doubts(arm.kinematics)
+    if found is not None:
+        calibrated = arm.model is not None
+        yield from misfit_words(found.alike, found.moved, arm.errors, calibrated=calibrated)
+
+
+def _of_robot(robot: str, words: str) -> str:
+    return f"Robot {robot}: {words[0].lower()}{words[1:]}"
+
+
+def with_errors(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
+) -> dict[str, RobotArm]:
+    """Looks for errors of each arm that follow its posture, the others being as stated."""
+    return {name: arm.with_errors(problem, fit) for name, arm in arms.items()}

@@ -34,10 +34,10 @@ def with_looks(
 ) -> tuple[Agreed, Seen]:
     """Fits lenses and boards with the rest, and with other effects."""
     looks = _looks(cell, cameras, views)
-    agreed, seen = _settled(cell, looks, looks.first, agreed, others)
+    agreed, seen = settled_looks(cell, looks, looks.first, agreed, others)
     wider = _wider(cell, seen, agreed, others)
     if len(wider) > len(seen.free):
-        agreed, seen = _settled(cell, seen.looks, wider, agreed, others)
+        agreed, seen = settled_looks(cell, seen.looks, wider, agreed, others)
     return agreed, seen
 
 
@@ -64,7 +64,7 @@ def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPo
     return Looks.of(problems, poses)
 
 
-def _settled(
+def settled_looks(
     cell: Cell, looks: Looks, free: IntArray, agreed: Agreed, others: Sequence[Effect]
 ) -> tuple[Agreed, Seen]:
     """Linearises corners and fits the cell in turn, until lenses and boards stay."""

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.alignment.arms import ARMS_ASKED, ArmsAsked, erring_arms
+from visioncal.alignment.arms import (
+    LEVELS,
+    Misfit,
+    covariance_with_arms,
+    doubts_of_arms,
+    misfits,
+    notes_on_arms,
+)
 from visioncal.alignment.cell import Cell, read_cell, robot_key
 from visioncal.alignment.clocks import Clocks, Pair, set_clocks
 from visioncal.alignment.faults import (
@@ -33,7 +40,6 @@ from visioncal.alignment.unseen import budget_mm, left_out
 from visioncal.alignment.written import corner_residuals, fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
-from visioncal.estimation.solve import covariance_of
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.measured import components
@@ -47,7 +53,7 @@ from visioncal.types import Corners, FloatArray, Progress
 def align(
     session: Session | Path | str,
     *,
-    arms: ArmsAsked = "reported",
+    level: str = "auto",
     corners: Mapping[int, Corners] | None = None,
     progress: Progress | None = None,
 ) -> Alignment:
@@ -57,8 +63,8 @@ def align(
 
     Args:
         session: A session, or the path of its folder or recording.
-        arms: What is estimated of the robots themselves: nothing, the `offsets` of their joints, or
-            their whole `kinematics`; it takes joint angles and a model.
+        level: How far each arm is calibrated, as `calibrate` has it; beyond `hand-eye` it takes
+            joint angles and a model.
         corners: What was found in its images before, by view; None to look.
         progress: Told of long work.
 
@@ -69,8 +75,8 @@ def align(
         DataError: The input is wrong or shows no target.
         DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
     """
-    if arms not in ARMS_ASKED:
-        raise DataError(f"arms is {arms!r}, one of {', '.join(ARMS_ASKED)} is needed.")
+    if level not in LEVELS:
+        raise DataError(f"level {level!r} is not one of {', '.join(LEVELS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
     looked = look_around(read_cell(loaded), corners, progress)
     if progress is not None:
@@ -79,7 +85,7 @@ def align(
         clocks = set_clocks(loaded, looked.poses)
         cell = read_cell(clocks.session)
         cell = replace(cell, reasons={**cell.reasons, **clocks.reasons})
-        solved = solve(cell, looked, clocks, arms)
+        solved = solve(cell, looked, clocks, level)
         return alignment_of(loaded, cell, looked, clocks, solved)
 
 
@@ -100,7 +106,8 @@ def alignment_of(
     """
     agreed = solved.agreed
     problem = agreed.problem
-    spread = covariance_of(problem.subset(agreed.used), agreed.fit)
+    found = misfits(problem.subset(agreed.used), agreed.fit)
+    spread = covariance_with_arms(problem.subset(agreed.used), agreed.fit, solved.arms, found)
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
@@ -139,11 +146,11 @@ def alignment_of(
             noise,
             moved,
             untied,
-            [*clocks.warnings, *_warnings(solved, looked, spread)],
-            (*clocks.notes, *_clock_words(clocks, solved, spread)),
+            [*clocks.warnings, *_warnings(solved, looked, spread, found)],
+            (*clocks.notes, *_clock_words(clocks, solved, spread), *notes_on_arms(solved.arms)),
         ),
         details=_details(clocks, solved, spread),
-        arms=_arms(session),
+        arms=_arms(session, solved, spread),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
         stages={
             **fit_sections(session, solved, spread, len(edges)),
@@ -152,26 +159,27 @@ def alignment_of(
     )
 
 
-def _arms(session: Session) -> dict[str, RobotResult]:
+def _arms(session: Session, solved: Solved, spread: FloatArray) -> dict[str, RobotResult]:
     models = session.robot_documents
-    return {
+    found = {
         robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
         for name in session.robots
     }
+    for name, arm in solved.arms.items():
+        stages = arm.documents(solved.agreed.problem, spread)
+        found[name] = replace(found[name], stages=stages)
+    return found
 
 
-def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
+def _warnings(
+    solved: Solved, looked: Looked, spread: FloatArray, found: Mapping[str, Misfit]
+) -> list[str]:
     """Reasons for doubt that are no figure of the result."""
     agreed = solved.agreed
     used = agreed.problem.subset(agreed.used)
     measured = components(used, agreed.fit.state, spread, solved.cell.priors)
-    missing = [
-        f"Robot {it} stays as it reports itself: its errors take joint angles and a known model."
-        for it in solved.arms.unasked
-    ]
     return [
-        *missing,
-        *_erring(solved),
+        *doubts_of_arms(solved.arms, found, solved.asked),
         *pushed_bases(solved),
         *solved.cell.session.warnings,
         *looked.warnings,
@@ -181,32 +189,16 @@ def _warnings(solved: Solved, looked: Looked, spread: FloatArray) -> list[str]:
     ]
 
 
-def _erring(solved: Solved) -> list[str]:
-    """Words robots whose errors follow their posture, where these were not asked for."""
-    if solved.arms.effects:
-        return []
-    agreed = solved.agreed
-    part = agreed.problem.subset(agreed.used)
-    found = erring_arms(solved.cell, part, agreed.fit.state, agreed.fit.noise)
-    return [
-        f"The errors of robot {robot} follow its posture, as those of its own "
-        f"{'joint offsets' if asked == 'offsets' else 'kinematics'} do, and frames are off by more "
-        f"than is said. Align again with --arms {asked}."
-        for robot, asked in found.items()
-    ]
-
-
 def _details(clocks: Clocks, solved: Solved, spread: FloatArray) -> dict[str, Any]:
-    """What was found of clocks, and of the arms where it was asked for."""
-    agreed, found = solved.agreed, {}
-    if clocks.found:
-        found["clocks"] = {
+    """What was found of clocks."""
+    if not clocks.found:
+        return {}
+    return {
+        "clocks": {
             it.words: _fitted_clock(it, at.clock, solved, spread).document()
             for it, at in clocks.found.items()
         }
-    if solved.arms.effects:
-        found["arms"] = solved.arms.document(agreed.problem, agreed.fit.state, spread)
-    return found
+    }
 
 
 def _fitted_clock(pair: Pair, clock: Clock, solved: Solved, spread: FloatArray) -> Clock:

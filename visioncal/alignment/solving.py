@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.alignment.arms import ArmsAsked, ArmsErrors, arms_errors
+from visioncal.alignment.arms import arms_of, check_arms, with_errors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.clocks import Clocks
-from visioncal.alignment.lenses import with_looks
+from visioncal.alignment.lenses import settled_looks, with_looks
 from visioncal.alignment.looking import Looked
 from visioncal.alignment.priors import most_contradicted
 from visioncal.alignment.reading import nominal_spread, places_alone
@@ -17,12 +17,17 @@ from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
+from visioncal.stages.arms import RobotArm, effects_of
 from visioncal.stages.choose import chosen, padded
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
 from visioncal.targets import rotation_transforms
 from visioncal.types import IntArray, Mask, Target
+
+# Arms are linearised anew so often, or until their errors move by less, which is far below any
+# arm's repeatability.
+_ROUNDS, _AT_REST_RAD = 4, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +40,8 @@ class Solved:
         seen: What all corners say of lenses and boards; None without images.
         poses: Each row's one pose.
         untied: Frames that nothing ties to the rest.
-        arms: The robots' own errors.
+        arms: The robots' arms, as far as they were calibrated.
+        asked: How far that was to be.
     """
 
     cell: Cell
@@ -43,7 +49,8 @@ class Solved:
     seen: Seen | None
     poses: tuple[ViewPoses, ...]
     untied: tuple[str, ...]
-    arms: ArmsErrors
+    arms: Mapping[str, RobotArm]
+    asked: str
 
     @property
     def looks(self) -> Looks | None:
@@ -64,14 +71,14 @@ class Solved:
         return np.asarray(first + np.searchsorted(free, places))
 
 
-def solve(cell: Cell, looked: Looked, clocks: Clocks, asked: ArmsAsked = "reported") -> Solved:
+def solve(cell: Cell, looked: Looked, clocks: Clocks, asked: str = "auto") -> Solved:
     """Solves a whole cell.
 
     Args:
         cell: The cell.
         looked: What its cameras saw.
         clocks: The offsets of clocks by which its rows have poses.
-        asked: What is to be estimated of the robots' arms.
+        asked: How far the robots' arms are to be calibrated, one of `arms.LEVELS`.
 
     Raises:
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
@@ -87,15 +94,57 @@ def solve(cell: Cell, looked: Looked, clocks: Clocks, asked: ArmsAsked = "report
     cell, views, problem, state, unplaced = _started(cell, views)
     agreed = agree(problem, state, _movable(problem))
     agreed = _levelled(cell, views, agreed)
-    seen, arms = None, arms_errors(cell, asked)
-    others = (*clocks.effects(cell), *arms.effects)
+    arms: Mapping[str, RobotArm] = arms_of(cell)
+    check_arms(arms, asked)
+    arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
+    seen, late = None, clocks.effects(cell)
+    others = (*late, *effects_of(arms))
     if looked.cameras:
         agreed, seen = with_looks(cell, looked.cameras, views, agreed, others)
     elif others:
         agreed = _with_effects(agreed, others)
+    if asked != "hand-eye":
+        arms = _levels(agreed, arms, asked)
+        agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
     agreed = _without_contradicted(settle(agreed, _movable(agreed.problem)))
+    agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
     agreed = _with_repeats(agreed)
-    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms)
+    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked)
+
+
+def _levels(agreed: Agreed, arms: Mapping[str, RobotArm], asked: str) -> dict[str, RobotArm]:
+    """Chooses how far each arm is calibrated, beside the errors of the others."""
+    problem, chosen = agreed.problem.subset(agreed.used), dict(arms)
+    for name, arm in arms.items():
+        stated = arm.without_errors(problem)
+        chosen[name] = arm.with_level(stated, agreed.fit, asked)
+        poses = {**problem.poses, name: chosen[name].poses}
+        effects = [*stated.effects, *chosen[name].effects()]
+        problem = replace(problem, poses=poses).with_effects(effects)
+    return chosen
+
+
+def _at_rest(
+    cell: Cell,
+    agreed: Agreed,
+    seen: Seen | None,
+    arms: Mapping[str, RobotArm],
+    late: Sequence[Effect],
+) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+    """Fits with calibrated arms that are linearised anew until they stay."""
+    for _ in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
+        poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
+        agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
+        effects = (*late, *effects_of(arms))
+        if seen is None:
+            agreed = _with_effects(agreed, effects)
+        else:
+            agreed, seen = settled_looks(cell, seen.looks, seen.free, agreed, effects)
+        moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
+        arms = {name: arm for name, (arm, _) in moved.items()}
+        if max(step for _, step in moved.values()) < _AT_REST_RAD:
+            break
+    return agreed, seen, arms
 
 
 def _with_repeats(agreed: Agreed) -> Agreed:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.alignment import ArmsAsked, align
+from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.cli.console import messages, print_verdict, shown_progress, tell_written
 from visioncal.figures import figure
@@ -22,13 +22,13 @@ _SHOWN_LEVEL = 1.2
 def align_command(
     session: Annotated[Path, typer.Argument(help="A session's folder, or its .rrd recording.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")] = Path("out"),
-    arms: Annotated[
-        ArmsAsked,
+    level: Annotated[
+        str,
         typer.Option(
-            help="What is estimated of the robots themselves: reported (nothing), offsets (of "
-            "their joints) or kinematics."
+            help="The arms: auto, hand-eye (none comes out), offsets (of their joints), "
+            "kinematics, elastic (joints that bend, too)."
         ),
-    ] = "reported",
+    ] = "auto",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print alignment.json to stdout.")
     ] = False,
@@ -41,16 +41,16 @@ def align_command(
     there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
     leave a frame open.
     """
-    found = align_into(Session.load(session), out, arms=arms, quiet=as_json)
+    found = align_into(Session.load(session), out, level=level, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))
 
 
-def align_into(session: Session, out: Path, *, arms: ArmsAsked, quiet: bool) -> Alignment:
+def align_into(session: Session, out: Path, *, level: str, quiet: bool) -> Alignment:
     """Aligns a session's cell, writes the result into a folder and tells of it."""
     left = leftover(out)
     with shown_progress(quiet=quiet) as told:
-        result = align(session, arms=arms, progress=told)
+        result = align(session, level=level, progress=told)
     if left is not None:
         left.keep()
     written = write_alignment(out, session, result)

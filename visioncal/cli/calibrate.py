@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.alignment import arms_asked
+from visioncal.alignment import check_whole
 from visioncal.calibration import to_document
 from visioncal.calibration.whole import whole_document
 from visioncal.cli.align import align_into
@@ -62,8 +62,8 @@ def calibrate_command(
     """
     loaded = Session.load(session)
     if is_whole_cell(loaded):
-        arms = arms_asked(solver, level, convention)
-        document = whole_document(align_into(loaded, out, arms=arms, quiet=as_json))
+        check_whole(solver, level, convention)
+        document = whole_document(align_into(loaded, out, level=level, quiet=as_json))
         if as_json:
             typer.echo(json.dumps(document, indent=2))
         return

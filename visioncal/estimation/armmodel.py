@@ -16,6 +16,7 @@ _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
 # What goes by the loads of a stop, and by the side from which it was approached; the others are
 # the same at all stops.
 COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
+RIGID = ("links", *_FUNCTIONS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +215,7 @@ def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
     springs = (COMPLIANCE,) if robot.masses is not None or loads.any else ()
     weighs = () if robot.masses is not None else (WEIGHT,)
     plays = (BACKLASH,) if loads.from_both_sides else ()
-    return ("links", *_FUNCTIONS, *springs, *weighs, *plays)
+    return (*RIGID, *springs, *weighs, *plays)
 
 
 def block_size(name: str, joints: int) -> int:

@@ -8,7 +8,7 @@ from visioncal.chance import chi2_limit
 from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.problem import Effect, Noise, Problem, State
-from visioncal.estimation.solve import normal_equations
+from visioncal.estimation.solve import fisher_information, normal_equations
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
@@ -123,3 +123,21 @@ def _where_it_looks(problem: Problem, state: State, robot: str) -> FloatArray:
         for frame in dict.fromkeys(observed[rows].tolist())
     ]
     return np.asarray(np.concatenate(places).mean(axis=0))
+
+
+def inflation(
+    problem: Problem, state: State, noise: Noise, robot: str, factor: float
+) -> FloatArray:
+    """What is to be added to a covariance (p, p) where a robot's neighbouring stops err alike.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        noise: Its levels.
+        robot: The robot.
+        factor: By how much more its stops contribute than independent noise lets them.
+    """
+    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
+    part = problem.subset(rows_of(problem, robot))
+    own = fisher_information(part, state, noise) - problem.knowledge(state).information
+    return np.asarray((factor - 1.0) * fitted @ own @ fitted)

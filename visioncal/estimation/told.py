@@ -143,6 +143,22 @@ def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return sizes, turned
 
 
+def frames_apart(frames: FloatArray, arm: FloatArray) -> FloatArray:
+    """Projects errors of the arm on those that no frames at its ends do as well.
+
+    Args:
+        frames: (r, f) slopes by the frames, at postures all over the workspace.
+        arm: (r, p) slopes by the errors.
+
+    Returns:
+        (p, p) a symmetric projection.
+    """
+    _, free = Slopes(frames, arm).free()
+    sizes, turned = right_vectors(free)
+    null = turned[sizes <= LEAST_SHARE * sizes[0]]
+    return np.asarray(np.eye(arm.shape[1]) - null.T @ null)
+
+
 def _split(slopes: FloatArray, frames: IntArray, arm_units: FloatArray) -> Slopes:
     flat, size = slopes.reshape(-1, slopes.shape[2]), len(arm_units)
     return Slopes(flat[:, frames], flat[:, flat.shape[1] - size :] * arm_units)

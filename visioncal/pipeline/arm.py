@@ -11,7 +11,6 @@ from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
 from visioncal.robot import Robot
 from visioncal.stages.backlash import plays_of
-from visioncal.stages.kinematics import Level
 from visioncal.stages.tell import ArmData, Estimate, Telling, tell
 from visioncal.targets import corner_positions
 
@@ -50,8 +49,7 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
     if found is None:
         return None
     document: dict[str, Any] = {
-        "level": found.level,
-        "levels": [_level(it) for it in found.levels],
+        **found.document(),
         **_backlash(known),
     }
     if model is None:
@@ -83,24 +81,8 @@ def _backlash(known: Known) -> dict[str, list[dict[str, Any]]]:
     """The play of the joints, where stops were approached from both sides."""
     if known.arm_model is None:
         return {}
-    rows = [
-        {"joint": it.joint, "deadband_rad": it.deadband_rad, "sigma_rad": it.sigma_rad}
-        for it in plays_of(known.arm_model, known.solved)
-    ]
+    rows = [it.document() for it in plays_of(known.arm_model, known.arm_spread)]
     return {"backlash": rows} if rows else {}
-
-
-def _level(level: Level) -> dict[str, Any]:
-    figures = {
-        "level": level.name,
-        "unknowns": level.unknowns,
-        "rms_mm": level.inside.mm,
-        "rms_deg": level.inside.deg,
-        "held_out_mm": level.left_out.mm,
-        "held_out_deg": level.left_out.deg,
-        "likelihood_ratio": level.likelihood_ratio,
-    }
-    return {name: it for name, it in figures.items() if it is not None}
 
 
 def _observability(telling: Telling) -> dict[str, Any]:

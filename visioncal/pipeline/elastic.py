@@ -30,7 +30,7 @@ def check_loads(known: Known) -> None:
 
 def with_springs(known: Known) -> Known:
     """Adds what the stops tell of the arm's springs, and of the play in its joints."""
-    plays = () if known.arm_model is None else plays_of(known.arm_model, known.solved)
+    plays = () if known.arm_model is None else plays_of(known.arm_model, known.arm_spread)
     known = replace(known, notes=(*known.notes, *backlash.remarks(plays)))
     found = _springs(known)
     if found is None:

@@ -360,6 +360,12 @@ class Known:
         return 0 if self.arm_model is None else len(self.arm_model.values)
 
     @property
+    def arm_spread(self) -> FloatArray:
+        """(p, p) covariance of the errors of the arm's model."""
+        first = len(self.solved.covariance) - self.arm_size
+        return self.solved.covariance[first:, first:]
+
+    @property
     def arm_values(self) -> FloatArray | None:
         """(p,) present values of the arm's errors; None for the nominal arm's."""
         return None if self.arm_model is None else self.arm_model.values

@@ -10,7 +10,6 @@ import numpy as np
 from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult, Validation
 from visioncal.errors import DataError, VisioncalError
 from visioncal.estimation.appearance import BOARD_NAMES, Free, shape_slices
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.boards import Placed, place
 from visioncal.estimation.chain import edge_names
 from visioncal.evidence import ViewEvidence
@@ -233,12 +232,7 @@ def _arm(known: Known) -> dict[str, Any]:
     """What was found of the arm."""
     documents: dict[str, Any] = {}
     if known.arm is not None:
-        documents["arm_errors"] = {
-            "sigma_mm": 1e3 * LEVER_M * known.arm.sigma,
-            "sigma_deg": float(np.rad2deg(known.arm.sigma)),
-            "likelihood_ratio": known.arm.gain,
-            "estimated": known.arm.is_estimated,
-        }
+        documents["arm_errors"] = known.arm.document()
     arm = {
         "kinematics": kinematics_document(known),
         "elastic": elastic_document(known),

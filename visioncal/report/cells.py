@@ -209,18 +209,17 @@ def _noise_facts(found: Alignment) -> list[Fact]:
 
 
 def _arm_facts(found: Alignment) -> list[Fact]:
-    """The robots' own errors, where they were estimated [mrad, mm]."""
-    arms: Mapping[str, Mapping[str, Sequence[float]]] = found.details.get("arms", {})
-    return [
-        Fact(
-            f"robot {name}",
-            ", ".join(
-                f"{1e3 * value:.2f} {content.PLUS_MINUS} {1e3 * sigma:.2f}"
-                for value, sigma in zip(it["values"], it["sigmas"], strict=True)
-            ),
-        )
-        for name, it in arms.items()
-    ]
+    """How far each arm is calibrated, where that was asked."""
+    facts = []
+    for name, arm in found.arms.items():
+        if "kinematics" in arm.stages:
+            kinematics = arm.stages["kinematics"]
+            left_out = {it["level"]: it["held_out_mm"] for it in kinematics["levels"]}
+            level = kinematics["level"]
+            now, stated = (f"{significant(left_out[it])} mm" for it in (level, "nominal"))
+            more = "" if level == "nominal" else f", as stated {stated}"
+            facts.append(Fact(f"robot {name}", level, f"stops left out: {now}{more}"))
+    return facts
 
 
 def _lens_facts(camera: CameraResult) -> list[Fact]:

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from visioncal.estimation.armmodel import BACKLASH, ArmModel
 from visioncal.figures import figure
-from visioncal.stages.handeye import HandEyeResult
+from visioncal.types import FloatArray
 
 # A dead-band of fewer standard deviations may be chance.
 _SURE = 3.0
@@ -28,24 +29,31 @@ class Play:
     deadband_rad: float
     sigma_rad: float
 
+    def document(self) -> dict[str, Any]:
+        """It as calibration.json has it."""
+        return {
+            "joint": self.joint,
+            "deadband_rad": self.deadband_rad,
+            "sigma_rad": self.sigma_rad,
+        }
+
     @property
     def is_sure(self) -> bool:
         """Whether it is beyond chance."""
         return abs(self.deadband_rad) > _SURE * self.sigma_rad
 
 
-def plays_of(model: ArmModel, result: HandEyeResult) -> tuple[Play, ...]:
+def plays_of(model: ArmModel, spread: FloatArray) -> tuple[Play, ...]:
     """Tells the play of each joint; nothing where stops did not come from both sides.
 
     Args:
         model: The arm.
-        result: The answer; the arm's errors are the last of its unknowns.
+        spread: (p, p) covariance of its errors.
     """
     if BACKLASH not in model.weights:
         return ()
-    size, place = len(model.values), model.place_of(BACKLASH)
-    spread = result.covariance[-size:, -size:][place, place]
-    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(spread))
+    place = model.place_of(BACKLASH)
+    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(spread)[place])
     names = model.nominal.joint_names
     columns = zip(names, model.backlash.tolist(), sigmas.tolist(), strict=True)
     return tuple(Play(name, band, sigma) for name, band, sigma in columns)

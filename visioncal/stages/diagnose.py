@@ -20,7 +20,7 @@ from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray
 
 # Fewer stops than this leave no residuals to be tested.
-_FEWEST_STOPS = 6
+FEWEST_STOPS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def diagnose(
     edges, noise = result.edges, result.noise
     with one_blas_thread():
         alike, moved = Neighbours(1.0, False), None
-        if len(data) >= _FEWEST_STOPS:
+        if len(data) >= FEWEST_STOPS:
             # A closed form is not at rest, and that would pass for a misfit.
             rest = fit_closure(data, edges)
             fitted = (data.problem, rest.edges.state, rest.noise.levels, ROBOT)
@@ -106,7 +106,7 @@ def diagnose(
         _spectrum(inflation * result.covariance[:12, :12]),
         inflation,
         arm,
-        tuple(_warnings(alike, moved, arm, calibrated=calibrated)),
+        tuple(misfit_words(alike, moved, arm, calibrated=calibrated)),
     )
 
 
@@ -169,9 +169,10 @@ def _spectrum(spread: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(values, 0.0)))
 
 
-def _warnings(
+def misfit_words(
     alike: Neighbours, moved: Drift | None, arm: ArmErrors | None, *, calibrated: bool
 ) -> Iterator[str]:
+    """Words what of a robot's residuals is no noise, and what it probably is."""
     if arm is not None and arm.is_significant and not calibrated:
         size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
         told = (

@@ -13,7 +13,7 @@ from visioncal.guess.hypothesis import HALF_TURN
 from visioncal.guess.joints import JointReading
 from visioncal.guess.misread import FEWEST_JOINT_ROWS, JointGuess, guess_joints
 from visioncal.robot import Robot, placed_at, with_zeros
-from visioncal.session import Session
+from visioncal.session import View
 from visioncal.transforms import invert, mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -112,23 +112,23 @@ class _Constants:
         return f"{figure(1e3 * self.fit.shift.max())} mm and {_deg(self.fit.angle.max())} deg"
 
 
-def match_joints(session: Session, robot: Robot) -> Matched:
-    """Compares the joint angles of a session with its reported poses.
+def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
+    """Compares the joint angles of a robot with its reported poses.
 
     Poses that belong to the angles are `base_from_model @ FK(q) @ flange_from_reported` with two
     constants: another base than the model's and a tool on its flange are no mistakes.
 
     Args:
-        session: The session.
-        robot: The model that it names.
+        rows: The views that tell where it stood.
+        robot: Its model, as the session names it.
 
     Returns:
         The angles that belong to it, and what does not.
     """
-    joints = {it.number: q for it in session.views if (q := it.joints_rad) is not None}
+    joints = {it.number: q for it in rows if (q := it.joints_rad) is not None}
     poses = {
         it.number: np.asarray(pose.as_matrix())
-        for it in session.views
+        for it in rows
         if (pose := it.base_from_flange()) is not None and it.number in joints
     }
     counts = {len(it) for it in joints.values()} - {robot.joint_count}

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,19 @@ class Level:
     likelihood_ratio: float
     sizes: int
 
+    def document(self) -> dict[str, Any]:
+        """Its figures as calibration.json has them."""
+        figures = {
+            "level": self.name,
+            "unknowns": self.unknowns,
+            "rms_mm": self.inside.mm,
+            "rms_deg": self.inside.deg,
+            "held_out_mm": self.left_out.mm,
+            "held_out_deg": self.left_out.deg,
+            "likelihood_ratio": self.likelihood_ratio,
+        }
+        return {name: it for name, it in figures.items() if it is not None}
+
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
@@ -69,6 +83,10 @@ class Kinematics:
     errors: Mapping[str, ArmErrors]
     was_asked: bool
     fits: tuple[LevelFit, LevelFit]
+
+    def document(self) -> dict[str, Any]:
+        """The levels that were compared, as calibration.json has them."""
+        return {"level": self.level, "levels": [it.document() for it in self.levels]}
 
 
 def choose_level(

@@ -61,7 +61,7 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         DataError: Joints are all there is, and they are not as many as the robot's; or rows that
             are said to be of one stop lie apart.
     """
-    matched = None if robot is None else match_joints(session, robot)
+    matched = None if robot is None else match_joints(session.views, robot)
     rejections = []
     poses: dict[int, FloatArray] = {}
     for view in session.views:

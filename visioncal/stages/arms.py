@@ -1,0 +1,185 @@
+"""The robots' arms: where each stood, which of its errors show, and how they are unknowns."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+
+from visioncal.estimation.arm import ArmErrors, find_arm_errors, link_basis, pose_basis
+from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
+from visioncal.estimation.problem import Effect, Problem, State
+from visioncal.estimation.solve import Solution
+from visioncal.estimation.told import frames_apart
+from visioncal.estimation.workspace import postures
+from visioncal.robot import Loads
+from visioncal.stages.backlash import plays_of
+from visioncal.stages.joints import Matched
+from visioncal.stages.kinematics import Kinematics, choose_level
+from visioncal.transforms import adjoint, invert
+from visioncal.types import FloatArray, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class RobotArm:
+    """A robot's arm at the s stops of a cell.
+
+    Attributes:
+        robot: The robot, as the problem has it.
+        reported: (s, 4, 4) `base_from_flange` as it was reported; not a number where unknown.
+        stood: (s,) the m stops at which it was.
+        joints_rad: (m, n) its joints there; None where they are missing or belong to no model.
+        loads: What it carried there.
+        matched: Its model, beside poses and joints; None where none is known.
+        errors: Errors that follow its posture, where they are likely.
+        kinematics: Which levels were compared; None where that was not asked or cannot be.
+        model: The arm with the errors of the level that was taken; None where it stays as stated.
+        apart: Of each block of its model's errors, the (p, p) projection on those that the frames
+            of its base and of what it carries do not do as well: these frames go with the arm.
+    """
+
+    robot: str
+    reported: FloatArray
+    stood: Mask
+    joints_rad: FloatArray | None
+    loads: Loads
+    matched: Matched | None = None
+    errors: ArmErrors | None = None
+    kinematics: Kinematics | None = None
+    model: ArmModel | None = None
+    apart: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def poses(self) -> FloatArray:
+        """(s, 4, 4) where the flange stood, by the calibrated arm where there is one."""
+        if self.model is None or self.joints_rad is None:
+            return self.reported
+        poses = self.reported.copy()
+        poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
+        return poses
+
+    def effects(self) -> tuple[Effect, ...]:
+        """Its errors as unknowns, where the stops determine them."""
+        if self.errors is None or not self.errors.is_estimated:
+            return ()
+        values = None if self.model is None else self.model.values
+        return (self.errors.effect(self.robot, values=values),)
+
+    def without_errors(self, problem: Problem) -> Problem:
+        """A problem with this arm as stated."""
+        mine = {it.name for it in self.effects()}
+        rest = [it for it in problem.effects if it.name not in mine]
+        return replace(problem, poses={**problem.poses, self.robot: self.reported}).with_effects(
+            rest
+        )
+
+    def with_errors(self, problem: Problem, fit: Solution) -> Self:
+        """Looks for errors that follow its posture.
+
+        Args:
+            problem: The observations, with this arm as stated.
+            fit: Their fit.
+        """
+        known = self.matched is not None and self.joints_rad is not None
+        found = find_arm_errors(
+            problem, fit.state, fit.noise, self.robot, self._any_errors(), of_links=known
+        )
+        return replace(self, errors=found)
+
+    def documents(self, problem: Problem, spread: FloatArray) -> dict[str, Any]:
+        """What was found of it, as calibration.json has it: one section a stage.
+
+        Args:
+            problem: The problem that has its errors.
+            spread: (p, p) covariance of its unknowns.
+        """
+        found: dict[str, Any] = {}
+        if self.errors is not None:
+            found["arm_errors"] = self.errors.document()
+        if self.kinematics is not None:
+            found["kinematics"] = self.kinematics.document()
+            if self.model is not None:
+                (effect,) = self.effects()
+                mine = problem.effect_columns[effect.name]
+                plays = [it.document() for it in plays_of(self.model, spread[mine, mine])]
+                found["kinematics"] |= {"backlash": plays} if plays else {}
+                found["kinematics"]["robot"] = dict(self.model.robot.document)
+        return found
+
+    def _any_errors(self) -> FloatArray:
+        """(s, 6, p) how small errors move its flange: of its links, where these are known."""
+        if self.matched is None or self.joints_rad is None:
+            return self._by_stop(pose_basis(self.reported[self.stood]))
+        return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
+
+    def with_level(self, problem: Problem, fit: Solution, asked: str) -> Self:
+        """Chooses how far it is calibrated.
+
+        Args:
+            problem: The observations, with this arm as stated.
+            fit: Where to start.
+            asked: A key of `stages.kinematics.ASKED`.
+        """
+        if self.matched is None or self.joints_rad is None:
+            return self
+        q, loads = self.joints_rad, self.loads
+        model = ArmModel.of(self.matched.arm, q, self.reported[self.stood]).loaded(q, loads)
+        blocks = blocks_of(model.nominal, loads)
+        apart = {name: frames_apart(*_anywhere(model, name)) for name in blocks if name in RIGID}
+        arm = replace(self, apart=apart)
+        bases = {name: arm._columns(model, name) for name in blocks}
+        start = State(fit.state.edges, problem.start_values)
+        found = choose_level(problem, start, self.robot, bases, asked)
+        arm = replace(arm, kinematics=found)
+        return arm._bending(model.erring(found.errors)) if found.errors else arm
+
+    def _columns(self, model: ArmModel, name: str) -> FloatArray:
+        """(s, 6, p) how the flange moves with the errors of a block, apart from frames."""
+        if self.joints_rad is None:
+            raise RuntimeError("an arm is calibrated by its joints")
+        columns = self._by_stop(model.columns(name, self.joints_rad, self.loads))
+        return columns @ self.apart[name] if name in self.apart else columns
+
+    def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
+        """Linearises the calibrated arm anew where a fit has it.
+
+        Returns:
+            The arm, and how far its farthest error has moved [rad].
+        """
+        if self.model is None:
+            return self, 0.0
+        (effect,) = self.effects()
+        step = problem.values_of(effect.name, state) - self.model.values
+        return self._bending(self.model.moved(step)), float(np.abs(step).max())
+
+    def _bending(self, model: ArmModel) -> Self:
+        """The arm with the errors of its model as they move the flange."""
+        if self.kinematics is None:
+            return self
+        found = self.kinematics.errors.values()
+        basis = [weight * self._columns(model, name) for name, weight in model.weights.items()]
+        gain = sum(it.gain for it in found)
+        errors = ArmErrors(np.concatenate(basis, axis=2), next(iter(found)).sigma, gain, True)
+        return replace(self, model=model, errors=errors)
+
+    def _by_stop(self, columns: FloatArray) -> FloatArray:
+        """(s, 6, p) of (m, 6, p): zero where the robot did not stand."""
+        found = np.zeros((len(self.stood), *columns.shape[1:]))
+        found[self.stood] = columns
+        return found
+
+
+def _anywhere(model: ArmModel, name: str) -> tuple[FloatArray, FloatArray]:
+    """Slopes all over the workspace, by the frames at both ends and by a block's errors."""
+    q = postures(model.robot)
+    of_base = adjoint(invert(model.base_from_flange(q)))
+    of_flange = np.broadcast_to(np.eye(6), of_base.shape)
+    columns = model.columns(name, q)
+    frames = np.concatenate([of_base, of_flange], axis=2)
+    return frames.reshape(-1, 12), columns.reshape(-1, columns.shape[2])
+
+
+def effects_of(arms: Mapping[str, RobotArm]) -> Iterator[Effect]:
+    """The errors of all arms that are unknowns."""
+    for arm in arms.values():
+        yield from arm.effects()
