@@ -24,7 +24,7 @@ from visioncal.simulation import Cell, CellOptions, simulate
 from visioncal.transforms import exp, invert, log
 from visioncal.types import Camera, Mount
 
-PAIRS = 12
+PAIRS = 8
 SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])
 
 
@@ -44,7 +44,7 @@ def pair(mount: Mount, seed: int) -> tuple[Calibration, Calibration]:
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_noise_is_no_change(mount: Mount) -> None:
     compared = [compare(*pair(mount, seed)) for seed in range(PAIRS)]
-    # One in a hundred may be told apart: two of twelve come once in two hundred such runs.
+    # One in a hundred may be told apart: two of eight come once in four hundred such runs.
     assert sum(it.is_change for it in compared) <= 1
     p_values = np.array(
         [
@@ -54,9 +54,9 @@ def test_noise_is_no_change(mount: Mount) -> None:
             for test in (edge.rotation, edge.translation)
         ]
     )
-    # Where the covariance is right half of the chances lie under one half; 48 of them scatter by
-    # 0.07, and by up to twice that as the two transforms of one pair share their noise.
-    assert abs(np.mean(p_values < 0.5) - 0.5) < 0.3
+    # Where the covariance is right half of the chances lie under one half; 32 of them scatter by
+    # 0.09, and by up to twice that as the two transforms of one pair share their noise.
+    assert abs(np.mean(p_values < 0.5) - 0.5) < 0.36
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

@@ -164,7 +164,7 @@ def test_the_fit_is_the_least_squares_solution_from_far_starts_too():
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
 @pytest.mark.parametrize("coarse", [1.0, 10.0], ids=["fine robot", "coarse robot"])
 def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
-    seeds, robot_m, robot_rad = 12, coarse * 3e-5, coarse * 5e-5
+    seeds, robot_m, robot_rad = 8, coarse * 3e-5, coarse * 5e-5
     surprises, noises = [], []
     for seed in range(seeds):
         cell = simulate(
@@ -182,15 +182,15 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
         surprises.append(error @ np.linalg.solve(spread, error) / 12)
         noises.append([known.solved.noise.sigma_m, known.solved.noise.sigma_rad])
         assert known.pixel_px == pytest.approx(0.1, rel=0.1)
-    # The mean of 12 chi-square of 12 has the standard deviation 0.12: four of it. The estimated
+    # The mean of 8 chi-square of 12 has the standard deviation 0.144: four of it. The estimated
     # noise raises the expectation by some percent (F against chi-square).
-    assert np.mean(surprises) == pytest.approx(1.05, abs=0.5)
-    # A level has some 100 degrees of freedom over 12 cells at the worst: 7 %; four of it.
+    assert np.mean(surprises) == pytest.approx(1.05, abs=0.58)
+    # A level has some 67 degrees of freedom over 8 cells at the worst: 9 %; four of it.
     level_m, level_rad = np.sqrt(np.mean(np.square(noises), axis=0))
-    assert level_m == pytest.approx(robot_m, rel=0.3)
+    assert level_m == pytest.approx(robot_m, rel=0.36)
     # Beside a fixed camera's 0.5 mrad a view, a robot's 0.05 mrad hardly shows.
     if mount == "eye-in-hand" or coarse > 1.0:
-        assert level_rad == pytest.approx(robot_rad, rel=0.3)
+        assert level_rad == pytest.approx(robot_rad, rel=0.36)
 
 
 def test_a_stop_counts_once_however_often_it_is_looked_at():
