@@ -6,7 +6,7 @@ import numpy as np
 from cells import calibrated
 
 from visioncal.calibration import Calibration, Edge, Rms, Validation, Verdict, ViewResult
-from visioncal.estimation.closure import edge_names
+from visioncal.estimation.chain import edge_names
 from visioncal.pipeline.known import Known
 from visioncal.simulation import Cell
 from visioncal.transforms import exp, invert
