@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from visioncal.estimation.causes import Belief, Cause, _at, explain, undone
-from visioncal.estimation.closure import Closure, Edges, Noise
+from visioncal.estimation.chain import chain
+from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import ROBOT, State
 from visioncal.transforms import adjoint, exp, invert, log
 
 NOISE = Noise(1e-4, 1e-4)
@@ -15,17 +17,22 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 def stops_of(mount, rng, count=5):
     """Stops that close the chain exactly, with the edges that they close it with."""
-    x, z, *robot = exp(rng.normal(0.0, 0.5, (count + 2, 6)))
-    robot = np.array(robot)
-    return Closure(
-        mount, robot, invert(robot @ x) @ z, np.tile(1e-10 * np.eye(6), (count, 1, 1))
-    ), Edges(x, z, np.zeros(0))
+    x, z, *poses = exp(rng.normal(0.0, 0.5, (count + 2, 6)))
+    poses = np.array(poses)
+    robot = poses if mount == "eye-in-hand" else invert(poses)
+    covariance = np.tile(1e-10 * np.eye(6), (count, 1, 1))
+    problem = chain(mount, poses, invert(robot @ x) @ z, covariance)
+    return problem, State(np.stack([x, z]), np.zeros(0))
+
+
+def seen_as(problem, measured):
+    return replace(problem, observations=replace(problem.observations, measured=measured))
 
 
 def moved_board(data):
     still = np.zeros((len(data), 6, 6))
-    by_camera = -np.tile(np.eye(6), (len(data), 1, 1))
-    return Cause("board", by_camera, still, np.full(6, 2.0), np.zeros(6))
+    by_sensor = -np.tile(np.eye(6), (len(data), 1, 1))
+    return Cause("board", by_sensor, still, np.full(6, 2.0), np.zeros(6))
 
 
 def slipped(data, rng):
@@ -33,19 +40,19 @@ def slipped(data, rng):
     return Cause("joint", still, rng.normal(size=(len(data), 6, 1)), np.ones(1), np.zeros(1))
 
 
-def belief_of(edges, freedom=np.inf, sigma=1e-5):
-    return Belief(edges, sigma**2 * np.eye(12), NOISE, freedom)
+def belief_of(state, freedom=np.inf, sigma=1e-5):
+    return Belief(state, sigma**2 * np.eye(12), NOISE.levels, freedom)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("size", [0.0, 0.4, 1.5])
 def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
     rng = np.random.default_rng(3)
-    data, edges = stops_of(mount, rng)
+    data, state = stops_of(mount, rng)
     for cause in (moved_board(data), slipped(data, rng)):
         count = len(cause.units)
         at = size * np.ones(count) / np.sqrt(6.0)
-        belief, step = belief_of(edges), 1e-6
+        belief, step = belief_of(state), 1e-6
         found = _at(data, belief, cause, at, 1.0)
         for unknown in range(count):
             ends = []
@@ -63,32 +70,32 @@ def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_board_that_was_turned_over_is_told_exactly(mount):
     rng = np.random.default_rng(4)
-    data, edges = stops_of(mount, rng)
+    data, state = stops_of(mount, rng)
     change = np.array([0.0, 2.9, 0.3, 0.2, -0.1, 0.4])
-    turned = replace(data, camera=data.camera @ exp(change))
-    start = log(invert(edges.z) @ turned.placed(edges.x)).mean(axis=0)
+    turned = seen_as(data, data.observations.measured @ exp(change))
+    start = log(turned.change_of("target", state)).mean(axis=0)
     cause = replace(moved_board(data), start=start)
-    found = explain(turned, belief_of(edges), cause)
+    found = explain(turned, belief_of(state), cause)
     assert exp(found.values) == pytest.approx(exp(change), abs=1e-6)
     # Exact stops leave nothing but rounding.
     assert found.misfit == pytest.approx(0.0, abs=1e-3)
-    before = undone(turned, cause, found.values)
-    assert before.camera == pytest.approx(data.camera, abs=1e-6)
+    before = undone(turned, cause, found.values).observations
+    assert before.measured == pytest.approx(data.observations.measured, abs=1e-6)
     # What was noise of the turned board's pose is noise of it where it was.
     carried = adjoint(invert(exp(-change)))
-    assert before.camera_covariance[0] == pytest.approx(1e-10 * carried @ carried.T, rel=1e-4)
+    assert before.covariance[0] == pytest.approx(1e-10 * carried @ carried.T, rel=1e-4)
 
 
 def test_misfit_and_evidence_follow_their_distributions():
     rng = np.random.default_rng(5)
-    data, edges = stops_of("eye-in-hand", rng)
+    data, state = stops_of("eye-in-hand", rng)
     sigma = np.repeat([NOISE.sigma_rad, NOISE.sigma_m], 3)
     misfits, ratios = [], []
     for _ in range(60):
         noise = exp(sigma * rng.standard_normal((5, 6)))
-        noisy = replace(data, robot=data.robot @ noise)
-        nothing = explain(noisy, belief_of(edges, freedom=60.0))
-        board = explain(noisy, belief_of(edges, freedom=60.0), moved_board(data))
+        noisy = replace(data, poses={ROBOT: data.poses[ROBOT] @ noise})
+        nothing = explain(noisy, belief_of(state, freedom=60.0))
+        board = explain(noisy, belief_of(state, freedom=60.0), moved_board(data))
         misfits.append(nothing.misfit)
         ratios.append(np.exp(board.likelihood - nothing.likelihood))
     # Chi-square of thirty directions: its mean over 60 draws is known to 1.
@@ -99,7 +106,7 @@ def test_misfit_and_evidence_follow_their_distributions():
 
 
 def test_a_known_scale_and_one_of_many_degrees_of_freedom_agree():
-    data, edges = stops_of("eye-in-hand", np.random.default_rng(6))
-    off = replace(data, camera=data.camera @ exp(np.full(6, 2e-4)))
-    sure, nearly = (explain(off, belief_of(edges, freedom=it)).likelihood for it in (np.inf, 1e9))
+    data, state = stops_of("eye-in-hand", np.random.default_rng(6))
+    off = seen_as(data, data.observations.measured @ exp(np.full(6, 2e-4)))
+    sure, nearly = (explain(off, belief_of(state, freedom=it)).likelihood for it in (np.inf, 1e9))
     assert nearly == pytest.approx(sure, rel=1e-6)

@@ -208,8 +208,10 @@ def test_one_of_two_boards_that_moved_is_named():
     moved = seen_by(known, footing)
     mine = np.array([shown[views[0]] for views in moved.stops]) == 1
     carry = adjoint(invert(footing.from_first[footing.boards.index(1)])) @ pushed
-    camera = np.where(mine[:, None, None], moved.data.camera @ exp(carry), moved.data.camera)
-    found = check(replace(moved, data=replace(moved.data, camera=camera)), footing)
+    seen = moved.problem.observations
+    measured = np.where(mine[:, None, None], seen.measured @ exp(carry), seen.measured)
+    pushed = replace(moved.problem, observations=replace(seen, measured=measured))
+    found = check(replace(moved, problem=pushed), footing)
     assert names(found)[0] == f"board {tuple(footing.targets)[1]}"
     with pytest.raises(DataError, match="several boards") as refused:
         check(moved, footing, board_placed_anew=True)

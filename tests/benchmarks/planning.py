@@ -230,10 +230,10 @@ def at_noise(begun: Begun, added: FloatArray, known: Known) -> tuple[float, floa
     """The prediction at the noise that the whole session shows."""
     noise = known.solved.noise
     scale = (known.pixel_px / begun.cell.pixel_px) ** 2
-    data = begun.recorded.data
-    data = replace(data, camera_covariance=scale * data.camera_covariance)
+    problem = begun.recorded.problem
+    seen = replace(problem.observations, covariance=scale * problem.observations.covariance)
     cell = replace(begun.cell, noise=Noise(*noise.sigmas), pixel_px=known.pixel_px)
-    recorded = replace(begun.recorded, data=data, noise=noise)
+    recorded = replace(begun.recorded, problem=replace(problem, observations=seen), noise=noise)
     world = worlds_of([cell], PURPOSES["hand-eye"], added, recorded=recorded)[0]
     return sigmas(world.covariance(range(len(added))))
 

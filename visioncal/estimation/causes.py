@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from visioncal.estimation.closure import Closure, Edges, Noise, residual_blocks
-from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.problem import Effect, Linear, Noise, Problem, State
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.types import FloatArray
@@ -34,13 +33,13 @@ class Belief:
     """What is known of a chain before it is looked at again.
 
     Attributes:
-        edges: The unknowns: both edges, and k values that all stops share.
-        covariance: (12 + k, 12 + k) of their steps.
-        noise: Of one stop.
+        state: The unknowns.
+        covariance: (p, p) of their steps.
+        noise: Its levels.
         freedom: Degrees of freedom that its scale was estimated with; infinite where it is known.
     """
 
-    edges: Edges
+    state: State
     covariance: FloatArray
     noise: Noise
     freedom: float
@@ -52,15 +51,15 @@ class Cause:
 
     Attributes:
         name: Which.
-        by_camera: (m, 6, p) how each stop's `cam_from_target` has to be moved to undo it.
-        by_flange: (m, 6, p) how each stop's `base_from_flange` has to be.
+        by_sensor: (n, 6, p) how each measured pose has to be moved to undo it, on its right.
+        by_flange: (s, 6, p) how the flange has to be at each stop, on its right.
         units: (p,) the size of each unknown, for a change of one metre.
         start: (p,) where to look for it.
         noise_factors: What the noise of the stops may have grown by, where that is the change.
     """
 
     name: str
-    by_camera: FloatArray
+    by_sensor: FloatArray
     by_flange: FloatArray
     units: FloatArray
     start: FloatArray
@@ -95,24 +94,24 @@ class Explained:
     freedom: int
 
 
-def explain(data: Closure, belief: Belief, cause: Cause | None = None) -> Explained:
-    """Says how well a cause explains some stops.
+def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Explained:
+    """Says how well a cause explains what was observed at some stops.
 
     Args:
-        data: The stops, with all that they share of `belief`.
+        problem: The stops of one robot, with all unknowns of `belief`.
         belief: What the calibration says.
         cause: The change; None where nothing has.
     """
-    cause = cause or _nothing(len(data))
+    cause = cause or _nothing(problem)
     units, (widest_m, factor) = cause.units, cause.trials[-1]
-    stops = _rested(data, belief, cause, widest_m * units, factor)
+    stops = _rested(problem, belief, cause, widest_m * units, factor)
     scores = []
     for size_m, grown in cause.trials:
         if grown != factor:
-            stops = _at(data, belief, cause, stops.values, grown)
+            stops = _at(problem, belief, cause, stops.values, grown)
         scores.append(_score(stops, size_m * units, belief.freedom))
     grown = cause.trials[int(np.argmax(scores))][1]
-    stops = _at(data, belief, cause, stops.values, grown)
+    stops = _at(problem, belief, cause, stops.values, grown)
     # The change's size is left to the stops: what is known of it beforehand would shrink it.
     mean, spread = _posterior(stops, widest_m * units)
     pulled = float(np.sum((mean / (widest_m * units)) ** 2))
@@ -141,70 +140,86 @@ class _Stops:
     spread: FloatArray
 
 
-def _nothing(stops: int) -> Cause:
+def _nothing(problem: Problem) -> Cause:
     """No change at all."""
-    still, none = np.zeros((stops, 6, 0)), np.zeros(0)
-    return Cause("nothing", still, still, none, none, (1.0,))
+    (poses,) = problem.poses.values()
+    still, resting, none = np.zeros((len(problem), 6, 0)), np.zeros((len(poses), 6, 0)), np.zeros(0)
+    return Cause("nothing", still, resting, none, none, (1.0,))
 
 
 def _rested(
-    data: Closure, belief: Belief, cause: Cause, sigmas: FloatArray, factor: float
+    problem: Problem, belief: Belief, cause: Cause, sigmas: FloatArray, factor: float
 ) -> _Stops:
     """Linearises at a cause's most likely values, which linearising finds."""
-    stops = _at(data, belief, cause, cause.start, factor)
+    stops = _at(problem, belief, cause, cause.start, factor)
     for _ in range(_ROUNDS if len(sigmas) else 0):
         after = _posterior(stops, sigmas)[0]
         moved = np.abs(after - stops.values).max()
-        stops = _at(data, belief, cause, after, factor)
+        stops = _at(problem, belief, cause, after, factor)
         if moved < _AT_REST:
             break
     return stops
 
 
-def _at(data: Closure, belief: Belief, cause: Cause, values: FloatArray, factor: float) -> _Stops:
+def _at(
+    problem: Problem, belief: Belief, cause: Cause, values: FloatArray, factor: float
+) -> _Stops:
     """Linearises at some values (p,) of a cause."""
-    without, known = undone(data, cause, values), len(belief.covariance)
-    shared = np.concatenate([belief.edges.shared, np.zeros(len(values))])
-    noise = Noise(factor * belief.noise.sigma_rad, factor * belief.noise.sigma_m)
-    residuals, jacobian, spreads = residual_blocks(
-        without, replace(belief.edges, shared=shared), noise
-    )
-    slopes = jacobian.reshape(-1, known + len(values))
+    without, known = undone(problem, cause, values), len(belief.covariance)
+    linear = without.linear(with_change(belief.state, cause))
+    noise = replace(belief.noise, robots=factor * belief.noise.robots)
+    slopes = linear.jacobian.reshape(-1, without.size)
     before, own = slopes[:, :known], slopes[:, known:]
-    spread = block_diag(*spreads) + before @ belief.covariance @ before.T
+    spread = _spread(without, linear, noise) + before @ belief.covariance @ before.T
     spread += _LEAST_SIGMA**2 * np.eye(len(spread))
-    return _Stops(values, residuals.reshape(-1) - own @ values, own, spread)
+    return _Stops(values, linear.residuals.reshape(-1) - own @ values, own, spread)
 
 
-def undone(data: Closure, cause: Cause, values: FloatArray) -> Closure:
+def _spread(problem: Problem, linear: Linear, noise: Noise) -> FloatArray:
+    """(6 n, 6 n) covariance of all residuals: those of one unit share the flange's error."""
+    found, (of, _) = block_diag(*problem.covariance(noise)), problem.units
+    for unit, errors in enumerate(problem.error_covariance(noise)):
+        rows = np.flatnonzero(of == unit)
+        places = (6 * rows[:, None] + np.arange(6)).ravel()
+        slopes = linear.by_errors[rows].reshape(-1, errors.shape[0])
+        found[np.ix_(places, places)] += slopes @ errors @ slopes.T
+    return np.asarray(found)
+
+
+def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
     """The stops as they would be without a change of some size, and how they go on moving with it.
 
     A change may be large: a board that was put elsewhere has turned by any angle.
 
     Args:
-        data: The stops.
+        problem: The stops of one robot.
         cause: What has changed.
         values: (p,) its unknowns, by how much.
 
     Returns:
-        The stops, with the p unknowns behind those that they share.
+        The stops, with the p unknowns as their last effect.
     """
-    by_camera, by_flange = (
-        _stepped(slopes, values) for slopes in (cause.by_camera, cause.by_flange)
+    by_sensor, by_flange = (
+        _stepped(slopes, values) for slopes in (cause.by_sensor, cause.by_flange)
     )
-    carried = adjoint(invert(by_camera.moved))
-    known = data.camera_covariance
+    carried, seen = adjoint(invert(by_sensor.moved)), problem.observations
     nothing = Knowledge(np.zeros((len(values), len(values))), np.zeros(len(values)))
-    changed = Effect.free("change", nothing, by_camera.slopes, {ROBOT: by_flange.slopes})
-    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
-    flange = flange @ by_flange.moved
+    ((robot, poses),) = problem.poses.items()
+    changed = Effect.free("change", nothing, by_sensor.slopes, {robot: by_flange.slopes})
     return replace(
-        data,
-        robot=flange if data.mount == "eye-in-hand" else invert(flange),
-        camera=data.camera @ by_camera.moved,
-        camera_covariance=None if known is None else carried @ known @ np.swapaxes(carried, 1, 2),
-        effects=tuple(it.carried(carried) for it in data.effects),
-    ).with_more(changed)
+        problem,
+        poses={robot: poses @ by_flange.moved},
+        observations=replace(
+            seen,
+            measured=seen.measured @ by_sensor.moved,
+            covariance=carried @ seen.covariance @ np.swapaxes(carried, 1, 2),
+        ),
+    ).with_effects([*(it.carried(carried) for it in problem.effects), changed])
+
+
+def with_change(state: State, cause: Cause) -> State:
+    """The unknowns with those of a cause behind them, from which a change has been undone."""
+    return State(state.edges, np.concatenate([state.values, np.zeros(len(cause.units))]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """What may have happened to a cell since it was calibrated: the causes that a check compares."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -54,14 +55,14 @@ def kind_of(cause: str) -> str:
 
 def _camera(seen: Seen) -> Cause:
     """The camera's edge: a twist on its right, seen from the target's side."""
-    moved = adjoint(invert(seen.data.camera))
-    return _cause(CAMERA, seen, _KNOCK, by_camera=moved)
+    moved = adjoint(invert(seen.problem.observations.measured))
+    return _cause(CAMERA, seen, _KNOCK, by_sensor=moved)
 
 
 def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each board's edge: a twist on its right."""
     boards, names = footing.boards, tuple(footing.targets) or ("",)
-    away = log(invert(footing.edges.z) @ placed_by(seen, footing))
+    away = log(asked_of_board(seen, footing))
     shown = _shown(seen)
     for at, board in enumerate(boards):
         mine = shown == at
@@ -69,21 +70,21 @@ def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
             continue
         carried = adjoint(invert(footing.from_first[at]))
         # The chain ends at the first board: what turns this one is carried there.
-        by_camera = -np.where(mine[:, None, None], carried, 0.0)
+        by_sensor = -np.where(mine[:, None, None], carried, 0.0)
         start = adjoint(footing.from_first[at]) @ away[mine].mean(axis=0)
-        yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_camera, start=start)
+        yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
 
 
 def _tell_both(seen: Seen, footing: Footing) -> bool:
     """Whether camera and board at once are worth a thought: they fit any two stops."""
-    return len(footing.boards) == 1 and len(seen.data) >= FEWEST_VIEWS
+    return len(footing.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
 
 
 def _both(camera: Cause, board: Cause) -> Cause:
     """Camera and board at once: nothing is left of the old hand-eye calibration but the arm."""
     return Cause(
         BOTH,
-        np.concatenate([camera.by_camera, board.by_camera], axis=2),
+        np.concatenate([camera.by_sensor, board.by_sensor], axis=2),
         np.concatenate([camera.by_flange, board.by_flange], axis=2),
         np.concatenate([camera.units, board.units]),
         np.concatenate([camera.start, np.zeros(len(board.units))]),
@@ -127,39 +128,39 @@ def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
 
 
 def _noise(seen: Seen) -> Cause:
-    nothing = np.zeros((len(seen.data), 6, 0))
-    return Cause(NOISE, nothing, nothing, np.zeros(0), np.zeros(0), _FACTORS)
+    return replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
 
 
 def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
-    if len(seen.data) < 2:
+    if len(seen.stops) < 2:
         return
-    away = log(invert(footing.edges.z) @ placed_by(seen, footing))
+    away = log(asked_of_board(seen, footing))
     for at, views in enumerate(seen.stops):
-        by_camera = np.zeros((len(seen.data), 6, 6))
-        by_camera[at] = -np.eye(6)
-        yield _cause(f"{VIEW} {views[0]}", seen, _KNOCK, by_camera, start=away[at])
+        by_sensor = np.zeros((len(seen.problem), 6, 6))
+        by_sensor[at] = -np.eye(6)
+        yield _cause(f"{VIEW} {views[0]}", seen, _KNOCK, by_sensor, start=away[at])
 
 
 def _cause(
     name: str,
     seen: Seen,
     units: FloatArray,
-    by_camera: FloatArray | None = None,
+    by_sensor: FloatArray | None = None,
     by_flange: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> Cause:
-    nothing = np.zeros((len(seen.data), 6, len(units)))
+    still = np.zeros((len(seen.problem), 6, len(units)))
+    resting = np.zeros((len(seen.stops), 6, len(units)))
     return Cause(
         name,
-        nothing if by_camera is None else by_camera,
-        nothing if by_flange is None else by_flange,
+        still if by_sensor is None else by_sensor,
+        resting if by_flange is None else by_flange,
         units,
         np.zeros(len(units)) if start is None else start,
     )
 
 
-def placed_by(seen: Seen, footing: Footing) -> FloatArray:
-    """(m, 4, 4) where each stop places the board, by the calibration's camera and arm."""
-    return seen.data.under(footing.edges.shared).placed(footing.edges.x)
+def asked_of_board(seen: Seen, footing: Footing) -> FloatArray:
+    """(m, 4, 4) by how much the board has moved, on its right, as each stop places it."""
+    return seen.problem.change_of(seen.problem.observations.observed[0], footing.state)

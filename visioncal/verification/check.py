@@ -9,13 +9,13 @@ from scipy.special import fdtrc
 from visioncal.calibration import Calibration, picked
 from visioncal.chance import f_limit
 from visioncal.errors import DataError
-from visioncal.estimation.causes import Belief, Cause, Explained, explain, undone
+from visioncal.estimation.causes import Belief, Cause, Explained, explain, undone, with_change
 from visioncal.session import Session
 from visioncal.session.choosing import Choice
 from visioncal.threads import one_blas_thread
-from visioncal.transforms import invert, log, mean_transform
+from visioncal.transforms import log, mean_transform
 from visioncal.types import FloatArray, Progress
-from visioncal.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of, placed_by
+from visioncal.verification.causes import BOTH, CAMERA, NOISE, asked_of_board, causes_of, kind_of
 from visioncal.verification.footing import Footing
 from visioncal.verification.seeing import Seen, see_again
 
@@ -135,17 +135,18 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
                 next_step="Leave --board-moved out: each board is compared by itself, and the one "
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
-        footing = footing.placed_anew(mean_transform(placed_by(seen, footing)), _ANYWHERE)
+        moved = mean_transform(asked_of_board(seen, footing))
+        footing = footing.placed_anew(footing.state.edges[1] @ moved, _ANYWHERE)
     belief = Belief(
-        footing.edges,
+        footing.state,
         footing.covariance,
-        footing.noise(from_corners=seen.from_corners),
+        footing.noise(from_corners=seen.from_corners).levels,
         footing.freedom,
     )
     causes = causes_of(seen, footing, board_placed_anew=board_placed_anew)
     with one_blas_thread():
-        nothing = explain(seen.data, belief)
-        found = [explain(seen.data, belief, it) for it in causes]
+        nothing = explain(seen.problem, belief)
+        found = [explain(seen.problem, belief, it) for it in causes]
     scores = np.array([it.likelihood for it in found]) + np.log(_shares(causes))
     evidence = float(np.logaddexp.reduce(scores))
     order = np.argsort(-scores, kind="stable")
@@ -154,7 +155,7 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     log_evidence = evidence - nothing.likelihood
     named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
     camera = next(it for it in suspects if it.name == CAMERA)
-    away = log(invert(footing.edges.z) @ placed_by(seen, footing))
+    away = log(asked_of_board(seen, footing))
     left = _left(seen, footing, causes[order[0]], suspects[0].explained) if named else away
     return Check(
         footing.calibration,
@@ -175,10 +176,9 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
 
 def _left(seen: Seen, footing: Footing, cause: Cause, explained: Explained) -> FloatArray:
     """(m, 6) where each stop places its board with a change undone, from where it was."""
-    edges, values = footing.edges, explained.values
-    before = undone(seen.data, cause, values)
-    shared = np.concatenate([edges.shared, np.zeros(len(values))])
-    return log(invert(edges.z) @ before.under(shared).placed(edges.x))
+    before = undone(seen.problem, cause, explained.values)
+    board = before.observations.observed[0]
+    return log(before.change_of(board, with_change(footing.state, cause)))
 
 
 def _shares(causes: Sequence[Cause]) -> FloatArray:

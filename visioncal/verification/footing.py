@@ -18,7 +18,8 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.closure import Edges, Noise
+from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import State
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document
@@ -39,7 +40,7 @@ class Footing:
         calibration: Whose.
         targets: What was printed, by the session's names for it; that of an only one is empty.
         boards: Places among the targets: the one that the chain ends at, then the others.
-        edges: x, z, and the values of what all stops share: lens, board, other boards and arm.
+        state: x, z, and the values of what all stops share: lens, board, other boards and arm.
         from_first: (b, 4, 4) where the boards lie from the first.
         covariance: (12 + k, 12 + k).
         looks: (l,) which values of lens and board are among them.
@@ -51,7 +52,7 @@ class Footing:
     calibration: Calibration
     targets: Mapping[str, Target]
     boards: tuple[int, ...]
-    edges: Edges
+    state: State
     from_first: FloatArray
     covariance: FloatArray
     looks: tuple[int, ...]
@@ -139,7 +140,8 @@ class Footing:
         spread = self.covariance.copy()
         spread[6:12], spread[:, 6:12] = 0.0, 0.0
         spread[6:12, 6:12] = np.diag(sigmas**2)
-        return replace(self, edges=replace(self.edges, z=z), covariance=spread)
+        moved = State(np.stack([self.state.edges[0], z]), self.state.values)
+        return replace(self, state=moved, covariance=spread)
 
 
 def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
@@ -160,7 +162,7 @@ def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
         calibration,
         targets,
         tuple(list(targets).index(it) for it in names) if targets else (0,),
-        Edges(calibration.edges[x_name].matrix, places[0], values),
+        State(np.stack([calibration.edges[x_name].matrix, places[0]]), values),
         invert(np.array(places)) @ places[0],
         spread,
         looks,

@@ -9,8 +9,9 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.closure import Closure
+from visioncal.estimation.closure import Edges
 from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.problem import Problem
 from visioncal.frames.sighting import check_mount, check_resolution
 from visioncal.pipeline import STAGES
 from visioncal.pipeline.known import Known
@@ -38,13 +39,13 @@ class Seen:
 
     Attributes:
         known: What is known of the session, with the calibration's lens, boards and arm.
-        data: The m stops, with all that the calibration's unknowns are.
+        problem: The m stops, with all that the calibration's unknowns are.
         stops: The views of each stop.
         warnings: What is odd, in sentences.
     """
 
     known: Known
-    data: Closure
+    problem: Problem
     stops: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...]
 
@@ -58,7 +59,7 @@ class Seen:
     @property
     def from_corners(self) -> bool:
         """Whether the target's poses come from corners, whose noise is known."""
-        return self.data.camera_covariance is not None
+        return not self.problem.is_combined
 
 
 def see_again(session: Session, footing: Footing, progress: Progress | None = None) -> Seen:
@@ -115,8 +116,8 @@ def seen_by(known: Known, footing: Footing) -> Seen:
     stops = tuple(
         tuple(np.array(known.used)[numbered == at].tolist()) for at in range(numbered.max() + 1)
     )
-    data = known.closure(known.used).merged(numbered)
-    return Seen(known, data, stops, tuple(_warnings(known, footing)))
+    problem = known.closure(known.used).merged(numbered).problem
+    return Seen(known, problem, stops, tuple(_warnings(known, footing)))
 
 
 def _with_arm(known: Known, footing: Footing) -> Known:
@@ -138,7 +139,8 @@ def _with_arm(known: Known, footing: Footing) -> Known:
 def _posed(known: Known, footing: Footing) -> Known:
     """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
     mount, targets = known.session.mount, tuple(footing.targets.values())
-    placed = footing.edges.z @ invert(footing.from_first)
+    x, z = footing.state.edges
+    placed = z @ invert(footing.from_first)
     order = {board: at for at, board in enumerate(footing.boards)}
     views, chosen = [], []
     for view in (it.number for it in known.session.views):
@@ -146,7 +148,7 @@ def _posed(known: Known, footing: Footing) -> Known:
         if poses is None or view not in known.base_from_flange or poses.board not in order:
             continue
         robot = robot_part(known.flange_poses([view]), mount)[0]
-        at = replace(footing.edges, z=placed[order[poses.board]])
+        at = Edges(x, placed[order[poses.board]], footing.state.values)
         views.append(view)
         chosen.append(choose_by(poses, robot, at, targets[poses.board] if targets else None))
     if not views:

@@ -141,11 +141,12 @@ def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
 
 
 def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> Motion:
-    edges, hand = check.footing.edges, check.calibration.mount == "eye-in-hand"
+    x, z = check.footing.state.edges
+    hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
-        rotation, point, parent = edges.x[:3, :3], np.zeros(3), "tool" if hand else "base"
+        rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if hand else "base"
     else:
-        rotation, point = edges.z[:3, :3], _middle(check, name)
+        rotation, point = z[:3, :3], _middle(check, name)
         parent = "base" if hand else "tool"
     moved = exp(twist)
     shift = moved[:3, :3] @ point + moved[:3, 3] - point
