@@ -9,10 +9,13 @@ from commands import turned_poses, visioncal, write_poses
 from whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
 from visioncal.calibration import Calibration, RobotResult
+from visioncal.cli.console import unused_words
 from visioncal.compare import compare
 from visioncal.compensation import correct
 from visioncal.frames.locate import locate
 from visioncal.frames.plane import Plane
+from visioncal.frames.seen_frame import seen_frame
+from visioncal.session import Session
 from visioncal.simulation import Moved, simulate_network
 
 # Chi-square of six and of three exceed these in one case of a thousand.
@@ -139,6 +142,27 @@ def test_a_target_is_placed_on_any_flange_and_in_any_base(
     found = content[f"{ends[0]}_from_thing"]
     matrix, covariance = np.array(found["matrix"]), np.array(found["covariance"])
     assert misfit(matrix, covariance, truth(cell, *ends)) < MOST
+
+
+def test_a_row_without_the_robots_pose_is_left_out_where_a_tool_is_placed(place):
+    session = Session.load(place / "later").of("left", "b", "plate_b")
+    whole, (first, *others) = Calibration.load(place / "out"), session.views
+    open_row = replace(first, numbers={})
+    shown = replace(session, views=(open_row, *others))
+    frame = seen_frame(shown, whole, "tool", camera="left", robot="b")
+    (left,) = [it for it in frame.observations if not it.used]
+    assert "no pose of the robot" in left.reason
+
+
+def test_many_rows_that_are_left_out_for_one_reason_share_a_line(place):
+    sight = Calibration.load(place / "out").cell.sights[0]
+    lost = [replace(sight, view=it, used=False, reason="not needed") for it in range(30)]
+    of = f"({sight.seer} of {sight.seen})"
+    assert list(unused_words([*lost, sight])) == [
+        f"30 views (0, 1, 2 and 27 more) {of}: not needed"
+    ]
+    alone = replace(lost[5], reason="blurred")
+    assert f"view 5 {of}: blurred" in unused_words([*lost[:5], alone])
 
 
 def test_a_fixture_of_one_robot_is_known_in_the_base_of_the_other(cell, place, tmp_path):

@@ -32,6 +32,7 @@ from visioncal.simulation import (
 from visioncal.stages.clock import set_clock, sweep_of
 from visioncal.stages.pnp import given_poses
 from visioncal.transforms import exp, invert, log
+from visioncal.verification import verify
 
 AHEAD_S = 0.0372
 # 7 s at 30 Hz; a PnP's noise of some tenths of a millimetre.
@@ -89,6 +90,16 @@ def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     error, covariance = x_error(it.cell, result)
     # Six degrees of freedom: one in ten thousand is beyond.
     assert error @ np.linalg.solve(covariance, error) < 27.9
+
+
+def test_another_sweep_verifies_the_camera(session):
+    known = calibrate(session)
+    again = swept(recording=1)
+    held = verify(sweep_session(again, "again"), known)
+    assert held.passed
+    assert len(held.seen.stops) > 20
+    knocked = sweep_session(swept(recording=1, camera_moved_m=2e-3), "knocked")
+    assert verify(knocked, known).named[0].name == "camera"
 
 
 def test_stamps_that_jitter_are_told_worse(moved):

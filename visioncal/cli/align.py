@@ -9,7 +9,13 @@ from rich.markup import escape
 
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
-from visioncal.cli.console import messages, print_verdict, shown_progress, tell_written
+from visioncal.cli.console import (
+    messages,
+    print_verdict,
+    shown_progress,
+    tell_written,
+    unused_words,
+)
 from visioncal.figures import figure
 from visioncal.joining import leftover
 from visioncal.outputs import write_alignment
@@ -82,7 +88,6 @@ def _tell(result: Alignment) -> None:
         if level > _SHOWN_LEVEL or not words:
             words.append(f"{figure(level)} times what is said of it")
         console.print(f"noise of {name}: {', '.join(words)}")
-    for it in result.sights:
-        if not it.used:
-            console.print(escape(f"  view {it.view} ({it.seer} of {it.seen}): {it.reason}"))
+    for unused in unused_words(result.sights):
+        console.print(escape(f"  {unused}"))
     console.print(escape(result.weakest))

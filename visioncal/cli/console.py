@@ -2,7 +2,7 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import typer
@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from visioncal.calibration import Calibration, Verdict
+from visioncal.calibration import Calibration, Sight, Verdict, ViewResult
 from visioncal.errors import VisioncalError
 from visioncal.files import some_of
 from visioncal.outputs import Written
@@ -103,7 +103,7 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         + ("" if held.deg is None else f", {held.deg:.2g} deg")
         + (f", {held.px:.2g} px" if held.px else "")
     )
-    for words in _unused(calibration):
+    for words in unused_words(calibration.views):
         console.print(f"  {escape(words)}")
     if verbose:
         console.print(_solver_table(calibration))
@@ -134,17 +134,18 @@ def tell_written(written: Written, *, quiet: bool = False, status: int = 0) -> N
         raise typer.Exit(status or _EXIT_BUG)
 
 
-def _unused(calibration: Calibration) -> Iterator[str]:
+def unused_words(views: Iterable[ViewResult | Sight]) -> Iterator[str]:
     """The views that are not used, each with its reason; many of one reason in one line."""
-    views = defaultdict(list)
-    for view in calibration.views:
-        if not view.used:
-            views[view.reason].append(view.view)
-    for reason, of_it in views.items():
-        if len(of_it) > _SAME_REASON:
-            yield f"{len(of_it)} views ({some_of([*map(str, of_it)], 3)}): {reason}"
+    found: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for it in views:
+        of = f" ({it.seer} of {it.seen})" if isinstance(it, Sight) else ""
+        if not it.used:
+            found[of, it.reason].append(it.view)
+    for (of, reason), mine in found.items():
+        if len(mine) > _SAME_REASON:
+            yield f"{len(mine)} views ({some_of([*map(str, mine)], 3)}){of}: {reason}"
         else:
-            yield from (f"view {view}: {reason}" for view in of_it)
+            yield from (f"view {view}{of}: {reason}" for view in mine)
 
 
 def _solver_table(calibration: Calibration) -> Table:

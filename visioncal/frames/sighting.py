@@ -72,8 +72,6 @@ def sighting(
     target = _checked(session, calibration)
     asked = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, parent, asked)
-    given = {it.number for it in asked if it.has_corners}
-    lost = {view: why for view, why in lost.items() if why != _NO_IMAGE or view not in given}
     views = _usable(session, asked, target, lost)
     seen = detect(session, progress=progress, among=views)
     lost |= {it.view: it.reason for it in seen.rejections}
@@ -107,6 +105,7 @@ def pictured(
     asked = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, "base", asked)
     sights = []
+    lost |= {it.number: _NO_IMAGE for it in asked if not it.image}
     for view in _usable(session, asked, target, lost):
         image = image_of(session, view)
         if isinstance(image, Rejection):
@@ -216,7 +215,7 @@ def _poses(
     session: Session, calibration: Calibration, parent: Parent, asked: tuple[View, ...]
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
     """The robot's poses by view, and why views without one or without an image are of no use."""
-    lost = {it.number: _NO_IMAGE for it in asked if not it.image}
+    lost = {it.number: _NO_IMAGE for it in asked if not (it.image or it.has_corners)}
     if needs_robot(Eye.of(calibration), parent):
         reported = _flange(session, calibration, asked)
         lost = {it.view: it.reason for it in reported.rejections} | lost

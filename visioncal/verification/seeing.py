@@ -110,7 +110,9 @@ def seen_by(known: Known, footing: Footing) -> Seen:
         check_resolution(known.session, calibration, known.resolution)
         camera = CameraResult(calibration.camera.camera, estimated=False)
         known = replace(known, camera=camera)
-    known = _with_arm(_STAGES["pnp"](known), footing)
+    # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
+    known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clock=None)
+    known = _with_arm(known, footing)
     known = _posed(known, footing)
     numbered = known.stops
     stops = tuple(
