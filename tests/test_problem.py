@@ -18,7 +18,7 @@ from visioncal.estimation.solve import (
     solve_problem,
 )
 from visioncal.estimation.variance import Knowledge
-from visioncal.stages.choose import Candidates
+from visioncal.stages.pairwise import Candidates
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import tie
 
@@ -39,8 +39,11 @@ def sighted(problem, **turned):
         seen.observers,
         seen.observed,
         seen.stops,
-        Candidates(seen.measured[:, None], np.ones((count, 1), dtype=bool)),
-        np.zeros((count, 1), dtype=np.int64),
+        Candidates(
+            seen.measured[:, None],
+            np.zeros((count, 1), dtype=np.int64),
+            np.ones((count, 1), dtype=bool),
+        ),
         turned,
         ~seen.has_rotation,
     )

@@ -18,7 +18,8 @@ from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.stages.arms import RobotArm, effects_of
-from visioncal.stages.choose import chosen, padded
+from visioncal.stages.choose import chosen
+from visioncal.stages.pairwise import Candidates
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
@@ -268,16 +269,11 @@ def _targets(cell: Cell) -> dict[str, Target]:
 
 
 def _sighted(cell: Cell, views: Sequence[ViewPoses], targets: Mapping[str, Target]) -> Sighted:
-    candidates = padded(views)
-    turns = np.zeros(candidates.valid.shape, dtype=np.int64)
-    for row, view in zip(turns, views, strict=True):
-        row[: len(view.turns)] = view.turns
     return Sighted(
         tuple(it.seer for it in cell.rows),
         tuple(it.seen for it in cell.rows),
         np.array([it.station for it in cell.rows]),
-        candidates,
-        turns,
+        Candidates.of(views),
         {
             frame: turned
             for frame, it in targets.items()

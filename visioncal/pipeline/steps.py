@@ -228,7 +228,6 @@ def _choose(known: Known) -> Known:
     layout = lay_out(
         [known.poses[view] for view in views],
         robot_part(known.flange_poses(views), known.session.mount),
-        known.session.mount,
         known.session.boards,
     )
     choice = layout.choice
@@ -272,8 +271,8 @@ def _held_back_poses(known: Known) -> Iterator[ViewPoses]:
         poses = known.poses[view]
         robot = robot_part(known.flange_poses([view]), mount)[0]
         z = agreed.edges.z @ known.shown([view]).first_from_own[0]
-        at = replace(agreed.edges, z=z)
-        yield choose_by(poses, robot, at, targets[poses.board] if targets else None)
+        predicted = invert(robot @ agreed.edges.x) @ z
+        yield choose_by(poses, predicted, targets[poses.board] if targets else None)
 
 
 def _refine(known: Known) -> Known:

@@ -1,27 +1,19 @@
 """Chooses among the poses that each view allows, by the robot's motion."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.closure import Edges
-from visioncal.solvers import SOLVERS
+from visioncal.stages.pairwise import Candidates, parted, trimmed
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import rotations
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray, IntArray, Mask, Rejection, Target
+from visioncal.types import FloatArray, IntArray, Rejection, Target
 
 # A rival that closes the chain within this many times the chosen one's distance is as likely.
 CLEAR_RATIO = 3.0
-# Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
-# probability (1 - 1/8)^40 = 0.5 %.
-_TRIPLES = 40
-# Of the starts, so many are followed up with all views.
-_REFINED, _ROUNDS = 5, 10
+_ROUNDS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +22,6 @@ class Choice:
 
     views: tuple[ViewPoses, ...]
     rejections: tuple[Rejection, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """Padded (m, k, 4, 4) candidates of m views, and their (m, k) validity."""
-
-    poses: FloatArray
-    valid: Mask
 
 
 def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target | None) -> Choice:
@@ -60,10 +44,9 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
     """
     if all(len(view.cam_from_target) == 1 for view in views) or len(views) < 3:
         return Choice(tuple(chosen(view, 0, target) for view in views), ())
-    candidates = padded(views)
-    turns = len(set(views[0].turns))
-    picks = _as_the_first(_assign(robot, candidates, views), turns)
-    distance = _distances(robot, candidates, picks)
+    candidates, turns = Candidates.of(views), len(set(views[0].turns))
+    picks = _as_the_first(_settled(robot, candidates), turns)
+    distance = parted(robot, candidates, np.arange(len(views)), picks).away
     best = distance[np.arange(len(views)), picks]
     others = distance.copy()
     others[np.arange(len(views)), picks] = np.inf
@@ -93,41 +76,25 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
     )
 
 
-def choose_by(view: ViewPoses, robot: FloatArray, edges: Edges, target: Target | None) -> ViewPoses:
-    """Chooses the pose of one view by edges that are known already.
+def choose_by(view: ViewPoses, predicted: FloatArray, target: Target | None) -> ViewPoses:
+    """Chooses the pose of one view that is nearest to a predicted one.
 
     Args:
         view: The view with its candidates.
-        robot: (4, 4) the robot's part of its chain.
-        edges: Both edges.
+        predicted: (4, 4) `cam_from_target`.
         target: What was seen, for its symmetries.
     """
-    pick = distances_to(robot[None], padded([view]), edges.x, edges.z)[0].argmin()
-    return chosen(view, int(pick), target)
+    return chosen(view, int(Candidates.of([view]).distances(predicted[None]).argmin()), target)
 
 
-def padded(views: Sequence[ViewPoses]) -> Candidates:
-    """Puts the candidates of m views into one array."""
-    most = max(len(view.cam_from_target) for view in views)
-    valid = np.array([np.arange(most) < len(view.cam_from_target) for view in views])
-    poses = np.array(
-        [
-            view.cam_from_target[np.minimum(np.arange(most), len(view.cam_from_target) - 1)]
-            for view in views
-        ]
-    )
-    return Candidates(poses, valid)
-
-
-def _assign(robot: FloatArray, candidates: Candidates, views: Sequence[ViewPoses]) -> IntArray:
-    """Finds the assignment under which the views agree best, from the best of many starts."""
-    picked = [
-        distances_to(robot, candidates, *_solve(robot[rows], candidates.poses[rows, picks]))
-        for rows, picks in _starts(candidates, views)
-    ]
-    picked.sort(key=_score)
-    settled = [_settle(robot, candidates, it.argmin(axis=1)) for it in picked[:_REFINED]]
-    return min(settled, key=lambda picks: _score(_distances(robot, candidates, picks)))
+def _settled(robot: FloatArray, candidates: Candidates) -> IntArray:
+    """Solves from the better half of the views, then from all, until no view picks anew."""
+    picks, rows = trimmed(robot, candidates)[1].picks, np.arange(len(robot))
+    for _ in range(_ROUNDS):
+        before, picks = picks, parted(robot, candidates, rows, picks).picks
+        if np.array_equal(before, picks):
+            break
+    return picks
 
 
 def _as_the_first(picks: IntArray, turns: int) -> IntArray:
@@ -137,58 +104,6 @@ def _as_the_first(picks: IntArray, turns: int) -> IntArray:
     """
     planar, turn = np.divmod(picks, turns)
     return np.asarray(planar * turns + (turn - turn[0]) % turns)
-
-
-def _score(distance: FloatArray) -> float:
-    return float(np.median(distance.min(axis=1)))
-
-
-def _settle(robot: FloatArray, candidates: Candidates, picks: IntArray) -> IntArray:
-    """Solves from all views and picks anew, until nothing changes."""
-    for _ in range(_ROUNDS):
-        before, picks = picks, _distances(robot, candidates, picks).argmin(axis=1)
-        if np.array_equal(before, picks):
-            break
-    return picks
-
-
-def _starts(
-    candidates: Candidates, views: Sequence[ViewPoses]
-) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yields rows and picks to solve from: all views' best by image, then triples of views."""
-    yield np.arange(len(views)), np.zeros(len(views), dtype=np.int64)
-    rng = np.random.default_rng(0)
-    # Views with few candidates first: they need the fewest combinations.
-    counts = candidates.valid.sum(axis=1)
-    likely = 1.0 / counts**2
-    for _ in range(_TRIPLES):
-        triple = rng.choice(len(views), 3, replace=False, p=likely / likely.sum())
-        options = [list(range(counts[at])) for at in triple]
-        # A turn of the target in all views alike is a change of its frame, and no other solution.
-        options[0] = [at for at in options[0] if views[triple[0]].turns[at] == 0]
-        for picks in product(*options):
-            yield triple, np.array(picks)
-
-
-def _solve(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
-    solution = SOLVERS["park"](robot, camera)
-    return solution.x, solution.z
-
-
-def _distances(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
-    """Distances under the solution of an assignment, (m, k)."""
-    x, z = _solve(robot, candidates.poses[np.arange(len(robot)), picks])
-    return distances_to(robot, candidates, x, z)
-
-
-def distances_to(
-    robot: FloatArray, candidates: Candidates, x: FloatArray, z: FloatArray
-) -> FloatArray:
-    """Distance (m, k) [m] between where each candidate places the target, and z."""
-    placed = robot[:, None] @ x @ candidates.poses
-    away = np.linalg.norm(placed[..., :3, 3] - z[:3, 3], axis=-1)
-    away = away + LEVER_M * rotation_angle(invert(z) @ placed)
-    return np.asarray(np.where(candidates.valid, away, np.inf))
 
 
 def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:

@@ -7,13 +7,13 @@ a board is tried every way round, and all views together tell which it was.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
 
-from visioncal.stages.choose import CLEAR_RATIO, Candidates
-from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
+from visioncal.stages.choose import CLEAR_RATIO
+from visioncal.stages.pairwise import FEWEST, consensus, hand_eye
 from visioncal.stages.placing import placed_by_points
 from visioncal.stages.sighted import Growth, Pair
 from visioncal.stages.twoarms import between_arms
@@ -115,13 +115,13 @@ def _implied(
         (it,) = missing
         at = factors.index(it)
         before, after = (_product(part, placed) for part in (factors[:at], factors[at + 1 :]))
-        candidates, turns = some(growth.sighted.candidates, rows), growth.sighted.turns[rows]
-        poses = invert(before)[:, None] @ candidates.poses @ invert(after)[:, None]
-        there = Candidates(invert(poses) if it.is_inverse else poses, candidates.valid)
+        there = growth.sighted.candidates.take(rows).carried(invert(before), invert(after))
+        if it.is_inverse:
+            there = replace(there, poses=invert(there.poses))
         # A board's own frame may be either way round: that of its first view is taken.
         ways = range(1 if it.frame == pair.seen else len(growth.sighted.turns_of(pair.seen)))
-        found = [consensus(there, turns, way) for way in ways]
-        yield it.frame, np.array([matrix for matrix, _ in found]), found[0][1]
+        found = [consensus(there, way) for way in ways]
+        yield it.frame, np.array([matrix for matrix, *_ in found]), found[0][2]
 
 
 def _parted(
@@ -146,16 +146,14 @@ def _parted(
             _product(factors[begin + 1 : end], placed)
             for begin, end in pairwise([-1, *open_ones, len(factors)])
         ]
-        candidates, turns = some(growth.sighted.candidates, rows), growth.sighted.turns[rows]
-        poses = invert(parts[0])[:, None] @ candidates.poses @ invert(parts[-1])[:, None]
-        there = Candidates(poses, candidates.valid)
+        there = growth.sighted.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
         if len(open_ones) == 2:
-            found = hand_eye(invert(parts[1]), there, turns, "eye-in-hand")
+            found = hand_eye(invert(parts[1]), there, "eye-in-hand")
             if found is not None:
                 (u_inverse, v), (sigma_u, sigma_v) = found
                 yield _as_placed(factors[open_ones[0]], invert(u_inverse), sigma_u)
                 yield _as_placed(factors[open_ones[1]], v, sigma_v)
-        elif (middle := between_arms(parts[1], parts[2], there, turns)) is not None:
+        elif (middle := between_arms(parts[1], parts[2], there)) is not None:
             yield _as_placed(factors[open_ones[1]], *middle)
 
 
@@ -203,7 +201,6 @@ def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
         rows = growth.sighted.early(pair.rows)
         factors = _factors(growth, pair, rows)
         if all(it.frame in placed for it in factors if it.frame):
-            predicted = _product(factors, placed)
-            distances = distances_from(predicted, some(growth.sighted.candidates, rows))
+            distances = growth.sighted.candidates.take(rows).distances(_product(factors, placed))
             away.append(np.minimum(distances.min(axis=1), _FAR_M))
     return float(np.concatenate(away).mean()) if away else 0.0

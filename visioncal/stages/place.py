@@ -11,23 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.closure import Closure, Edges, distances
 from visioncal.estimation.observability import FEWEST_VIEWS
-from visioncal.estimation.outliers import inliers
-from visioncal.stages.choose import (
-    CLEAR_RATIO,
-    Candidates,
-    Choice,
-    choose_by,
-    choose_poses,
-    distances_to,
-    padded,
-)
+from visioncal.stages.choose import CLEAR_RATIO, Choice, choose_by, choose_poses
+from visioncal.stages.pairwise import Candidates, consensus, trimmed
 from visioncal.stages.pnp import ViewPoses
-from visioncal.threads import one_blas_thread
-from visioncal.transforms import invert, mean_transform
-from visioncal.types import FloatArray, Mask, Mount, Rejection, Target
+from visioncal.transforms import invert
+from visioncal.types import FloatArray, Mask, Rejection, Target
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +38,6 @@ class Layout:
 def lay_out(
     views: Sequence[ViewPoses],
     robot: FloatArray,
-    mount: Mount,
     targets: Mapping[str, Target],
 ) -> Layout:
     """Chooses each view's pose, and finds where the boards are.
@@ -57,7 +45,6 @@ def lay_out(
     Args:
         views: The views with their candidates.
         robot: (m, 4, 4) the robot's part of the chain, one a view.
-        mount: Where the camera is.
         targets: The session's targets by name.
 
     Raises:
@@ -76,19 +63,21 @@ def lay_out(
     if len(parts[first]) < FEWEST_VIEWS:
         raise _too_few(parts, tuple(targets))
     choice = choose_poses(parts[first], robot[shown == first], stated[first])
-    edges, typical = _edges(choice, parts[first], robot[shown == first], mount)
+    views_of = [it.view for it in parts[first]]
+    rows = [views_of.index(it.view) for it in choice.views]
+    _, found = trimmed(robot[shown == first][rows], Candidates.of(choice.views))
+    typical = float(np.median(found.away.min(axis=1)))
     chosen, rejections, from_first = [*choice.views], [*choice.rejections], [np.eye(4)]
     for board in boards[1:]:
         part, mine = parts[board], robot[shown == board]
-        z, clear = _place_of(part, mine, edges.x, typical)
-        at = Edges(edges.x, z, edges.shared)
-        for view, stop, it in zip(part, mine, clear, strict=True):
+        z, clear = _place_of(part, mine, found.x, typical)
+        for view, predicted, it in zip(part, invert(mine @ found.x) @ z, clear, strict=True):
             if it:
-                chosen.append(choose_by(view, stop, at, stated[board]))
+                chosen.append(choose_by(view, predicted, stated[board]))
             else:
                 why = "ambiguous: two poses of the target fit image and motion alike"
                 rejections.append(Rejection(view.view, why))
-        from_first.append(invert(z) @ edges.z)
+        from_first.append(invert(z) @ found.z)
     order = {view.view: at for at, view in enumerate(views)}
     chosen.sort(key=lambda it: order[it.view])
     kept = [at for at, it in enumerate(boards) if any(view.board == it for view in chosen)]
@@ -109,47 +98,19 @@ def _too_few(parts: Mapping[int, Sequence[ViewPoses]], names: Sequence[str]) -> 
     )
 
 
-def _edges(
-    choice: Choice, views: Sequence[ViewPoses], robot: FloatArray, mount: Mount
-) -> tuple[Edges, float]:
-    """Both edges by the views of one board, and how far off they typically place it [m]."""
-    rows = [[it.view for it in views].index(it.view) for it in choice.views]
-    camera = np.array([it.cam_from_target[0] for it in choice.views])
-    data = Closure(mount, robot[rows], camera)
-    with one_blas_thread():
-        state = inliers(data.problem).fit.state
-    edges = Edges(state.edges[0], state.edges[1], state.values)
-    away_m, away_rad = distances(data.placed(edges.x), edges.z)
-    return edges, float(np.median(away_m + LEVER_M * away_rad))
-
-
 def _place_of(
     views: Sequence[ViewPoses], robot: FloatArray, x: FloatArray, typical: float
 ) -> tuple[FloatArray, Mask]:
     """Where a board is, (4, 4), and for which of its views the pose is clear."""
-    candidates = padded(views)
-    # A turn of the board in all views alike is a change of its frame, and no other place.
-    own = np.array([[turn == 0 for turn in _filled(view, candidates)] for view in views])
-    places = (robot[:, None] @ x @ candidates.poses)[own & candidates.valid]
-    away = np.array([distances_to(robot, candidates, x, z) for z in places])
-    nearest, half = away.min(axis=2), (len(views) + 1) // 2
-    trimmed = np.sort(nearest, axis=1)[:, :half].mean(axis=1)
-    best = int(trimmed.argmin())
-    kept, picks = np.argsort(nearest[best])[:half], away[best].argmin(axis=1)
-    z = mean_transform(robot[kept] @ x @ candidates.poses[kept, picks[kept]])
+    candidates = Candidates.of(views).carried(robot @ x, np.eye(4)[None])
+    z, away, _ = consensus(candidates)
     if len(views) == 1:
         # It has nothing that speaks for one of its poses.
-        return z, np.array([len(places) == 1])
-    ordered = np.sort(distances_to(robot, candidates, x, z), axis=1)
-    limit = CLEAR_RATIO * max(float(trimmed[best]), typical)
+        return z, np.array([np.sum(candidates.valid & (candidates.turns == 0)) == 1])
+    ordered = np.sort(candidates.distances(z[None]), axis=1)
+    limit = CLEAR_RATIO * max(away, typical)
     # A view far from all others with any of its poses is wrong, which is for others to say.
     rival = np.zeros(len(views), dtype=bool)
     if ordered.shape[1] > 1:
         rival = ordered[:, 1] < np.maximum(limit, CLEAR_RATIO * ordered[:, 0])
     return z, ~rival | (ordered[:, 0] > CLEAR_RATIO * limit)
-
-
-def _filled(view: ViewPoses, candidates: Candidates) -> tuple[int, ...]:
-    """The turns of a view's candidates, padded as they are."""
-    more = int(candidates.valid.shape[1]) - len(view.turns)
-    return view.turns + view.turns[-1:] * more

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimation.tree import Step, Tree
-from visioncal.stages.choose import Candidates
+from visioncal.stages.pairwise import Candidates
 from visioncal.types import FloatArray, IntArray, Mask
 
 # The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
@@ -21,8 +21,7 @@ class Sighted:
         seers: (n,) the frame that saw.
         seen: (n,) the frame that was seen.
         stops: (n,) the stop, numbered from 0 in the order of time.
-        candidates: Padded (n, c, 4, 4) poses `seer_from_seen`, and their validity.
-        turns: (n, c) which turn of the target's own each candidate has applied.
+        candidates: The poses `seer_from_seen` that each allows.
         turned: By the frame of a target that looks the same turned: (t, 4, 4) its turns.
         places: (n,) whether a place alone was read; its rotation then says nothing.
     """
@@ -31,7 +30,6 @@ class Sighted:
     seen: tuple[str, ...]
     stops: IntArray
     candidates: Candidates
-    turns: IntArray
     turned: Mapping[str, FloatArray]
     places: Mask
 

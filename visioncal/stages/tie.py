@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Step, Tree
 from visioncal.stages.grow import grow
-from visioncal.stages.pairwise import FEWEST, consensus, distances_from, hand_eye, some
+from visioncal.stages.pairwise import FEWEST, consensus, hand_eye
 from visioncal.stages.placing import mounted_points
 from visioncal.stages.sighted import Growth, Pair, Relation, Sighted
 from visioncal.transforms import invert
@@ -76,7 +76,7 @@ def pick(predicted: FloatArray, sighted: Sighted) -> IntArray:
         predicted: (n, 4, 4) `seer_from_seen`.
         sighted: What may have been seen.
     """
-    return np.asarray(distances_from(predicted, sighted.candidates).argmin(axis=1))
+    return np.asarray(sighted.candidates.distances(predicted).argmin(axis=1))
 
 
 def _pairs(tree: Tree, sighted: Sighted) -> tuple[Pair, ...]:
@@ -98,7 +98,7 @@ def _solved(
     """What one pair says by itself."""
     rows, turns = sighted.early(pair.rows), sighted.turns_of(pair.seen)
     if not pair.robots:
-        matrix, sigma_m = consensus(some(sighted.candidates, rows), sighted.turns[rows])
+        matrix, _, sigma_m = consensus(sighted.candidates.take(rows))
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, turns)
         return
     if len(pair.robots) > 1:
@@ -125,4 +125,4 @@ def _parted(
     robot = poses[step.robot][sighted.stops[rows]]
     mount: Mount = "eye-in-hand" if step.is_up else "eye-to-hand"
     robot = robot if step.is_up else invert(robot)
-    return hand_eye(robot, some(sighted.candidates, rows), sighted.turns[rows], mount)
+    return hand_eye(robot, sighted.candidates.take(rows), mount)

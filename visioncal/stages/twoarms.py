@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.estimation.arm import LEVER_M
 from visioncal.solvers import SOLVERS
-from visioncal.stages.choose import Candidates
+from visioncal.stages.pairwise import Candidates
 from visioncal.transforms import compose, invert, rotation_angle
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import FloatArray
 
 _FEWEST = 5
 # Rounds of a start, how many starts are followed, and for how long.
@@ -23,7 +23,7 @@ _NEAR_M = 0.02
 
 
 def between_arms(
-    first: FloatArray, second: FloatArray, candidates: Candidates, turns: IntArray
+    first: FloatArray, second: FloatArray, candidates: Candidates
 ) -> tuple[FloatArray, float] | None:
     """Finds the transform in the middle.
 
@@ -31,12 +31,11 @@ def between_arms(
         first: (m, 4, 4) the arm's poses before it.
         second: (m, 4, 4) the other arm's, behind it.
         candidates: What each view allows of what was seen.
-        turns: (m, c) which turn of the target each candidate has applied.
 
     Returns:
         (4, 4) v, and how far views are from it [m]; None where they are far.
     """
-    if len(first) < _FEWEST or turns.max(initial=0) > 0:
+    if len(first) < _FEWEST or candidates.turns.max(initial=0) > 0:
         return None
     seen = candidates.poses[:, 0]
     starts = Rotation.create_group("O").as_matrix()

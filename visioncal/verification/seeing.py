@@ -9,7 +9,6 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.closure import Edges
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.problem import Problem
 from visioncal.frames.sighting import check_mount, check_resolution
@@ -150,9 +149,9 @@ def _posed(known: Known, footing: Footing) -> Known:
         if poses is None or view not in known.base_from_flange or poses.board not in order:
             continue
         robot = robot_part(known.flange_poses([view]), mount)[0]
-        at = Edges(x, placed[order[poses.board]], footing.state.values)
+        predicted = invert(robot @ x) @ placed[order[poses.board]]
         views.append(view)
-        chosen.append(choose_by(poses, robot, at, targets[poses.board] if targets else None))
+        chosen.append(choose_by(poses, predicted, targets[poses.board] if targets else None))
     if not views:
         raise DataError(
             f"session {known.session.name!r}: no view shows the target from a known pose of the "
