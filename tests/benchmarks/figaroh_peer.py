@@ -23,7 +23,7 @@ import visioncal
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.closure import ROBOT, Closure, Edges, Noise, solve_closure
-from visioncal.estimation.kinematics import LEVELS, fit_level
+from visioncal.estimation.kinematics import LEVELS, ArmTrials, fit_level
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
@@ -145,7 +145,9 @@ def fitted(world: World, noise: Noise | None) -> tuple[Edges, ArmModel]:
     errors = {"links": ArmErrors(basis, SIZE_RAD, 0.0, of_links=True)}
     if noise is None:
         problem = _chain(world, cell.base_from_flange).problem
-        level = fit_level(problem, edges.state, ROBOT, {"links": basis}, LEVELS["geometry"])
+        level = fit_level(
+            ArmTrials(problem, edges.state, ROBOT, {"links": basis}), LEVELS["geometry"]
+        )
         if level is None:
             raise RuntimeError("the arm's errors do not show")
         errors, noise = dict(level.errors), Noise(*level.fit.noise.robots[0].tolist())

@@ -7,17 +7,20 @@ white noise. What of them looks the same in all views hides in the edges: its sh
 covariance is the price of an uncalibrated arm.
 """
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.problem import Effect, Noise, Problem, State
-from visioncal.estimation.solve import normal_equations, robot_levels
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.solve import (
+    RobotLikelihood,
+    normal_equations,
+    robot_levels,
+    robot_likelihood,
+)
+from visioncal.estimation.variance import LEAST_SIGMA, Components, Knowledge
 from visioncal.robot import Robot
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray, IntArray, Mask
@@ -29,8 +32,8 @@ TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 # Twice the gain in log-likelihood that noise gives in one session of ten thousand, and in one of
 # twenty: chi-square of one degree of freedom.
 SIGNIFICANT, _LIKELY = 15.1, 3.84
-# Typical errors of links that are tried first [rad], and how finely the best is sought.
-_TRIED, _FINEST = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3), 1.05
+# The size that is sought begins here, and is none below the other [rad].
+_START, _NOTHING = 1e-3, 1e-6
 # Fewer stops have hardly more residuals than the edges and the noise take.
 _FEWEST_STOPS = 6
 # Positions and directions change over about so much when an arm's posture does [m].
@@ -145,22 +148,54 @@ def find_arm_errors(
     """
     if len(stops_of(problem, robot)) < _FEWEST_STOPS:
         return None
-    white = robot_levels(problem, state, noise, from_above=True)[1]
-    still = State(state.edges, np.concatenate([state.values, np.zeros(basis.shape[2])]))
+    levels, white = robot_levels(problem, state, noise, from_above=True)
+    size = basis.shape[2]
+    freely = Knowledge(np.zeros((size, size)), np.zeros(size))
+    effect = replace(ArmErrors(basis, 1.0, 0.0, of_links).effect(robot), known=freely)
+    widened = problem.with_effects([*problem.effects, effect])
+    still = State(state.edges, np.concatenate([state.values, np.zeros(size)]))
+    likelihood = robot_likelihood(widened, still, noise)
+    sigma, value = _most_likely_size(likelihood, size, levels)
+    gain = 2.0 * (white - value)
+    return ArmErrors(basis, sigma, gain, of_links) if gain > _LIKELY else None
 
-    def gain(sigma: float) -> float:
-        effect = ArmErrors(basis, sigma, 0.0, of_links).effect(robot)
-        widened = problem.with_effects([*problem.effects, effect])
-        # The effects' own density, which the likelihood of given knowledge leaves out.
-        value = robot_levels(widened, still, noise, from_above=True)[1]
-        return float(2.0 * (white - value - basis.shape[2] * math.log(sigma)))
 
-    found = {sigma: gain(sigma) for sigma in _TRIED}
-    best = max(found, key=lambda it: found[it])
-    if found[best] < _LIKELY:
-        return None
-    best, highest = _climb(gain, best, found[best])
-    return ArmErrors(basis, best, highest, of_links)
+def _most_likely_size(
+    likelihood: RobotLikelihood, size: int, levels: FloatArray
+) -> tuple[float, float]:
+    """The most likely size of the last unknowns as random effects, beside the robots' levels.
+
+    They are observed to be zero, in units of their own, as one more component of the variance.
+
+    Returns:
+        The size, and the negative logarithm of its restricted likelihood.
+    """
+    reduced, components = likelihood.reduced, likelihood.components
+    width, columns = reduced.errors.shape[1], reduced.slopes.shape[2]
+    units, places = np.divmod(np.arange(size), width)
+    count = int(units[-1]) + 1
+    slopes, part = np.zeros((count, width, columns)), np.zeros((count, width, width))
+    slopes[units, places, columns - size + np.arange(size)] = 1.0
+    part[units, places, places] = 1.0
+    parts = np.zeros((len(components.parts) + 1, len(reduced.errors) + count, width, width))
+    parts[:-1, :-count], parts[-1, -count:] = components.parts, part
+    # Places that are left over in the last unit are of no unknown.
+    rest = np.eye(width) - part
+    grown = replace(
+        likelihood,
+        reduced=replace(
+            reduced,
+            errors=np.pad(reduced.errors, ((0, count), (0, 0))),
+            slopes=np.concatenate([reduced.slopes, slopes]),
+        ),
+        components=Components(np.concatenate([components.known, rest]), parts),
+    )
+    sigmas, value = grown.most_likely(
+        np.append(levels, _START),
+        np.append(np.repeat(likelihood.seen, 2), True),
+        np.append(np.full(levels.size, LEAST_SIGMA), _NOTHING),
+    )
+    return float(sigmas[-1]), value
 
 
 def rows_of(problem: Problem, robot: str) -> Mask:
@@ -174,19 +209,6 @@ def rows_of(problem: Problem, robot: str) -> Mask:
 def stops_of(problem: Problem, robot: str) -> IntArray:
     """The stops at which a robot was observed, in their order."""
     return np.unique(problem.observations.stops[rows_of(problem, robot)])
-
-
-def _climb(gain: Callable[[float], float], at: float, value: float) -> tuple[float, float]:
-    """Follows a gain with one maximum by factors that shrink, from near it."""
-    factor = math.sqrt(_TRIED[1] / _TRIED[0])
-    while factor > _FINEST:
-        for candidate in (at * factor, at / factor):
-            there = gain(candidate)
-            if there > value:
-                at, value = candidate, there
-                break
-        factor = math.sqrt(factor)
-    return at, value
 
 
 def misfit_covariance(

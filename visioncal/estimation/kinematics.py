@@ -7,7 +7,7 @@ bound (Harville 1977, section 4, for the linear mixed model).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -75,32 +75,51 @@ class LevelFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Arm:
-    """The observations without errors of the arm, and whose arm it is."""
+class ArmTrials:
+    """Fits with errors of one robot's arm, each made once: levels begin with the same blocks.
+
+    Attributes:
+        problem: The observations, without errors of this arm.
+        state: Where to start.
+        robot: The robot.
+        bases: (s, 6, p) by stop, columns of each block of errors by its name.
+    """
 
     problem: Problem
+    state: State
     robot: str
+    bases: Mapping[str, FloatArray]
+    _fits: dict[tuple[ArmErrors, ...], Solution] = field(default_factory=dict)
+    _found: dict[tuple[object, ...], ArmErrors | None] = field(default_factory=dict)
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
         """The observations with errors of the arm among the unknowns."""
         effects = [it.effect(self.robot, name) for name, it in errors.items()]
         return self.problem.with_effects([*self.problem.effects, *effects])
 
-    def fitted(self, errors: Mapping[str, ArmErrors], near: State) -> tuple[Problem, Solution]:
-        """That with its fit."""
-        problem = self.erring(errors)
-        return problem, fit_problem(problem, State(near.edges, problem.start_values))
+    def fitted(self, errors: Mapping[str, ArmErrors]) -> Solution:
+        """The fit of that."""
+        key = tuple(errors.values())
+        if key not in self._fits:
+            problem, fewer = self.erring(errors), self._fits.get(key[:-1])
+            near = self.state if fewer is None else fewer.state
+            self._fits[key] = fit_problem(problem, State(near.edges, problem.start_values))
+        return self._fits[key]
 
-    def found(
-        self, among: Mapping[str, ArmErrors], fit: Solution, basis: FloatArray
-    ) -> ArmErrors | None:
-        """Looks for errors of one more block."""
-        problem = self.erring(among)
-        return find_arm_errors(problem, fit.state, fit.noise, self.robot, basis, of_links=True)
+    def found(self, among: Mapping[str, ArmErrors], basis: FloatArray) -> ArmErrors | None:
+        """Looks for errors of one more block by its columns, which stay as long as this."""
+        key = (id(basis), *among.values())
+        if key not in self._found:
+            problem, fit = self.erring(among), self.fitted(among)
+            self._found[key] = find_arm_errors(
+                problem, fit.state, fit.noise, self.robot, basis, of_links=True
+            )
+        return self._found[key]
 
-    def level(self, errors: Mapping[str, ArmErrors], fit: Solution, gain: float) -> LevelFit:
+    def level(self, errors: Mapping[str, ArmErrors], gain: float) -> LevelFit:
         """Puts a level's fit together."""
-        problem, mine = self.erring(errors), rows_of(self.problem, self.robot)
+        problem, fit = self.erring(errors), self.fitted(errors)
+        mine = rows_of(problem, self.robot)
         rotation = [
             has and name not in problem.points
             for has, name in zip(
@@ -117,66 +136,52 @@ class _Arm:
         )
 
 
-def fit_level(
-    problem: Problem,
-    state: State,
-    robot: str,
-    bases: Mapping[str, FloatArray],
-    blocks: Blocks = _RIGID,
-) -> LevelFit | None:
+def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
     """Fits all unknowns with some blocks of the errors of one robot's arm free.
 
     Args:
-        problem: The observations, without errors of this arm.
-        state: Where to start.
-        robot: The robot.
-        bases: (s, 6, p) by stop, columns of each block by its name.
+        arm: The observations, and what of the arm they may show.
         blocks: Those to free; behind the first, those that explain no more than chance stay out.
 
     Returns:
         The fit; None where nothing beyond chance makes it this level.
     """
-    if blocks.own and not bases.keys() & set(blocks.own):
+    if blocks.own and not arm.bases.keys() & set(blocks.own):
         return None
-    arm, gain = _Arm(problem, robot), 0.0
     errors: dict[str, ArmErrors] = {}
-    _, fit = arm.fitted(errors, state)
-    for name in (it for it in blocks.names if it in bases):
-        found = arm.found(errors, fit, bases[name])
+    gain = 0.0
+    for name in (it for it in blocks.names if it in arm.bases):
+        found = arm.found(errors, arm.bases[name])
         if found is None or not found.is_significant:
             if not errors:
                 return None
             continue
         gain += found.gain
-        errors = _without_springs(arm, fit.state, errors | {name: found})
-        _, fit = arm.fitted(errors, fit.state)
+        errors = _without_springs(arm, errors | {name: found})
     if blocks.own and not errors.keys() & set(blocks.own):
         return None
-    return arm.level(errors, fit, gain)
+    return arm.level(errors, gain)
 
 
-def resized(problem: Problem, robot: str, fit: LevelFit) -> LevelFit:
+def resized(arm: ArmTrials, fit: LevelFit) -> LevelFit:
     """Estimates the size of each block's errors anew, beside those of all others.
 
     They were looked for one after the other: what explains the most takes too much at first.
 
     Args:
-        problem: The observations of `fit_level`.
-        robot: The robot.
+        arm: The observations of `fit_level`.
         fit: Its answer.
     """
     if len(fit.errors) < 2:
         return fit
-    arm, errors, state = _Arm(problem, robot), dict(fit.errors), fit.fit.state
+    errors = dict(fit.errors)
     for name, it in fit.errors.items():
         others = {other: errors[other] for other in errors if other != name}
-        errors[name] = arm.found(others, arm.fitted(others, state)[1], it.basis) or it
-    return arm.level(errors, arm.fitted(errors, state)[1], fit.gain)
+        errors[name] = arm.found(others, it.basis) or it
+    return arm.level(errors, fit.gain)
 
 
-def _without_springs(
-    arm: _Arm, state: State, errors: Mapping[str, ArmErrors]
-) -> dict[str, ArmErrors]:
+def _without_springs(arm: ArmTrials, errors: Mapping[str, ArmErrors]) -> dict[str, ArmErrors]:
     """Holds joints rigid that would yield against their load: the bound of a compliance is zero.
 
     An active set that only grows (Lawson and Hanson 1974, chapter 23, has the way back too, which
@@ -184,9 +189,9 @@ def _without_springs(
     """
     kept = dict(errors)
     while COMPLIANCE in kept:
-        problem, fit = arm.fitted(kept, state)
         springs = kept[COMPLIANCE]
-        bends = problem.values_of(springs.effect(arm.robot, COMPLIANCE).name, fit.state)
+        name = springs.effect(arm.robot, COMPLIANCE).name
+        bends = arm.erring(kept).values_of(name, arm.fitted(kept).state)
         if not (bends < 0.0).any():
             break
         kept[COMPLIANCE] = replace(springs, basis=springs.basis * (bends >= 0.0))

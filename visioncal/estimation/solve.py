@@ -15,7 +15,13 @@ from visioncal.estimation.linalg import (
     squared_lengths,
 )
 from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
-from visioncal.estimation.variance import Components, Knowledge, RatioPrior, estimate_sigmas
+from visioncal.estimation.variance import (
+    LEAST_SIGMA,
+    Components,
+    Knowledge,
+    RatioPrior,
+    estimate_sigmas,
+)
 from visioncal.types import FloatArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-10
@@ -321,12 +327,15 @@ class RobotLikelihood:
         squares = self.reduced.errors.reshape(-1, 2, 3) ** 2
         return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
 
-    def most_likely(self, start: FloatArray, free: Mask) -> tuple[FloatArray, float]:
+    def most_likely(
+        self, start: FloatArray, free: Mask, least: FloatArray | float = LEAST_SIGMA
+    ) -> tuple[FloatArray, float]:
         """The most likely levels, and the negative logarithm of their likelihood.
 
         Args:
-            start: (r, 2) the levels to start from.
-            free: (2 r,) which of them are sought, robot by robot.
+            start: (r, 2) the levels to start from; or (2 r + k,) with those of k more components.
+            free: (2 r + k,) which of them are sought, robot by robot.
+            least: Below which they are not sought.
         """
         seen = np.flatnonzero(self.seen).tolist()
         sigmas, value = estimate_sigmas(
@@ -337,6 +346,7 @@ class RobotLikelihood:
             start.ravel(),
             replace(RATIO_PRIOR, places=tuple((2 * it, 2 * it + 1) for it in seen)),
             free,
+            least,
         )
         return sigmas.reshape(start.shape), value
 

@@ -74,6 +74,7 @@ def estimate_sigmas(
     start: FloatArray,
     prior: RatioPrior | None = None,
     free: Mask | None = None,
+    least: FloatArray | float = LEAST_SIGMA,
 ) -> tuple[FloatArray, float]:
     """Estimates the standard deviations of variance components.
 
@@ -92,11 +93,12 @@ def estimate_sigmas(
         prior: Of the ratio of pairs of sigmas: it decides where the residuals cannot, because one
             kind of them can be fitted away altogether. None where nothing is known of it.
         free: (k,) which sigmas to estimate; the others stay at their start. All where None.
+        least: Below which they are not sought: one for all, or (k,).
 
     Returns:
         (k,) standard deviations, and the negative log-likelihood there.
     """
-    limits = np.log([LEAST_SIGMA, MOST_SIGMA])
+    limits = np.log(least), np.log(MOST_SIGMA)
     logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), *limits)
     now, damping = _likelihood(residuals, jacobian, components, known, logs, prior), 1e-3
     for _ in range(_ITERATIONS):

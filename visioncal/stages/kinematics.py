@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.calibration import Rms
 from visioncal.errors import DataError
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.kinematics import LEVELS, LevelFit, fit_level, resized
+from visioncal.estimation.kinematics import LEVELS, ArmTrials, LevelFit, fit_level, resized
 from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.figures import figure
@@ -112,17 +112,18 @@ def choose_level(
             it where it is; None where none is lost. Then offsets are what is taken at the least.
     """
     with one_blas_thread():
-        fits = {NOMINAL: fit_level(problem, state, robot, bases)}
-        fits |= {it: fit_level(problem, state, robot, bases, to) for it, to in LEVELS.items()}
+        arm = ArmTrials(problem, state, robot, bases)
+        fits = {NOMINAL: fit_level(arm)}
+        fits |= {name: fit_level(arm, blocks) for name, blocks in LEVELS.items()}
         if stated is not None:
-            nominal = fit_level(stated, state, robot, bases)
+            nominal = fit_level(ArmTrials(stated, state, robot, bases))
             fits = _with_lost_zero(fits, problem, stated, nominal, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
     levels = tuple(_level(name, fit) for name, fit in found.items())
     least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
     best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
     with one_blas_thread():
-        chosen = resized(problem, robot, found[best.name])
+        chosen = resized(arm, found[best.name])
     levels = tuple(
         _level(it, chosen) if it == best.name else was
         for it, was in zip(found, levels, strict=True)
