@@ -8,8 +8,7 @@ import numpy as np
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
-from visioncal.estimation.joint import Problem as CameraCorners
-from visioncal.estimation.joint import Scene, chance_limit
+from visioncal.estimation.joint import CornerProblem, Scene, chance_limit
 from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import (
@@ -59,7 +58,7 @@ def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPo
         corners: dict[int, Corners] = {
             view.view: view.corners for view in mine if view.corners is not None
         }
-        problems[name] = CameraCorners.of(scene, corners)
+        problems[name] = CornerProblem.of(scene, corners)
         poses[name] = np.array([view.cam_from_target[0] for view in mine])
     return Looks.of(problems, poses)
 

@@ -23,11 +23,17 @@ from visioncal.estimation.appearance import (
     shape_slices,
 )
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.boards import Boards
-from visioncal.estimation.closure import Closure, ClosureFit, Edges, fit_closure, normal_equations
+from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import ROBOT, FramePrior
+from visioncal.estimation.linalg import covariance, covariance_among
+from visioncal.estimation.problem import ROBOT, FramePrior, Problem, State
+from visioncal.estimation.solve import (
+    Solution,
+    fit_problem,
+    fitted_covariance,
+    normal_equations,
+    score_gain,
+)
 from visioncal.targets import first_corners, numbered_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
 
@@ -77,26 +83,26 @@ class Arm:
     """The robot's side of the chain.
 
     Attributes:
-        robot: (m, 4, 4) the robot's part of the chain, one a view.
-        stops: (m,) the stop of each view, numbered from 0 in the order of first appearance.
-        basis: (m, 6, p) how its errors move each view's flange.
+        poses: (s, 4, 4) `base_from_flange` at each stop.
+        stops: (m,) the stop of each view, numbered from 0.
+        targets: (m,) the frame of the target that each view shows.
+        basis: (s, 6, p) how its errors move the flange at each stop.
         of_links: Whether these are errors of its own links.
-        boards: What the views show, where there are several boards.
         errors: Their size, where they are free.
-        priors: What is known of the edges besides.
+        priors: What was measured of frames by hand.
     """
 
-    robot: FloatArray
+    poses: FloatArray
     stops: IntArray
+    targets: tuple[str, ...]
     basis: FloatArray
     of_links: bool
-    boards: Boards
     errors: ArmErrors | None = None
     priors: tuple[FramePrior, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class CornerProblem:
     """The corners of m views with what is known of the scene beforehand.
 
     Attributes:
@@ -116,7 +122,7 @@ class Problem:
     contested: bool = False
 
     @classmethod
-    def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "Problem":
+    def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "CornerProblem":
         """Puts the problem together from the corners by view."""
         positions = numbered_positions(scene.targets)
         priors = [board_prior(it) for it in scene.targets]
@@ -128,7 +134,7 @@ class Problem:
             np.concatenate([_lens_prior(scene), *priors]),
         )
 
-    def without_prior(self, columns: IntArray) -> "Problem":
+    def without_prior(self, columns: IntArray) -> "CornerProblem":
         """The same problem, some values of which nobody has stated."""
         sigma = self.prior_sigma.copy()
         sigma[columns] = np.inf
@@ -240,11 +246,11 @@ def _lens_prior(scene: Scene) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a fit begins: lens and board, (m, 4, 4) poses of the target, and both edges."""
+    """Where a fit begins: lens and board, (m, 4, 4) poses of the target, and where frames are."""
 
     appearance: Appearance
     poses: FloatArray
-    edges: Edges
+    frames: Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,17 +263,36 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
-    """The fit at rest: the linearisation, the chain's data, and what came out."""
+class Fitted:
+    """The fit at rest: the linearisation, the problem of all frames, and what came out."""
 
     seen: Seen
-    data: Closure
-    fit: ClosureFit
+    problem: Problem
+    fit: Solution
+
+    @property
+    def looks(self) -> slice:
+        """The columns of lens and board: the first effect's."""
+        first = 6 * len(self.problem.unknown)
+        return slice(first, first + len(self.seen.free.columns))
+
+    @property
+    def frames(self) -> Mapping[str, FloatArray]:
+        """Where the unknown frames are."""
+        return dict(zip(self.problem.unknown, self.fit.state.edges, strict=True))
+
+    @property
+    def appearance(self) -> Appearance:
+        """Lens and board as they came out."""
+        return self.seen.free.after(self.fit.state.values)
 
     def again(self) -> Start:
         """The answer as the start of the next fit."""
-        after = self.seen.free.after(self.fit.edges.shared)
-        return Start(after, self.seen.compressed.cam_from_target, self.fit.edges)
+        return Start(self.appearance, self.seen.compressed.cam_from_target, self.frames)
+
+    def spread(self) -> FloatArray:
+        """(p, p) covariance of what the fit moves, where it was measured."""
+        return fitted_covariance(self.problem, self.fit.state, self.fit.noise)
 
     @property
     def moving(self) -> IntArray:
@@ -275,7 +300,7 @@ class State:
         return self.seen.free.columns[~self.seen.free.anchored]
 
 
-def settle(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+def settle(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> Fitted:
     """Linearises and fits in turn, until the values stay where they are.
 
     Raises:
@@ -295,46 +320,45 @@ def settle(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
         ) from error
 
 
-def _settled(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
-    state = _fitted(problem, arm, moving, start)
+def _settled(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> Fitted:
+    fitted = _fitted(problem, arm, moving, start)
     for _ in range(_ROUNDS):
-        spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])
-        looks = len(state.seen.free.columns)
-        sigma = np.sqrt(np.diag(spread)[12 : 12 + looks])
-        if np.all(np.abs(state.fit.edges.shared[:looks]) <= _SETTLED * sigma):
+        sigma = np.sqrt(np.diag(fitted.spread())[fitted.looks])
+        if np.all(np.abs(fitted.fit.state.values[: len(sigma)]) <= _SETTLED * sigma):
             break
-        state = _fit(problem, arm, _stepped(problem, moving, state), state.fit.edges)
-    return state
+        fitted = _fit(problem, arm, _stepped(problem, moving, fitted), fitted.frames)
+    return fitted
 
 
-def _fitted(problem: Problem, arm: Arm, moving: IntArray, start: Start) -> State:
+def _fitted(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> Fitted:
     seen = seen_at(problem, moving, start.appearance, start.poses)
-    return _fit(problem, arm, seen, start.edges)
+    return _fit(problem, arm, seen, start.frames)
 
 
-def _stepped(problem: Problem, moving: IntArray, state: State) -> Seen:
+def _stepped(problem: CornerProblem, moving: IntArray, fitted: Fitted) -> Seen:
     """Linearises where the fit came to rest, or on the way there as far as the corners follow.
 
     Far from the answer, as where a lens was stated for images of another size, the whole step
     leads to lenses that see nothing.
     """
-    limit = _FOLLOWS * floored_sigma_px(state.seen.sigma_px)
-    change, poses = state.fit.edges.shared, state.seen.compressed.cam_from_target
+    limit = _FOLLOWS * floored_sigma_px(fitted.seen.sigma_px)
+    change, poses = fitted.fit.state.values, fitted.seen.compressed.cam_from_target
     for _ in range(_HALVINGS):
-        seen = seen_at(problem, moving, state.seen.free.after(change), poses)
+        seen = seen_at(problem, moving, fitted.seen.free.after(change), poses)
         if seen.sigma_px <= limit:
             return seen
         change = change / 2
-    return state.seen
+    return fitted.seen
 
 
-def _fit(problem: Problem, arm: Arm, seen: Seen, start: Edges) -> State:
-    data = _chain(problem, arm, seen, seen.free)
-    at_rest = Edges(start.x, start.z, data.unchanged)
-    return State(seen, data, fit_closure(data, at_rest))
+def _fit(problem: CornerProblem, arm: Arm, seen: Seen, frames: Mapping[str, FloatArray]) -> Fitted:
+    whole = _chain(problem, arm, seen, seen.free)
+    return Fitted(seen, whole, fit_problem(whole, whole.start(frames)))
 
 
-def seen_at(problem: Problem, moving: IntArray, appearance: Appearance, poses: FloatArray) -> Seen:
+def seen_at(
+    problem: CornerProblem, moving: IntArray, appearance: Appearance, poses: FloatArray
+) -> Seen:
     """Linearises the corners.
 
     Args:
@@ -350,7 +374,7 @@ def seen_at(problem: Problem, moving: IntArray, appearance: Appearance, poses: F
 
 
 def _known_beforehand(
-    problem: Problem,
+    problem: CornerProblem,
     moving: IntArray,
     appearance: Appearance,
     compressed: Compressed,
@@ -374,19 +398,20 @@ def _known_beforehand(
     )
 
 
-def _chain(problem: Problem, arm: Arm, seen: Seen, free: Free) -> Closure:
-    data = Closure(
+def _chain(problem: CornerProblem, arm: Arm, seen: Seen, free: Free) -> Problem:
+    effects = [free.effect(seen.compressed.by_shared[:, :, free.columns])]
+    if arm.errors is not None:
+        effects.append(arm.errors.effect(ROBOT))
+    return chain(
         problem.scene.mount,
-        arm.robot,
+        arm.poses,
         seen.compressed.cam_from_target,
         floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
-        (free.effect(seen.compressed.by_shared[:, :, free.columns]),),
+        stops=arm.stops,
+        targets=arm.targets,
+        effects=effects,
         priors=arm.priors,
     )
-    data = arm.boards.brought(data)
-    if arm.errors is not None:
-        data = data.with_more(arm.errors.effect(ROBOT))
-    return data.merged(arm.stops)
 
 
 @dataclass(frozen=True)
@@ -416,16 +441,18 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(problem: Problem, arm: Arm, state: State, board: int = 0) -> MeasuredScale:
+def measured_scale(
+    problem: CornerProblem, arm: Arm, fitted: Fitted, board: int = 0
+) -> MeasuredScale:
     """Measures a board's size by the robot's motion."""
     place = problem.scale_of(board)
-    data, at_change = _with_free(
-        problem, arm, state, np.union1d(state.moving, place), ignored=place
+    whole, at_change = _with_free(
+        problem, arm, fitted, np.union1d(fitted.moving, place), ignored=place
     )
-    information, gradient = normal_equations(data, at_change, state.fit.noise)
-    spread = covariance(information)
-    at = 12 + int(np.searchsorted(state.seen.free.columns, place[0]))
-    now = float(state.seen.free.after(state.fit.edges.shared).values[place[0]])
+    information, gradient = normal_equations(whole, at_change, fitted.fit.noise)
+    spread = covariance_among(information, whole.moving)
+    at = fitted.looks.start + int(np.searchsorted(fitted.seen.free.columns, place[0]))
+    now = float(fitted.appearance.values[place[0]])
     uneven = _UNEVEN if arm.errors is not None and arm.of_links else 1.0
     return MeasuredScale(
         board,
@@ -435,23 +462,22 @@ def measured_scale(problem: Problem, arm: Arm, state: State, board: int = 0) -> 
     )
 
 
-def moved_surprise(problem: Problem, state: State, places: IntArray) -> float:
+def moved_surprise(problem: CornerProblem, fitted: Fitted, places: IntArray) -> float:
     """Squared distance of some values from the stated ones, in units of their covariance.
 
     Args:
         problem: The corners.
-        state: A fit that moves these values among others.
+        fitted: A fit that moves these values among others.
         places: (k,) where they stand among the values.
     """
-    spread = covariance(normal_equations(state.data, state.fit.edges, state.fit.noise)[0])
-    at = 12 + np.searchsorted(state.seen.free.columns, places)
-    away = (state.again().appearance.values - problem.stated.values)[places]
-    return float(away @ np.linalg.solve(spread[np.ix_(at, at)], away))
+    at = fitted.looks.start + np.searchsorted(fitted.seen.free.columns, places)
+    away = (fitted.appearance.values - problem.stated.values)[places]
+    return float(away @ np.linalg.solve(fitted.spread()[np.ix_(at, at)], away))
 
 
-def contradicted_lens(problem: Problem, state: State) -> bool:
+def contradicted_lens(problem: CornerProblem, fitted: Fitted) -> bool:
     """Whether given intrinsics are farther off than what they are known to explains."""
-    away = state.again().appearance.values - problem.stated.values
+    away = fitted.appearance.values - problem.stated.values
     return bool(np.any(np.abs(away)[problem.lens] > _CONTRADICTION * _lens_prior(problem.scene)))
 
 
@@ -460,26 +486,25 @@ def chance_limit(freedom: int) -> float:
     return float(chi2_limit(_FALSE_ALARM, freedom))
 
 
-def gain(problem: Problem, arm: Arm, state: State, moving: IntArray) -> float:
+def gain(problem: CornerProblem, arm: Arm, fitted: Fitted, moving: IntArray) -> float:
     """How much the whitened squared error falls when more values are free (Rao's score test)."""
-    data, at = _with_free(problem, arm, state, moving)
-    information, gradient = normal_equations(data, at, state.fit.noise)
-    return float(gradient @ covariance(information) @ gradient)
+    whole, at = _with_free(problem, arm, fitted, moving)
+    return score_gain(*normal_equations(whole, at, fitted.fit.noise), whole.moving)
 
 
 def _with_free(
-    problem: Problem,
+    problem: CornerProblem,
     arm: Arm,
-    state: State,
+    fitted: Fitted,
     moving: IntArray,
     ignored: IntArray | None = None,
-) -> tuple[Closure, Edges]:
-    """The chain at the same state with other values free, and without the prior of some."""
-    seen = state.seen
+) -> tuple[Problem, State]:
+    """The problem at the same state with other values free, and without the prior of some."""
+    seen = fitted.seen
     stated = problem if ignored is None else problem.without_prior(ignored)
     free = _known_beforehand(stated, moving, seen.free.appearance, seen.compressed, seen.sigma_px)
-    looks, rest = np.split(state.fit.edges.shared, [len(seen.free.columns)])
+    looks, rest = np.split(fitted.fit.state.values, [len(seen.free.columns)])
     change = np.zeros(len(free.columns))
     change[np.searchsorted(free.columns, seen.free.columns)] = looks
-    edges = Edges(state.fit.edges.x, state.fit.edges.z, np.concatenate([change, rest]))
-    return _chain(problem, arm, seen, free), edges
+    there = State(fitted.fit.state.edges, np.concatenate([change, rest]))
+    return _chain(problem, arm, seen, free), there

@@ -380,6 +380,10 @@ class Problem:
         """How many columns p there are."""
         return 6 * len(self.unknown) + sum(map(len, self.effects))
 
+    def start(self, frames: Mapping[str, FloatArray]) -> State:
+        """The unknowns where frames are, and where effects were linearised."""
+        return State(np.stack([frames[it] for it in self.unknown]), self.start_values)
+
     @cached_property
     def start_values(self) -> FloatArray:
         """(k,) the effects' values where the observations were linearised."""

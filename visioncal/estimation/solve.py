@@ -244,6 +244,20 @@ def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArra
     return covariance_among(normal_equations(problem, state, noise)[0], problem.moving)
 
 
+def held_shift(problem: Problem, solution: Solution) -> FloatArray:
+    """How far the unknowns (p,) would move if what is held moved as well, to first order.
+
+    What is held is wrong by what is open about it, and by how far the observations pull at it:
+    beside the covariance, which counts the former, the square of this shift is the error of
+    holding.
+    """
+    held = problem.counted & ~problem.moving
+    if not held.any():
+        return np.zeros(problem.size)
+    pull = normal_equations(problem, solution.state, solution.noise)[1]
+    return np.asarray(-covariance_of(problem, solution) @ np.where(held, pull, 0.0))
+
+
 def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
     """Covariance (p, p) of the unknowns, where all chains close exactly; zero of what is fixed.
 

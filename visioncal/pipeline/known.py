@@ -13,14 +13,15 @@ from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.boards import Boards
-from visioncal.estimation.closure import Closure, Noise
+from visioncal.estimation.chain import edge_names
+from visioncal.estimation.closure import Closure, Edges, Noise
 from visioncal.estimation.joint import Scene
 from visioncal.estimation.problem import ROBOT, FramePrior
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
 from visioncal.robot import Convention, Loads, Robot, with_zeros
-from visioncal.session import Session
+from visioncal.session import Session, frame_name
 from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
@@ -287,6 +288,26 @@ class Known:
             errors = replace(self.arm, basis=self.arm_basis(views))
             data = data.with_more(errors.effect(ROBOT, values=self.arm_values))
         return data
+
+    def targets(self, views: Sequence[int]) -> tuple[str, ...]:
+        """(m,) the frame of the target that each view shows."""
+        return tuple(self._frame_of(self.poses[view].board) for view in views)
+
+    def _frame_of(self, board: int) -> str:
+        if len(self.boards) < 2:
+            return edge_names(self.session.mount)[1].partition("_from_")[2]
+        return frame_name("target", tuple(self.session.boards)[board])
+
+    def frames_at(self, edges: Edges) -> dict[str, FloatArray]:
+        """Where the camera and all targets are by both edges."""
+        placed = edges.z @ invert(self.from_first)
+        targets = zip(map(self._frame_of, self.boards), placed, strict=True)
+        return {edge_names(self.session.mount)[0].partition("_from_")[2]: edges.x, **dict(targets)}
+
+    def first_of_stops(self, views: Sequence[int]) -> list[int]:
+        """(s,) the first view of each stop."""
+        first = np.unique(self.stops_of(views), return_index=True)[1]
+        return [views[it] for it in first.tolist()]
 
     def shown(self, views: Sequence[int]) -> Boards:
         """The boards of some views, all of which the chain holds."""

@@ -281,12 +281,12 @@ def _refine(known: Known) -> Known:
     if agreed is None or known.solver != "joint":
         return known
     if scene is None or free is None or any(it is None for it in known.seen(known.used)):
-        data = known.closure(known.used).merged(known.stops)
-        edges = replace(agreed.edges, shared=data.unchanged)
-        return replace(known, arm=arm_errors(_arm(known), data, edges))
+        problem = known.closure(known.used).merged(known.stops).problem
+        frames = dict(zip(problem.unknown, agreed.edges.state.edges, strict=True))
+        return replace(known, arm=arm_errors(_arm(known), problem, frames))
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
-        result = refine(scene, views, _arm(known), agreed.edges)
+        result = refine(scene, views, _arm(known), known.frames_at(agreed.edges))
         known = known.seeing(result)
         before, all_of = agreed.mask, known.candidates
         boards = known.shown(all_of)
@@ -299,12 +299,13 @@ def _refine(known: Known) -> Known:
 
 
 def _arm(known: Known) -> Arm:
+    first = known.first_of_stops(known.used)
     return Arm(
-        known.closure(known.used).robot,
+        known.flange_poses(first),
         known.stops,
-        known.arm_basis(known.used),
+        known.targets(known.used),
+        known.arm_basis(first),
         known.joints_rad is not None,
-        known.shown(known.used),
         priors=known.priors,
     )
 

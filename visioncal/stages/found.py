@@ -6,18 +6,18 @@ import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.estimation.appearance import MOST_LOOSE
-from visioncal.estimation.closure import held_shift
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (
     Arm,
+    CornerProblem,
+    Fitted,
     MeasuredScale,
-    Problem,
-    State,
     chance_limit,
     contradicted_lens,
     measured_scale,
     moved_surprise,
 )
+from visioncal.estimation.solve import held_shift
 from visioncal.figures import figure
 from visioncal.types import FloatArray, IntArray
 
@@ -25,41 +25,41 @@ from visioncal.types import FloatArray, IntArray
 _FALSE_ALARM = 1e-4
 
 
-def findings(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
+def findings(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[str]:
     """Says what was found that is a reason for doubt, and what the user can do about it.
 
     Args:
         problem: The corners, and what is known of the scene.
         arm: The robot's side.
-        state: The answer.
+        fitted: The answer.
     """
-    words, is_doubt = _noise_words(problem, state)
+    words, is_doubt = _noise_words(problem, fitted)
     if is_doubt:
         yield words
     for board in problem.printed:
-        yield from _scale_finding(problem, arm, state, board)
-        yield from _bend_finding(problem, state, board)
+        yield from _scale_finding(problem, arm, fitted, board)
+        yield from _bend_finding(problem, fitted, board)
     for rig in range(len(problem.scene.targets)):
-        yield from _points_finding(problem, state, rig)
-    yield from _lens_finding(problem, state)
+        yield from _points_finding(problem, fitted, rig)
+    yield from _lens_finding(problem, fitted)
 
 
-def remarks(problem: Problem, arm: Arm, state: State) -> Iterator[str]:
+def remarks(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[str]:
     """Says what was found that is no reason for doubt; as `findings`."""
-    words, is_doubt = _noise_words(problem, state)
+    words, is_doubt = _noise_words(problem, fitted)
     if words and not is_doubt:
         yield words
     for board in problem.printed:
-        measured = _measured(problem, arm, state, board)
+        measured = _measured(problem, arm, fitted, board)
         if measured is not None and not measured.contradicts:
             yield (
                 f"{_sized(problem, measured)}, which what is stated allows (to within "
                 f"{100 * measured.stated_sigma:.1g} %). The result goes by both."
             )
-    if _lens_moved(problem, state) and not _is_doubtful(problem, state):
+    if _lens_moved(problem, fitted) and not _is_doubtful(problem, fitted):
         yield (
             "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
-            f"{_lens_steps(problem, state)} px."
+            f"{_lens_steps(problem, fitted)} px."
         )
 
 
@@ -82,7 +82,7 @@ def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tup
         "by the scatter. Look for errors of the detector, the lens or the target that sigma_px "
         "leaves out."
         if more
-        else "by what is stated. State what the detector errs by, or leave sigma_px out."
+        else "by what is stated. Fitted what the detector errs by, or leave sigma_px out."
     )
     return (
         f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
@@ -91,14 +91,14 @@ def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tup
     )
 
 
-def _noise_words(problem: Problem, state: State) -> tuple[str, bool]:
-    seen = state.seen.compressed
-    return noise_words(problem.stack, seen.residuals, problem.unknowns(seen, state.moving))
+def _noise_words(problem: CornerProblem, fitted: Fitted) -> tuple[str, bool]:
+    seen = fitted.seen.compressed
+    return noise_words(problem.stack, seen.residuals, problem.unknowns(seen, fitted.moving))
 
 
-def _scale_finding(problem: Problem, arm: Arm, state: State, board: int) -> Iterator[str]:
+def _scale_finding(problem: CornerProblem, arm: Arm, fitted: Fitted, board: int) -> Iterator[str]:
     """Whether the robot measures another size of the squares than the file states."""
-    measured = _measured(problem, arm, state, board)
+    measured = _measured(problem, arm, fitted, board)
     if measured is not None and measured.contradicts:
         yield (
             f"{_sized(problem, measured)}, which is not what is stated (to within "
@@ -108,18 +108,18 @@ def _scale_finding(problem: Problem, arm: Arm, state: State, board: int) -> Iter
         )
 
 
-def _measured(problem: Problem, arm: Arm, state: State, board: int) -> MeasuredScale | None:
+def _measured(problem: CornerProblem, arm: Arm, fitted: Fitted, board: int) -> MeasuredScale | None:
     """What the robot measures, where the fit has taken it up."""
-    taken = _moves(state, problem.scale_of(board))
-    return measured_scale(problem, arm, state, board) if taken else None
+    taken = _moves(fitted, problem.scale_of(board))
+    return measured_scale(problem, arm, fitted, board) if taken else None
 
 
-def _board(problem: Problem, board: int) -> str:
+def _board(problem: CornerProblem, board: int) -> str:
     """What a board is called: by its name where there are several."""
     return f"board {problem.scene.names[board]}".strip()
 
 
-def _sized(problem: Problem, measured: MeasuredScale) -> str:
+def _sized(problem: CornerProblem, measured: MeasuredScale) -> str:
     side = 1e3 * problem.scene.targets[measured.board].square_m
     return (
         f"By the robot's motion the {_board(problem, measured.board)} is "
@@ -130,10 +130,10 @@ def _sized(problem: Problem, measured: MeasuredScale) -> str:
     )
 
 
-def _bend_finding(problem: Problem, state: State, board: int) -> Iterator[str]:
-    if not _moved(problem, state, problem.shape_of(board)):
+def _bend_finding(problem: CornerProblem, fitted: Fitted, board: int) -> Iterator[str]:
+    if not _moved(problem, fitted, problem.shape_of(board)):
         return
-    shift = state.seen.free.corners_after(state.fit.edges.shared) - problem.positions
+    shift = fitted.seen.free.corners_after(fitted.fit.state.values) - problem.positions
     bend_mm = 1e3 * float(np.ptp(shift[problem.corners_of(board), 2]))
     yield (
         f"The {_board(problem, board)} is not flat: its corners lie within {bend_mm:.2g} mm of "
@@ -142,7 +142,7 @@ def _bend_finding(problem: Problem, state: State, board: int) -> Iterator[str]:
     )
 
 
-def _points_finding(problem: Problem, state: State, rig: int) -> Iterator[str]:
+def _points_finding(problem: CornerProblem, fitted: Fitted, rig: int) -> Iterator[str]:
     """Whether a rig's points lie farther from where its table has them than it says."""
     target, places = problem.scene.targets[rig], problem.points_of(rig)
     if not target.point_sigmas_m:
@@ -153,7 +153,7 @@ def _points_finding(problem: Problem, state: State, rig: int) -> Iterator[str]:
             f"their sigma_m counts for up to {MOST_LOOSE}."
         )
         return
-    moved = state.again().appearance.values[places].reshape(-1, 3)
+    moved = fitted.appearance.values[places].reshape(-1, 3)
     sigmas = np.array(target.point_sigmas_m)
     away = np.linalg.norm(moved, axis=1)
     worst = int(np.argmax(away / sigmas))
@@ -166,40 +166,40 @@ def _points_finding(problem: Problem, state: State, rig: int) -> Iterator[str]:
         )
 
 
-def _lens_finding(problem: Problem, state: State) -> Iterator[str]:
+def _lens_finding(problem: CornerProblem, fitted: Fitted) -> Iterator[str]:
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
         yield (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
             f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
             "more corners, or more views."
         )
-    if _lens_moved(problem, state) and _is_doubtful(problem, state):
+    if _lens_moved(problem, fitted) and _is_doubtful(problem, fitted):
         yield (
             "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved "
-            f"by {_lens_steps(problem, state)} px. Calibrate the camera anew, or hold them with "
+            f"by {_lens_steps(problem, fitted)} px. Calibrate the camera anew, or hold them with "
             'intrinsics = "hold".'
         )
     if problem.contested:
-        yield _contest(problem, state)
+        yield _contest(problem, fitted)
 
 
-def _lens_moved(problem: Problem, state: State) -> bool:
-    return not problem.scene.estimated and _moved(problem, state, problem.lens)
+def _lens_moved(problem: CornerProblem, fitted: Fitted) -> bool:
+    return not problem.scene.estimated and _moved(problem, fitted, problem.lens)
 
 
-def _is_doubtful(problem: Problem, state: State) -> bool:
+def _is_doubtful(problem: CornerProblem, fitted: Fitted) -> bool:
     """Whether moved intrinsics were taken for exact, or for better than they are."""
-    return problem.scene.matrix_sigma_px is None or contradicted_lens(problem, state)
+    return problem.scene.matrix_sigma_px is None or contradicted_lens(problem, fitted)
 
 
-def _lens_steps(problem: Problem, state: State) -> str:
-    return _px((state.again().appearance.values - problem.stated.values)[:4])
+def _lens_steps(problem: CornerProblem, fitted: Fitted) -> str:
+    return _px((fitted.appearance.values - problem.stated.values)[:4])
 
 
-def _contest(problem: Problem, state: State) -> str:
+def _contest(problem: CornerProblem, fitted: Fitted) -> str:
     """Words intrinsics that stay although the corners speak against them."""
-    shift = held_shift(state.data, state.fit.edges, state.fit.noise)[12:]
-    moves = shift[np.searchsorted(state.seen.free.columns, problem.lens[:4])]
+    shift = held_shift(fitted.problem, fitted.fit)[fitted.looks]
+    moves = shift[np.searchsorted(fitted.seen.free.columns, problem.lens[:4])]
     why = (
         'intrinsics = "hold" keeps them'
         if problem.scene.mode == "hold"
@@ -212,13 +212,13 @@ def _contest(problem: Problem, state: State) -> str:
     )
 
 
-def _moves(state: State, places: IntArray) -> bool:
-    return bool(np.isin(places, state.moving).all())
+def _moves(fitted: Fitted, places: IntArray) -> bool:
+    return bool(np.isin(places, fitted.moving).all())
 
 
-def _moved(problem: Problem, state: State, places: IntArray) -> bool:
+def _moved(problem: CornerProblem, fitted: Fitted, places: IntArray) -> bool:
     """Whether values were moved from what is stated by more than chance."""
-    return _moves(state, places) and moved_surprise(problem, state, places) > chance_limit(
+    return _moves(fitted, places) and moved_surprise(problem, fitted, places) > chance_limit(
         len(places)
     )
 

@@ -1,6 +1,6 @@
 """Stage 6: what all views share besides the edges: the lens, and the board as it really is."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,16 +13,15 @@ from visioncal.estimation.appearance import (
     compress,
 )
 from visioncal.estimation.arm import ArmErrors, find_arm_errors
-from visioncal.estimation.closure import Closure, Edges, fit_closure
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.joint import (
     Arm,
+    CornerProblem,
+    Fitted,
     MeasuredScale,
-    Problem,
     Scene,
     Seen,
     Start,
-    State,
     chance_limit,
     contradicted_lens,
     gain,
@@ -31,14 +30,14 @@ from visioncal.estimation.joint import (
     settle,
 )
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.observability import worst_directions
-from visioncal.estimation.problem import ROBOT
-from visioncal.estimation.solve import left_out_residuals
+from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.estimation.problem import ROBOT, Problem, State
+from visioncal.estimation.solve import covariance_of, fit_problem, left_out_residuals
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
-from visioncal.types import Corners, IntArray
+from visioncal.types import Corners, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +73,16 @@ def look(scene: Scene, views: Sequence[ViewPoses], *, closed_form: bool = False)
         The views with how they move when lens and board do.
     """
     with one_blas_thread():
-        problem = Problem.of(scene, _corners(views))
+        problem = CornerProblem.of(scene, _corners(views))
         moving = problem.lens[:0] if closed_form else problem.first
         poses = np.array([view.cam_from_target[0] for view in views])
         seen = seen_at(problem, moving, problem.stated, poses)
     return _told(seen, views, None)
 
 
-def refine(scene: Scene, views: Sequence[ViewPoses], arm: Arm, edges: Edges) -> Refined:
+def refine(
+    scene: Scene, views: Sequence[ViewPoses], arm: Arm, frames: Mapping[str, FloatArray]
+) -> Refined:
     """Fits lens, board and edges to all corners together.
 
     Estimated intrinsics move with the edges. The board's bend, given intrinsics together with it,
@@ -93,31 +94,31 @@ def refine(scene: Scene, views: Sequence[ViewPoses], arm: Arm, edges: Edges) -> 
         scene: What is looked at, and with what.
         views: The views in the fit, each with its one pose and its corners.
         arm: The robot's side.
-        edges: Where to start.
+        frames: Where the unknown frames are thought to be.
     """
     with one_blas_thread():
-        problem = Problem.of(scene, _corners(views))
+        problem = CornerProblem.of(scene, _corners(views))
         poses = np.array([view.cam_from_target[0] for view in views])
-        start = Start(problem.stated, poses, edges)
+        start = Start(problem.stated, poses, frames)
         answer = _chosen(problem, arm, settle(problem, arm, problem.first, start))
-        errors = arm_errors(arm, answer.state.data, answer.state.fit.edges)
+        errors = arm_errors(arm, answer.fitted.problem, answer.fitted.frames)
         if errors is not None and errors.is_significant:
             answer, arm, errors = _with_arm(problem, arm, start, errors)
-        doubts = tuple(findings(answer.problem, arm, answer.state))
-        notes = tuple(remarks(answer.problem, arm, answer.state))
-    return replace(_told(answer.state.seen, views, errors), warnings=doubts, notes=notes)
+        doubts = tuple(findings(answer.problem, arm, answer.fitted))
+        notes = tuple(remarks(answer.problem, arm, answer.fitted))
+    return replace(_told(answer.fitted.seen, views, errors), warnings=doubts, notes=notes)
 
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
     """A fit, and the problem that it answers: priors that are contradicted have been dropped."""
 
-    problem: Problem
-    state: State
+    problem: CornerProblem
+    fitted: Fitted
 
 
 def _with_arm(
-    problem: Problem, arm: Arm, start: Start, errors: ArmErrors
+    problem: CornerProblem, arm: Arm, start: Start, errors: ArmErrors
 ) -> tuple[_Answer, Arm, ArmErrors | None]:
     """Fits again with errors of the arm, which may have passed for another lens or board.
 
@@ -125,38 +126,29 @@ def _with_arm(
     under the stated lens and board: a board that changes its size with the arm hides a part of it.
     """
     stated = settle(problem, arm, problem.first, start)
-    errors = arm_errors(arm, stated.data, stated.fit.edges) or errors
+    errors = arm_errors(arm, stated.problem, stated.frames) or errors
     erring = replace(arm, errors=errors)
     answer = _chosen(problem, erring, settle(problem, erring, problem.first, start))
     if arm.of_links:
         return answer, erring, errors
-    state = settle(answer.problem, arm, answer.state.moving, answer.state.again())
-    left = arm_errors(arm, state.data, state.fit.edges)
-    return replace(answer, state=state), arm, left
+    fitted = settle(answer.problem, arm, answer.fitted.moving, answer.fitted.again())
+    left = arm_errors(arm, fitted.problem, fitted.frames)
+    return replace(answer, fitted=fitted), arm, left
 
 
-def arm_errors(arm: Arm, data: Closure, edges: Edges) -> ArmErrors | None:
+def arm_errors(arm: Arm, problem: Problem, frames: Mapping[str, FloatArray]) -> ArmErrors | None:
     """Finds errors that follow the arm's posture.
 
     Args:
-        arm: The robot's side of m views.
-        data: The same views, one a stop.
-        edges: The answer under white noise, or a start.
+        arm: The robot's side.
+        problem: What was observed at its stops.
+        frames: Where the unknown frames are under white noise, or a start.
 
     Returns:
-        The errors at all m views; None where white noise explains the residuals as well.
+        The errors; None where white noise explains the residuals as well.
     """
-    fit = fit_closure(data, Edges(edges.x, edges.z, data.unchanged))
-    first = np.unique(arm.stops, return_index=True)[1]
-    found = find_arm_errors(
-        data.problem,
-        fit.edges.state,
-        fit.noise.levels,
-        ROBOT,
-        arm.basis[first],
-        of_links=arm.of_links,
-    )
-    return None if found is None else replace(found, basis=arm.basis)
+    fit = fit_problem(problem, problem.start(frames))
+    return find_arm_errors(problem, fit.state, fit.noise, ROBOT, arm.basis, of_links=arm.of_links)
 
 
 def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
@@ -171,24 +163,24 @@ def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> R
     )
 
 
-def _chosen(problem: Problem, arm: Arm, state: State) -> _Answer:
+def _chosen(problem: CornerProblem, arm: Arm, fitted: Fitted) -> _Answer:
     """Sets free what the data speak for."""
-    answer = _Answer(problem, state)
-    for moving in _shapes(problem, arm, state):
-        wider = _freed(problem, arm, moving, state)
-        if _is_determined(wider.state, arm) and not _predicts_worse(wider.state, state):
+    answer = _Answer(problem, fitted)
+    for moving in _shapes(problem, arm, fitted):
+        wider = _freed(problem, arm, moving, fitted)
+        if _is_determined(wider.fitted) and not _predicts_worse(wider.fitted, fitted):
             answer = wider
             break
-    if not np.isin(problem.lens, answer.state.moving).all() and _speaks_against_lens(answer, arm):
+    if not np.isin(problem.lens, answer.fitted.moving).all() and _speaks_against_lens(answer, arm):
         contested = replace(answer.problem, contested=True)
-        again = settle(contested, arm, answer.state.moving, answer.state.again())
+        again = settle(contested, arm, answer.fitted.moving, answer.fitted.again())
         answer = _Answer(contested, again)
     return _resized(answer, arm)
 
 
-def _freed(problem: Problem, arm: Arm, moving: IntArray, state: State) -> _Answer:
+def _freed(problem: CornerProblem, arm: Arm, moving: IntArray, fitted: Fitted) -> _Answer:
     """Fits with more values free; a confident wrong prior is worse than none."""
-    wider = settle(problem, arm, moving, state.again())
+    wider = settle(problem, arm, moving, fitted.again())
     if not np.isin(problem.lens, moving).all() or not contradicted_lens(problem, wider):
         return _Answer(problem, wider)
     unknown = problem.without_prior(problem.lens)
@@ -204,13 +196,13 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
         other = _wrongly_sized(answer, arm)
         if other is None:
             return answer
-        problem, state = answer.problem, answer.state
+        problem, fitted = answer.problem, answer.fitted
         place = problem.scale_of(other.board)
         if other.contradicts:
             problem = problem.without_prior(place)
-        moving = np.union1d(state.moving, place)
-        resized = _Answer(problem, settle(problem, arm, moving, state.again()))
-        if not _is_determined(resized.state, arm):
+        moving = np.union1d(fitted.moving, place)
+        resized = _Answer(problem, settle(problem, arm, moving, fitted.again()))
+        if not _is_determined(resized.fitted):
             return answer
         answer = resized
     return answer
@@ -218,31 +210,35 @@ def _resized(answer: _Answer, arm: Arm) -> _Answer:
 
 def _wrongly_sized(answer: _Answer, arm: Arm) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
-    problem, state = answer.problem, answer.state
-    held = [it for it in problem.printed if problem.scale_of(it)[0] not in state.moving]
-    measured = [measured_scale(problem, arm, state, board) for board in held]
+    problem, fitted = answer.problem, answer.fitted
+    held = [it for it in problem.printed if problem.scale_of(it)[0] not in fitted.moving]
+    measured = [measured_scale(problem, arm, fitted, board) for board in held]
     # An arm whose links may all be too long is hard to tell from a board that is too large.
     other = [it for it in measured if (it.is_another if arm.errors is None else it.contradicts)]
     return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)
 
 
-def _is_determined(state: State, arm: Arm) -> bool:
+def _is_determined(fitted: Fitted) -> bool:
     """Whether the views still determine both edges to what is accepted, errors of the arm aside."""
-    boards = replace(arm.boards, begin=len(state.seen.free.columns))
-    kept = boards.begin + boards.unknowns
-    edges = replace(state.fit.edges, shared=state.fit.edges.shared[:kept])
-    worst = worst_directions(state.data.with_first(kept), edges, state.fit.noise, boards)
-    return all(it.sigma < it.limit for it in worst)
+    looks, fit = fitted.problem.effects[:1], fitted.fit
+    problem = fitted.problem.with_effects(looks)
+    values = fit.state.values[: sum(map(len, looks))]
+    spread = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
+    size = 6 * len(problem.unknown)
+    limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), len(problem.unknown))
+    blocks = np.split(spread[:size, :size], size // 3)
+    worst = [np.linalg.eigvalsh(it[:, 3 * at : 3 * at + 3])[-1] for at, it in enumerate(blocks)]
+    return bool(np.all(np.sqrt(worst) < limits[::3]))
 
 
 def _speaks_against_lens(answer: _Answer, arm: Arm) -> bool:
     """Whether given intrinsics that are held explain the corners worse than chance does."""
-    problem, state = answer.problem, answer.state
+    problem, fitted = answer.problem, answer.fitted
     if not problem.has_spare_corners:
         return False
-    bent = np.union1d(state.moving, problem.shape)
+    bent = np.union1d(fitted.moving, problem.shape)
     everything = np.union1d(bent, problem.lens)
-    more = gain(problem, arm, state, everything) - gain(problem, arm, state, bent)
+    more = gain(problem, arm, fitted, everything) - gain(problem, arm, fitted, bent)
     return more > chance_limit(len(problem.lens))
 
 
@@ -279,14 +275,14 @@ def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[Vie
     )
 
 
-def _shapes(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
+def _shapes(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[IntArray]:
     """The bend, with given intrinsics or without, where it explains significantly more."""
-    now = state.moving
+    now = fitted.moving
     if not problem.has_spare_corners:
         return
     bent = np.union1d(now, problem.shape)
     everything = np.union1d(bent, problem.lens)
-    gain_bent, gain_all = gain(problem, arm, state, bent), gain(problem, arm, state, everything)
+    gain_bent, gain_all = gain(problem, arm, fitted, bent), gain(problem, arm, fitted, everything)
     may_refine = problem.scene.mode != "hold" and len(everything) > len(bent)
     if may_refine and gain_all - gain_bent > chance_limit(len(everything) - len(bent)):
         yield everything
@@ -294,13 +290,11 @@ def _shapes(problem: Problem, arm: Arm, state: State) -> Iterator[IntArray]:
         yield bent
 
 
-def _predicts_worse(wider: State, state: State) -> bool:
+def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
     """Whether views that are left out are predicted worse, in position and in rotation."""
     errors = [
-        left_out_residuals(it.data.problem, it.fit.edges.state, it.fit.noise.levels).reshape(
-            -1, 2, 3
-        )
-        for it in (wider, state)
+        left_out_residuals(it.problem, it.fit.state, it.fit.noise).reshape(-1, 2, 3)
+        for it in (wider, fitted)
     ]
     more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
     return bool(np.all(more > less))

@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.joint import Problem
+from visioncal.estimation.joint import CornerProblem
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.problem import Effect
 from visioncal.estimation.variance import Knowledge
@@ -33,12 +33,12 @@ class Looks:
         poses: (v, 4, 4) of the views, camera by camera.
     """
 
-    problems: Mapping[str, Problem]
+    problems: Mapping[str, CornerProblem]
     values: FloatArray
     poses: FloatArray
 
     @classmethod
-    def of(cls, problems: Mapping[str, Problem], poses: Mapping[str, FloatArray]) -> "Looks":
+    def of(cls, problems: Mapping[str, CornerProblem], poses: Mapping[str, FloatArray]) -> "Looks":
         """Lenses and boards as they are stated or were estimated before.
 
         Args:
@@ -69,7 +69,7 @@ class Looks:
 
     @property
     def printed(self) -> list[int]:
-        """Which boards are printed; see `Problem.printed`."""
+        """Which boards are printed; see `CornerProblem.printed`."""
         return self._one.printed
 
     @property
@@ -93,7 +93,7 @@ class Looks:
         return tuple(places[one.corners_of(it)] for it in range(len(one.scene.targets)))
 
     @property
-    def _one(self) -> Problem:
+    def _one(self) -> CornerProblem:
         """Any camera's corners: all see the same boards."""
         return next(iter(self.problems.values()))
 
