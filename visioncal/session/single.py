@@ -8,8 +8,12 @@ from visioncal.session.session import Session
 
 
 def is_whole_cell(session: Session) -> bool:
-    """Whether all of a session can only be adjusted together."""
-    return bool(_several(session))
+    """Whether all of a session can only be adjusted together.
+
+    So is a camera with an instrument, where the session says what hangs on what.
+    """
+    both = bool(session.cameras and session.instruments)
+    return bool(_several(session)) or (both and bool(session.declaration.frames))
 
 
 def check_one_of_each(session: Session) -> None:
