@@ -303,7 +303,7 @@ def test_few_stops_are_said_to_be_few():
     cell = simulate_network(NetworkOptions(stops=6))
     found = aligned(cell)
     assert found.verdict.status == "check"
-    assert "6 stops leave little to check the result with" in found.verdict.reasons[0]
+    assert "Robot a: only 6 stops are used; 10 or more give" in found.verdict.reasons[0]
     with pytest.raises(DegenerateError, match=r"too few, too much alike, or wrong .* 2 have any"):
         aligned(simulate_network(NetworkOptions(stops=2)))
 

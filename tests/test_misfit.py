@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 
-from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
+from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.closure import ROBOT, closure_information
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.misfit import drift, neighbours
 from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.stages.diagnose import _radius95
 from visioncal.transforms import exp
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
@@ -161,7 +160,7 @@ def test_a_point_is_as_uncertain_as_its_scatter():
 @pytest.mark.parametrize("variances", [(1, 1, 1), (1, 0.1, 0.01), (1, 0, 0)])
 def test_95_percent_lie_within_the_radius(variances):
     draws = np.random.default_rng(0).standard_normal((200000, 3)) ** 2 @ np.array(variances, float)
-    radius = _radius95(np.diag(np.array(variances, float)))
+    radius = radius95(np.diag(np.array(variances, float)))
     # Imhof's fit is good to 1 %; 200000 draws to 0.1 %.
     assert np.mean(draws < radius**2) == pytest.approx(0.95, abs=0.004)
 

@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 
 from visioncal.calibration import Rms, ViewResult
-from visioncal.estimation.closure import Edges, Noise
 from visioncal.estimation.observability import Direction
 from visioncal.figures import figure
-from visioncal.stages.diagnose import Diagnosis
-from visioncal.stages.handeye import HandEyeResult
-from visioncal.stages.judge import Findings, judge
+from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor, judge
 from visioncal.types import Rejection
-
-SIGMA = 1e-4
 
 
 def directions(*sigmas):
@@ -24,47 +19,35 @@ def directions(*sigmas):
     )
 
 
-def hand_eye(**changes):
-    identity = np.eye(4)
-    result = HandEyeResult(
-        edges=Edges(identity, identity, np.zeros(0)),
-        covariance=np.eye(12) * SIGMA**2,
-        noise=Noise(1e-4, 1e-4),
-        worst=directions(1e-4, 1e-4, 1e-4, 1e-4),
-        held=np.zeros(12),
-    )
-    return replace(result, **changes)
-
-
 def views(count=20, **odd):
     """Views with like residuals, but for view 7 where `odd` says so."""
     plain = [ViewResult(at, True, "", 40, 0.1, 0.1, 0.01) for at in range(count)]
     return tuple(replace(view, **odd) if view.view == 7 else view for view in plain)
 
 
+PAIR = Pair(views(), Rms(0.1, 0.01, 0.1), Rms(0.11, 0.011, 0.12))
+SENSOR = Sensor(20, pixel_px=0.05)
+ARM = Arm(20, 0.1, 0.0057)
 SOUND = Findings(
-    views=views(),
-    stops=20,
-    lost=(),
-    disagreeing=(),
-    hand_eye=hand_eye(),
-    rms=Rms(0.1, 0.01, 0.1),
-    held_out=Rms(0.11, 0.011, 0.12),
-    holdout=None,
-    pixel_px=0.05,
-    robot=Noise(1e-4, 1e-4),
-    diagnosis=Diagnosis(
-        point_cam=np.array([0.0, 0.0, 0.5]),
-        budget_mm={"pixels": 0.05, "robot": 0.03, "total": 0.06},
-        radius95_mm=0.1,
-        intervals=np.full((2, 2), 1e-4),
-        spectrum=np.full(12, 0.01),
-        inflation=1.0,
-        arm=None,
-        warnings=(),
-    ),
-    warnings=(),
+    (PAIR,),
+    (SENSOR,),
+    (ARM,),
+    directions(1e-4, 1e-4, 1e-4, 1e-4),
+    (Place("Where the views look, a point", {"pixels": 0.05, "robot": 0.03, "total": 0.06}, 0.1),),
 )
+PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
+
+
+def changed(findings, **changes):
+    """Findings with other values of their only pair, sensor and arm, or of their own."""
+    for name, part in PARTS.items():
+        mine = {it: changes.pop(it) for it in list(changes) if hasattr(part, it)}
+        if mine:
+            (now,) = getattr(findings, name)
+            changes[name] = (replace(now, **mine),)
+    return replace(findings, **changes)
+
+
 LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
 
 
@@ -87,35 +70,35 @@ def test_sound_findings_are_good_and_say_how_good():
         ({"held_out": Rms(0.5, 0.011)}, "bad", "fit 5.0 times worse"),
         ({"held_out": Rms(0.11, 0.02)}, "check", "fit 2.0 times worse"),
         (
-            {"views": views(residual_mm=0.9), "robot": None},
+            {"views": views(residual_mm=0.9), "away_mm": None},
             "check",
             "View 7 stands out: it places the target 0.9",
         ),
         (
-            {"robot": None, "views": views(residual_deg=0.2)},
+            {"away_mm": None, "views": views(residual_deg=0.2)},
             "check",
             "0.2 deg from the others, 20 times",
         ),
         ({"holdout": Rms(2.0, 0.01)}, "check", "holds back are missed by 2 mm"),
         ({"holdout": Rms(0.1, 0.4)}, "check", "0.4 deg, 36 times worse"),
         (
-            {"hand_eye": hand_eye(worst=directions(2e-3, 0, 0, 0))},
+            {"worst": directions(2e-3, 0, 0, 0)},
             "check",
             "the direction 0 (2 mm)",
         ),
-        ({"hand_eye": hand_eye(worst=directions(4e-3, 0, 0, 0))}, "bad", "the direction 0 (4 mm)"),
+        ({"worst": directions(4e-3, 0, 0, 0)}, "bad", "the direction 0 (4 mm)"),
         (
-            {"hand_eye": hand_eye(worst=directions(0, 3e-3, 0, 0))},
+            {"worst": directions(0, 3e-3, 0, 0)},
             "check",
             "the direction 1 (0.17 deg)",
         ),
         (
-            {"hand_eye": hand_eye(worst=directions(0, 0, 2e-3, 0))},
+            {"worst": directions(0, 0, 2e-3, 0)},
             "check",
             "the direction 2 (2 mm)",
         ),
-        ({"robot": Noise(1e-4, 1e-3)}, "check", "have to be off by 1 mm and 0.0057 deg"),
-        ({"robot": Noise(5e-4, 1e-4)}, "check", "0.029 deg from stop to stop"),
+        ({"away_mm": 1.0}, "check", "have to be off by 1 mm and 0.0057 deg"),
+        ({"away_deg": 0.029}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
         ({"lost": LOST}, "check", "10 of 30 views are not used; the first: view 30, blurred"),
@@ -126,7 +109,7 @@ def test_sound_findings_are_good_and_say_how_good():
     ],
 )
 def test_each_doubt_has_its_sentence(changes, status, words):
-    verdict = judge(replace(SOUND, **changes))
+    verdict = judge(changed(SOUND, **changes))
     assert verdict.status == status
     assert len(verdict.reasons) == 1
     assert words in verdict.reasons[0]
@@ -139,20 +122,22 @@ def test_each_doubt_has_its_sentence(changes, status, words):
         {"views": views(residual_mm=0.5)},
         {"lost": LOST[:3]},
         {"pixel_px": None},
-        {"robot": None},
+        {"away_mm": None},
         # Exact data: held-out and in-sample scatter are both rounding.
         {"rms": Rms(1e-10, 1e-11), "held_out": Rms(9e-10, 9e-11)},
     ],
 )
 def test_what_is_ordinary_raises_no_doubt(changes):
-    assert judge(replace(SOUND, **changes)).status == "good"
+    assert judge(changed(SOUND, **changes)).status == "good"
 
 
 def left_out(numbers, count=20):
     """Findings of views of which some disagree with the others."""
     seen = [replace(it, used=it.view not in numbers) for it in views(count)]
     out = [Rejection(at, f"disagrees with the other views: view {at}'s figures") for at in numbers]
-    return replace(SOUND, views=seen, disagreeing=out, lost=out)
+    pair = replace(PAIR, views=seen, disagreeing=out)
+    sensor = replace(SENSOR, used=count - len(out), lost=out, disagreeing=[*numbers])
+    return replace(SOUND, pairs=(pair,), sensors=(sensor,))
 
 
 @pytest.mark.parametrize(
@@ -176,7 +161,7 @@ def test_a_reason_is_told_once():
     reasons = judge(found).reasons
     assert sum("view 12's figures" in it for it in reasons) == 1
     assert "8 of 20 views are not used; all of them disagree with the others." in reasons
-    more = judge(replace(found, lost=[*found.lost, *LOST[:1]])).reasons
+    more = judge(changed(found, lost=[*found.sensors[0].lost, *LOST[:1]])).reasons
     assert any("; the first but for these: view 30, blurred: very." in it for it in more)
 
 
@@ -199,11 +184,11 @@ def test_figures_have_no_exponents(value, words):
 
 
 def test_a_scatter_that_settles_it_is_not_blamed_on_the_motion():
-    wild = replace(
+    wild = changed(
         SOUND,
         held_out=Rms(80.0, 5.0),
         rms=Rms(75.0, 4.8),
-        hand_eye=hand_eye(worst=directions(0.02, 0.02, 0.02, 0.02)),
+        worst=directions(0.02, 0.02, 0.02, 0.02),
     )
     verdict = judge(wild)
     assert verdict.status == "bad"
@@ -212,6 +197,6 @@ def test_a_scatter_that_settles_it_is_not_blamed_on_the_motion():
 
 
 def test_what_settles_it_comes_first():
-    verdict = judge(replace(SOUND, pixel_px=4.0, warnings=("Something.",), stops=8))
+    verdict = judge(changed(SOUND, pixel_px=4.0, warnings=("Something.",), stops=8))
     assert verdict.reasons[0].startswith("Corners deviate")
     assert len(verdict.reasons) == 3

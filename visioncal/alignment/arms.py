@@ -9,7 +9,7 @@ from visioncal.alignment.cell import Cell, robot_key
 from visioncal.estimation.arm import misfit_covariance, stops_of
 from visioncal.estimation.misfit import Drift, Neighbours, drift, inflation, neighbours
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution, covariance_of
+from visioncal.estimation.solve import Solution
 from visioncal.robot import Robot
 from visioncal.session import View
 from visioncal.session.loads import loads_of
@@ -88,13 +88,13 @@ def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
     return found
 
 
-def covariance_with_arms(
+def covariance_of_arms(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
     found: Mapping[str, Misfit],
-) -> FloatArray:
-    """Covariance (p, p) of a fit, with what is no noise of its robots.
+) -> dict[str, FloatArray]:
+    """Covariances (p, p) that a fit has of what is no noise of its robots, by their source.
 
     Args:
         problem: The observations that agree.
@@ -102,15 +102,16 @@ def covariance_with_arms(
         arms: The arms; errors that are no unknowns count.
         found: What their residuals show.
     """
-    spread = covariance_of(problem, fit)
+    parts = {}
     for robot, arm in arms.items():
         if arm.errors is not None and not arm.errors.is_estimated:
-            spread = spread + misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
+            errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
+            parts[f"arm {robot}"] = errors
     for robot, it in found.items():
         if it.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
-            spread = spread + more
-    return spread
+            parts[f"misfit of robot {robot}"] = more
+    return parts
 
 
 def doubts_of_arms(

@@ -1,7 +1,7 @@
 """What is wrong with observations that disagree, and what moved, for people."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from visioncal.estimation.closure import deviations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import by_noise_alone
 from visioncal.figures import figure
+from visioncal.files import some_of
 from visioncal.stages.validate import apart
 from visioncal.transforms import mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
@@ -22,8 +23,27 @@ from visioncal.types import FloatArray, IntArray, Mask
 _CHANCE, _NEAR = 1e-3, 4.0
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
-# Poses of one robot are exchanged where so many observations of the stops say so.
+# A robot's pose is wrong where so many observations of its stop say so.
 _FEWEST = 2
+
+
+# So many views of a fault are named.
+_LISTED = 8
+
+
+@dataclass(frozen=True)
+class PoseFault:
+    """What is wrong with the poses of a robot.
+
+    Attributes:
+        words: What it is, in sentences.
+        rows: The observations that it explains.
+        short: The same as a clause, for each of these; empty where the sentences are enough.
+    """
+
+    words: str
+    rows: tuple[int, ...]
+    short: str = ""
 
 
 @dataclass(frozen=True)
@@ -116,8 +136,32 @@ def moved_words(moved: Moved) -> str:
     )
 
 
-def pushed_bases(solved: Solved) -> list[str]:
-    """Words robots whose observations all disagree from some stop on, as one other place explains.
+def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
+    """Robots that were pushed, and poses of theirs that are exchanged or wrong."""
+    out = np.flatnonzero(~solved.agreed.used)
+    if not len(out):
+        return ()
+    found = _pushed_bases(solved)
+    found += _exchanged(solved, _mutual(solved, out, _fitting(solved, out)))
+    explained = {row for it in found for row in it.rows}
+    return (*found, *_wrong_poses(solved, explained))
+
+
+def _by_way_of(problem: Problem, robot: str) -> Mask:
+    """(n,) the observations between whose frames a robot is."""
+    found = np.zeros(len(problem), dtype=bool)
+    for group in problem.groups:
+        found[group.rows] = any(step.robot == robot for step in group.path)
+    return found
+
+
+def _views(solved: Solved, rows: Sequence[int]) -> str:
+    views = [str(solved.cell.rows[it].view) for it in rows]
+    return f"views {some_of(views, _LISTED)}"
+
+
+def _pushed_bases(solved: Solved) -> list[PoseFault]:
+    """Robots whose observations all disagree from some stop on, as one other place explains.
 
     Such observations are left out, and the base is where it stood before: a base is no frame that
     may be two, because all that its robot carries hangs on it.
@@ -127,31 +171,58 @@ def pushed_bases(solved: Solved) -> list[str]:
     for flange, branch in problem.tree.branches.items():
         if not branch.robot:
             continue
-        asked = problem.change_of(branch.parent, solved.agreed.fit.state)
-        mine = np.isfinite(asked[:, 0, 0])
+        mine = _by_way_of(problem, branch.robot)
         first = int(stops[mine & used].max(initial=-1)) + 1
-        after = mine & ~used & (stops >= first)
+        after = np.flatnonzero(mine & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
             continue
-        middle = mean_transform(asked[after])
-        shift_mm, turn_deg = pose_difference(np.eye(4), middle)
-        scatter_mm = 1e3 * float(np.median(deviations(asked[after])[0]))
-        alike = scatter_mm < _ALIKE * shift_mm
-        found.append(
-            f"All {int(after.sum())} views by way of {flange} from stop "
-            f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before"
-            + (
-                f", as if {branch.parent} had been pushed by {figure(shift_mm)} mm and "
-                f"{figure(turn_deg)} deg"
-                if alike
-                else ""
-            )
-            + f": {branch.parent} is where it stood before. Align the stops from there on alone."
+        moved = _moved_by(solved, branch.parent, after)
+        as_if = f", as if {branch.parent} had been pushed by {moved}" if moved else ""
+        words = (
+            f"All {len(after)} views by way of {flange} from stop "
+            f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
+            f"{branch.parent} is where it stood before. Align the stops from there on alone."
         )
+        found.append(PoseFault(words, tuple(after.tolist())))
     return found
 
 
-def reasons(solved: Solved) -> dict[int, str]:
+def _moved_by(solved: Solved, base: str, rows: IntArray) -> str:
+    """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
+    asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
+    shift_mm, turn_deg = pose_difference(np.eye(4), mean_transform(asked))
+    scatter_mm = 1e3 * float(np.median(deviations(asked)[0]))
+    return f"{figure(shift_mm)} mm and {figure(turn_deg)} deg" * (scatter_mm < _ALIKE * shift_mm)
+
+
+def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
+    """Stops at which all that was seen by way of a robot asks for it to stand elsewhere."""
+    problem, used = solved.agreed.problem, solved.agreed.used
+    stops = problem.observations.stops
+    for branch in problem.tree.branches.values():
+        if not branch.robot:
+            continue
+        mine = _by_way_of(problem, branch.robot)
+        for stop in np.unique(stops[mine & ~used]).tolist():
+            rows = np.flatnonzero(mine & (stops == stop))
+            if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
+                continue
+            moved = _moved_by(solved, branch.parent, rows)
+            if moved:
+                words = (
+                    f"Robot {branch.robot} did not stand at stop {solved.cell.stops[stop]} where "
+                    f"its pose says: all {len(rows)} views by way of it disagree with the others, "
+                    f"as if it had been moved by {moved}, and were left out "
+                    f"({_views(solved, rows.tolist())}). Correct its pose there, or leave the stop "
+                    "out."
+                )
+                short = (
+                    f"the pose of robot {branch.robot} at stop {solved.cell.stops[stop]} is wrong"
+                )
+                yield PoseFault(words, tuple(rows.tolist()), short)
+
+
+def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
     """Why observations that disagree are left out, by view, with what they fit instead."""
     agreed, rows = solved.agreed, solved.cell.rows
     out = np.flatnonzero(~agreed.used)
@@ -160,7 +231,7 @@ def reasons(solved: Solved) -> dict[int, str]:
     away = residuals(solved)[out]
     fitting = _fitting(solved, out)
     mutual = _mutual(solved, out, fitting)
-    robots = _exchanged_robots(solved, mutual)
+    robots = {row: it.short for it in faults if it.short for row in it.rows}
     found = {}
     for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
         words = f"disagrees with the rest of the cell by {figure(mm)} mm"
@@ -271,18 +342,12 @@ def _mutual(solved: Solved, out: IntArray, fitting: Mapping[int, Sequence[int]])
     return found
 
 
-def _exchanged_robots(solved: Solved, mutual: Mapping[int, int]) -> dict[int, str]:
-    """Observations that disagree because two poses of a robot are exchanged, in words."""
-    rows, problem = solved.cell.rows, solved.agreed.problem
-    ways = {(it.seer, it.seen): problem.tree.path(it.seer, it.seen) for it in rows}
-    used = solved.agreed.used
-    found: dict[int, str] = {}
+def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
+    """Pairs of poses of one robot that are exchanged."""
+    rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
+    found = []
     for robot in problem.robots:
-        mine = [
-            at
-            for at, it in enumerate(rows)
-            if any(step.robot == robot for step in ways[it.seer, it.seen])
-        ]
+        mine = np.flatnonzero(_by_way_of(problem, robot)).tolist()
         pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
         for at in mine:
             if at in mutual:
@@ -291,9 +356,11 @@ def _exchanged_robots(solved: Solved, mutual: Mapping[int, int]) -> dict[int, st
         for stations, members in pairs.items():
             at_both = [at for at in mine if rows[at].station in stations]
             if len(members) >= 2 * _FEWEST and not used[at_both].any():
-                stops = [solved.cell.stops[it] for it in stations]
+                first, second = (solved.cell.stops[it] for it in stations)
+                short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
                 words = (
-                    f"the poses of robot {robot} at stops {stops[0]} and {stops[1]} are exchanged"
+                    f"{short[0].upper()}{short[1:]}: {_views(solved, at_both)} were left out. Each "
+                    "pose is right at the other's stop."
                 )
-                found |= dict.fromkeys(members, words)
+                found.append(PoseFault(words, tuple(at_both), short))
     return found

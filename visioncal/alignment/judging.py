@@ -1,51 +1,140 @@
-"""Whether the alignment of a cell can be trusted, and which link of it is the weakest."""
+"""What a whole cell is judged by: its cameras, robots and targets, and its weakest link."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from visioncal.alignment.cell import Cell
-from visioncal.alignment.faults import moved_words
+from visioncal.alignment.faults import PoseFault
 from visioncal.alignment.solving import Solved
-from visioncal.calibration import Edge, Moved, Untied, Verdict, VerdictStatus
+from visioncal.calibration import Edge, Sight
+from visioncal.calibration.whole import left_out_rms, rms_of, view_results
 from visioncal.errors import DegenerateError
-from visioncal.estimation.observability import (
-    SIGMA_LIMIT_M,
-    SIGMA_LIMIT_RAD,
-    Direction,
-    axis_words,
-)
+from visioncal.estimation.arm import stops_of
+from visioncal.estimation.budget import radius95
+from visioncal.estimation.observability import Direction, edge_directions
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.stages.found import noise_words
-from visioncal.types import FloatArray
+from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.types import FloatArray, Rejection
 
 # A board whose size is off by more of its own sigmas than this is another than was stated.
 _SIZE_SIGMAS = 3.0
+_HELD_BACK = "held back"
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Where doubt begins and where trust ends: (check, bad) limits.
+def findings_of(
+    solved: Solved,
+    sights: Sequence[Sight],
+    faults: Sequence[PoseFault],
+    edges: Mapping[str, Edge],
+    budget_mm: Mapping[str, Mapping[str, float]],
+    noise: Mapping[str, Mapping[str, float]],
+    *,
+    spared: Collection[int],
+    warnings: Sequence[str],
+    notes: Sequence[str],
+) -> Findings:
+    """Puts together what a whole cell is judged by.
 
-    Attributes:
-        sigma_mm: Sigma of a frame's place [mm].
-        sigma_deg: The same in rotation [deg].
-        pixel_px: Noise of a corner's coordinate [px].
-        robot_mm: Error of a flange from stop to stop [mm].
-        level: How much more a camera's poses scatter than its corners say.
-        stops: Stops in the fit; fewer leave too little to check the result with.
-        left_out: Share of observations that disagree.
+    Args:
+        solved: The fit.
+        sights: What became of each observation.
+        faults: What of them wrong poses of robots explain.
+        edges: The transforms by the frames that they place.
+        budget_mm: What these are uncertain by, by source.
+        noise: Estimated standard deviations, by frame or robot.
+        spared: Views that are not needed.
+        warnings: Reasons for doubt that were found before.
+        notes: What is good to know.
     """
+    tree = solved.cell.tree
+    tied = [it for it in sights if {it.seer, it.seen} <= tree.branches.keys()]
+    explained = {solved.cell.rows[row].view for it in faults for row in it.rows}
+    directions = [
+        it for frame, edge in edges.items() for it in _directions(solved.cell, frame, edge)
+    ]
+    return Findings(
+        _pairs(tied, explained),
+        _sensors(tied, noise, spared),
+        _arms(solved, noise),
+        sorted(directions, key=lambda it: (it.is_rotation, -it.sigma)),
+        [
+            Place(frame, budget_mm[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
+            for frame, edge in edges.items()
+        ],
+        (*(it.words for it in faults), *warnings),
+        notes,
+        "instrument" if all(it.seer.startswith("instrument") for it in tied) else "eye-to-hand",
+    )
 
-    sigma_mm: tuple[float, float] = (1.0, 3.0)
-    sigma_deg: tuple[float, float] = (0.1, 0.3)
-    pixel_px: tuple[float, float] = (0.7, 3.0)
-    robot_mm: float = 0.2
-    level: float = 2.0
-    stops: tuple[int, int] = (10, 5)
-    left_out: tuple[float, float] = (0.25, 0.6)
+
+def _pairs(sights: Sequence[Sight], explained: Collection[int]) -> list[Pair]:
+    rows: dict[tuple[str, str], list[Sight]] = {}
+    for it in sights:
+        rows.setdefault((it.seer, it.seen), []).append(it)
+    return [
+        Pair(
+            view_results(mine),
+            rms_of(mine),
+            left_out_rms(mine),
+            disagreeing=[
+                Rejection(it.view, it.reason)
+                for it in mine
+                if _disagrees(it) and it.view not in explained
+            ],
+            name=f"{seer} of {seen}" if len(rows) > 1 else "",
+        )
+        for (seer, seen), mine in rows.items()
+    ]
+
+
+def _disagrees(sight: Sight) -> bool:
+    """Whether an observation was left out although its chain could be closed."""
+    return not sight.used and sight.residual_mm is not None
+
+
+def _sensors(
+    sights: Sequence[Sight], noise: Mapping[str, Mapping[str, float]], spared: Collection[int]
+) -> list[Sensor]:
+    seers = dict.fromkeys(it.seer for it in sights)
+    found = []
+    for seer in seers:
+        mine = [it for it in sights if it.seer == seer]
+        lost = [
+            Rejection(it.view, it.reason)
+            for it in mine
+            if not it.used and it.view not in spared and not it.reason.startswith(_HELD_BACK)
+        ]
+        levels = noise.get(seer, {})
+        found.append(
+            Sensor(
+                sum(it.used for it in mine),
+                lost,
+                [it.view for it in mine if _disagrees(it)],
+                levels.get("pixel_px"),
+                levels.get("level", 1.0),
+                seer if len(seers) > 1 else "",
+            )
+        )
+    return found
+
+
+def _arms(solved: Solved, noise: Mapping[str, Mapping[str, float]]) -> list[Arm]:
+    part = solved.agreed.problem.subset(solved.agreed.used)
+    modelled = {name or "robot" for name in solved.cell.session.robot_documents}
+    return [
+        Arm(
+            len(stops_of(part, robot)),
+            noise[robot]["translation_mm"],
+            noise[robot]["rotation_deg"],
+            errs=robot in solved.arms and solved.arms[robot].errors is not None,
+            modelled=robot in modelled,
+            name=robot if len(part.robots) > 1 else "",
+        )
+        for robot in part.robots
+    ]
 
 
 def check_determined(cell: Cell, edges: Mapping[str, Edge]) -> None:
@@ -59,26 +148,27 @@ def check_determined(cell: Cell, edges: Mapping[str, Edge]) -> None:
         DegenerateError: A direction's sigma is over the limit, or it is not determined at all.
     """
     for name, edge in edges.items():
-        worst = worst_direction(edge)
+        worst = worst_direction(cell, name, edge)
         if worst.sigma > worst.limit:
             raise DegenerateError(
-                f"align: {name}: {worst.words} has a predicted sigma of {worst.figure}.",
+                f"align: {worst.words} has a predicted sigma of {worst.figure}.",
                 culprits=[name],
                 next_step=_more(cell, name),
             )
 
 
-def worst_direction(edge: Edge) -> Direction:
-    """Finds it, in the axes of the frame that the transform hangs on."""
-    found = []
-    for is_rotation in (False, True):
-        at = slice(0, 3) if is_rotation else slice(3, 6)
-        values, vectors = np.linalg.eigh(edge.covariance[at, at])
-        axis = axis_words(edge.matrix[:3, :3] @ vectors[:, -1])
-        words = f"its rotation about {axis}" if is_rotation else f"its offset along {axis}"
-        limit = float(SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M)
-        found.append(Direction(words, float(np.sqrt(max(values[-1], 0.0))), limit, is_rotation))
+def worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
+    """The direction of a frame that is known worst, in the axes of the frame that it hangs on."""
+    found = _directions(cell, frame, edge)
     return max(found, key=lambda it: it.sigma / it.limit)
+
+
+def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
+    """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
+    parent = cell.tree.branches[frame].parent
+    named = "the cell" if parent == cell.tree.root else parent
+    found = edge_directions(edge.matrix, edge.covariance, frame, named)
+    return [it for it in found if edge.oriented or not it.is_rotation]
 
 
 def _more(cell: Cell, frame: str) -> str:
@@ -108,12 +198,10 @@ def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
     if not edges:
         return ""
     name, edge = max(edges.items(), key=lambda it: it[1].sigma_mm)
-    worst = worst_direction(edge)
+    worst = worst_direction(cell, name, edge)
     return (
         f"The weakest link is {name}: sigma {figure(edge.sigma_mm)} mm and "
-        f"{figure(edge.sigma_deg)} deg, most of it in {worst.words} of "
-        f"{cell.tree.branches[name].parent if name in cell.tree.branches else 'its parent'}. "
-        f"{_resting(cell, name)}"
+        f"{figure(edge.sigma_deg)} deg, most of it in {worst.words}. {_resting(cell, name)}"
     )
 
 
@@ -126,113 +214,6 @@ def _resting(cell: Cell, frame: str) -> str:
         pairs[key] = pairs.get(key, 0) + 1
     least = sorted(pairs.items(), key=lambda it: it[1])
     return f"It rests on {some_of([f'{count} views by {key}' for key, count in least], 4)}."
-
-
-def judge(
-    solved: Solved,
-    edges: Mapping[str, Edge],
-    noise: Mapping[str, Mapping[str, float]],
-    moved: Sequence[Moved],
-    untied: Sequence[Untied],
-    warnings: Sequence[str],
-    notes: Sequence[str] = (),
-    limits: Limits | None = None,
-) -> Verdict:
-    """Judges an alignment.
-
-    Args:
-        solved: The fit.
-        edges: The transforms by the frames that they place.
-        noise: Estimated standard deviations.
-        moved: What moved.
-        untied: What nothing ties.
-        warnings: Reasons for doubt that were found before.
-        notes: What is good to know.
-        limits: Where doubt begins.
-    """
-    limits = limits or Limits()
-    doubts: list[tuple[VerdictStatus, str]] = [("check", it) for it in warnings]
-    doubts += [("good", it) for it in notes]
-    doubts += [("check", moved_words(it)) for it in moved]
-    doubts += [("check", f"{it.frame} is tied to nothing. {it.remedy}") for it in untied]
-    doubts += _weak(solved.cell, edges, limits)
-    doubts += _noisy(noise, limits)
-    stops = len(np.unique(solved.agreed.problem.observations.stops[solved.agreed.used]))
-    if stops < limits.stops[0]:
-        words = f"{stops} stops leave little to check the result with: record {limits.stops[0]}."
-        doubts.append(("bad" if stops < limits.stops[1] else "check", words))
-    out = int(np.sum(~solved.agreed.used))
-    if out:
-        status = _beyond(out / len(solved.agreed.used), limits.left_out) or "good"
-        doubts.append(
-            (
-                status,
-                f"{out} of {len(solved.agreed.used)} observations disagree with the rest and are "
-                "left out: see what is said of each.",
-            )
-        )
-    grades: tuple[VerdictStatus, ...] = ("bad", "check")
-    for grade in grades:
-        if any(it == grade for it, _ in doubts):
-            return Verdict(grade, tuple(words for _, words in doubts))
-    agreed = (
-        f"All {len(edges)} frames are tied, and {int(solved.agreed.used.sum())} observations agree."
-    )
-    return Verdict("good", (agreed, *(words for _, words in doubts)))
-
-
-def _weak(cell: Cell, edges: Mapping[str, Edge], limits: Limits) -> list[tuple[VerdictStatus, str]]:
-    found: list[tuple[VerdictStatus, str]] = []
-    for name, edge in edges.items():
-        status = _beyond(edge.sigma_mm, limits.sigma_mm) or _beyond(
-            edge.sigma_deg, limits.sigma_deg
-        )
-        if status:
-            words = (
-                f"{name} is known to {figure(edge.sigma_mm)} mm and {figure(edge.sigma_deg)} deg "
-                f"only. {_more(cell, name)}"
-            )
-            found.append((status, words))
-    return found
-
-
-def _beyond(value: float, limits: tuple[float, float]) -> VerdictStatus | None:
-    if value > limits[1]:
-        return "bad"
-    return "check" if value > limits[0] else None
-
-
-def _noisy(
-    noise: Mapping[str, Mapping[str, float]], limits: Limits
-) -> list[tuple[VerdictStatus, str]]:
-    found: list[tuple[VerdictStatus, str]] = []
-    for name, levels in noise.items():
-        pixel, robot = levels.get("pixel_px", 0.0), levels.get("translation_mm", 0.0)
-        status = _beyond(pixel, limits.pixel_px)
-        if status:
-            found.append(
-                (status, f"{name}: corners scatter by {figure(pixel)} px; 0.05 to 0.3 are usual.")
-            )
-        level = levels.get("level", 1.0)
-        if "pixel_px" in levels and level > limits.level:
-            found.append(
-                (
-                    "check",
-                    f"{name}: its poses scatter {figure(level)} times as much as its corners say: "
-                    "squares of few pixels, blur, or a lens that is not as stated. Go nearer, or "
-                    "show it larger squares.",
-                )
-            )
-        if robot > limits.robot_mm and not name.startswith("cam"):
-            found.append(
-                (
-                    "check",
-                    f"Robot {name} errs by {figure(robot)} mm from stop to stop; arms repeat to "
-                    "0.1 mm or better. Its kinematics may be behind it, or poses that belong to "
-                    "other images: calibrate it by itself.",
-                )
-            )
-    return found
 
 
 def noise_warnings(solved: Solved) -> list[str]:

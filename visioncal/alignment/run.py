@@ -1,6 +1,6 @@
 """Aligning a whole cell: the way from a session to its frames, each with respect to all others."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.alignment.arms import (
     LEVELS,
     Misfit,
-    covariance_with_arms,
+    covariance_of_arms,
     doubts_of_arms,
     misfits,
     notes_on_arms,
@@ -19,16 +19,18 @@ from visioncal.alignment.arms import (
 from visioncal.alignment.cell import Cell, read_cell, robot_key
 from visioncal.alignment.clocks import Clocks, Pair, set_clocks
 from visioncal.alignment.faults import (
+    PoseFault,
     Version,
+    moved_words,
     movements,
-    pushed_bases,
+    pose_faults,
     reasons,
     residuals,
     versions,
 )
 from visioncal.alignment.judging import (
     check_determined,
-    judge,
+    findings_of,
     noise_warnings,
     size_warnings,
     weakest_link,
@@ -40,8 +42,10 @@ from visioncal.alignment.unseen import budget_mm, left_out
 from visioncal.alignment.written import corner_residuals, fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
+from visioncal.estimation.solve import covariance_of
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
+from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.offset import Clock
 from visioncal.stages.validate import HeldOut
@@ -107,7 +111,8 @@ def alignment_of(
     agreed = solved.agreed
     problem = agreed.problem
     found = misfits(problem.subset(agreed.used), agreed.fit)
-    spread = covariance_with_arms(problem.subset(agreed.used), agreed.fit, solved.arms, found)
+    parts = covariance_of_arms(problem.subset(agreed.used), agreed.fit, solved.arms, found)
+    spread = sum(parts.values(), covariance_of(problem.subset(agreed.used), agreed.fit))
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
@@ -118,12 +123,27 @@ def alignment_of(
         for name, it in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
-    moved, noise, held_out = movements(solved), _noise(solved), left_out(solved)
-    budget = {
-        f"{parents[it.name]}_from_{it.name}": mm
-        for it, mm in ((named[key], mm) for key, mm in budget_mm(solved).items())
-    }
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
+    moved, noise, faults = movements(solved), _noise(solved), pose_faults(solved)
+    held_out = left_out(solved)
+    sights = _sights(cell, solved, held_out, faults)
+    budget = {named[key].name: mm for key, mm in budget_mm(solved, parts).items()}
+    findings = findings_of(
+        solved,
+        sights,
+        faults,
+        last,
+        budget,
+        noise,
+        spared={view for it in clocks.found.values() for view in it.spared},
+        warnings=[
+            *clocks.warnings,
+            *_warnings(solved, looked, spread, found),
+            *(moved_words(it) for it in moved),
+            *(f"{it.frame} is tied to nothing. {it.remedy}" for it in untied),
+        ],
+        notes=(*clocks.notes, *_clock_words(clocks, solved, spread), *notes_on_arms(solved.arms)),
+    )
     return Alignment(
         session_name=session.name,
         session_sha256=session.digest(),
@@ -135,26 +155,20 @@ def alignment_of(
         joint_covariance=spread[: 6 * len(edges), : 6 * len(edges)],
         cameras=_cameras(solved, looked, spread, len(edges)),
         noise=noise,
-        sights=_sights(cell, solved, held_out),
+        sights=sights,
         left_out=held_out.method if np.isfinite(held_out.away_m).any() else "",
         moved=moved,
         untied=untied,
         weakest=weakest_link(solved.cell, last),
-        verdict=judge(
-            solved,
-            last,
-            noise,
-            moved,
-            untied,
-            [*clocks.warnings, *_warnings(solved, looked, spread, found)],
-            (*clocks.notes, *_clock_words(clocks, solved, spread), *notes_on_arms(solved.arms)),
-        ),
+        verdict=judge(findings),
         details=_details(clocks, solved, spread),
         arms=_arms(session, solved, spread),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
         stages={
             **fit_sections(session, solved, spread, len(edges)),
-            "uncertainty": {"budget_mm": budget},
+            "uncertainty": {
+                "budget_mm": {f"{parents[it]}_from_{it}": mm for it, mm in budget.items()}
+            },
         },
     )
 
@@ -180,7 +194,6 @@ def _warnings(
     measured = components(used, agreed.fit.state, spread, solved.cell.priors)
     return [
         *doubts_of_arms(solved.arms, found, solved.asked),
-        *pushed_bases(solved),
         *solved.cell.session.warnings,
         *looked.warnings,
         *noise_warnings(solved),
@@ -290,10 +303,12 @@ def _cameras(
     return found
 
 
-def _sights(cell: Cell, solved: Solved, held_out: HeldOut) -> tuple[Sight, ...]:
+def _sights(
+    cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
+) -> tuple[Sight, ...]:
     """What became of each observation, in the order of the session's rows."""
     rows, used = solved.cell.rows, solved.agreed.used
-    away, why = residuals(solved), reasons(solved)
+    away, why = residuals(solved), reasons(solved, faults)
     corners = corner_residuals(solved, solved.agreed.fit.state, np.arange(len(rows)))
     unseen = np.full((len(rows), 3), np.nan)
     unseen[used] = np.stack(

@@ -1,5 +1,7 @@
 """Observations of a whole cell that no fit has seen, and what its uncertainty is made of."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from visioncal.alignment.solving import Solved
@@ -34,11 +36,18 @@ def left_out(solved: Solved) -> HeldOut:
     return validate(problem, stops, needs, again, pixels)
 
 
-def budget_mm(solved: Solved) -> dict[str, dict[str, float]]:
-    """Sigmas of each unknown frame's place in its parent, by source and as a `total` [mm]."""
+def budget_mm(solved: Solved, of_arms: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+    """Sigmas of each unknown frame's place in its parent, by source and as a `total` [mm].
+
+    Args:
+        solved: The fit.
+        of_arms: (p, p) what counts beside its noise, by source.
+    """
     fit, part = solved.agreed.fit, solved.agreed.problem.subset(solved.agreed.used)
     parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
-    parts["total"] = sum(parts.values(), np.zeros((6 * len(part.unknown),) * 2))
+    size = 6 * len(part.unknown)
+    parts |= {name: it[:size, :size] for name, it in of_arms.items()}
+    parts["total"] = sum(parts.values(), np.zeros((size, size)))
     found: dict[str, dict[str, float]] = {}
     for key in part.unknown:
         at = part.edge_columns(key).start

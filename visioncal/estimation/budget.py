@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from visioncal.chance import chi2_limit
 from visioncal.estimation.linalg import covariance_among, gram
 from visioncal.estimation.problem import Linear, Noise, Problem, State
 from visioncal.estimation.solve import fisher_information
@@ -123,6 +124,17 @@ def _by_errors(
         part = by_unit[unit].T @ errors[unit] @ by_unit[unit]
         found.append((sources.sensors[frame], part))
     return found
+
+
+def radius95(spread: FloatArray) -> float:
+    """Radius of the ball that holds a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
+    values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
+    first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
+    if not third > 0.0:
+        return 0.0
+    freedom = second**3 / third**2
+    quantile = (chi2_limit(0.05, freedom) - freedom) * np.sqrt(second / freedom) + first
+    return float(np.sqrt(max(quantile, 0.0)))
 
 
 def point_covariance(edge: FloatArray, spread: FloatArray, point: FloatArray) -> FloatArray:

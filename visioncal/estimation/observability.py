@@ -157,18 +157,36 @@ def directions(
         mount: Where the camera is.
         boards: The boards, where there are several.
     """
-    found = []
+    found: list[Direction] = []
     placed = place(boards, edges)
     spread = placed.covariance(spread)
     for edge, transform in enumerate((edges.x, *placed.z)):
-        for is_rotation in (False, True):
-            start = 6 * edge + (0 if is_rotation else 3)
-            block = spread[start : start + 3, start : start + 3]
-            values, vectors = np.linalg.eigh(block)
-            limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
-            words = _words(edge, transform[:3, :3] @ vectors[:, -1], mount, is_rotation, boards)
-            found.append(Direction(words, float(np.sqrt(values[-1])), float(limit), is_rotation))
+        block = spread[6 * edge : 6 * edge + 6, 6 * edge : 6 * edge + 6]
+        thing, frame = _names(edge, mount, boards)
+        found += edge_directions(transform, block, f"the {thing}", f"the {frame}")
     return tuple(found)
+
+
+def edge_directions(
+    matrix: FloatArray, spread: FloatArray, thing: str, frame: str
+) -> tuple[Direction, Direction]:
+    """The worst directions of an edge: of its offset, and of its rotation.
+
+    Args:
+        matrix: (4, 4) the edge.
+        spread: (6, 6) its covariance.
+        thing: What it places, in words.
+        frame: The frame that this hangs on, in words.
+    """
+    found = []
+    for is_rotation in (False, True):
+        at = slice(0, 3) if is_rotation else slice(3, 6)
+        values, vectors = np.linalg.eigh(spread[at, at])
+        limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
+        words = _words(thing, frame, matrix[:3, :3] @ vectors[:, -1], is_rotation)
+        sigma = float(np.sqrt(max(values[-1], 0.0)))
+        found.append(Direction(words, sigma, float(limit), is_rotation))
+    return found[0], found[1]
 
 
 def refuse_too_few(data: Closure, views: int = 1) -> None:
@@ -223,21 +241,18 @@ def _open_part(
     vectors, sizes, _ = np.linalg.svd(directions)
     # Null vectors have unit length over all twelve unknowns, a radian counting as a metre.
     rank = int(np.sum(sizes > _PART_OF_NULL))
+    thing, frame = _names(edge, mount, boards)
     if rank == 1:
-        return _words(edge, vectors[:, 0], mount, is_rotation, boards)
+        return _words(f"the {thing}", f"the {frame}", vectors[:, 0], is_rotation)
     if rank == 0:
         return ""
-    thing, frame = _names(edge, mount, boards)
     return f"the {thing}'s {'rotation' if is_rotation else 'offset from the ' + frame}"
 
 
-def _words(
-    edge: int, direction: FloatArray, mount: Mount, is_rotation: bool, boards: Boards
-) -> str:
+def _words(thing: str, frame: str, direction: FloatArray, is_rotation: bool) -> str:
     """Says which component of which edge a direction in the edge's parent frame is."""
-    thing, frame = _names(edge, mount, boards)
     quantity = "rotation about" if is_rotation else "offset along"
-    return f"the {thing}'s {quantity} the {frame}'s {axis_words(direction)}"
+    return f"{thing}'s {quantity} {frame}'s {axis_words(direction)}"
 
 
 def _names(edge: int, mount: Mount, boards: Boards) -> tuple[str, str]:

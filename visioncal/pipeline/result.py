@@ -182,9 +182,9 @@ def result_of(known: Known) -> Calibration:
             for name, it in _solutions(known).items()
         },
         noise=_noise(known),
-        views=tuple(findings.views),
+        views=tuple(findings.pairs[0].views),
         rms=findings.rms,
-        validation=Validation(held.method, findings.held_out, findings.holdout),
+        validation=Validation(held.method, findings.held_out, findings.pairs[0].holdout),
         verdict=verdict,
         camera=_camera(known),
         robot=known.robot,

@@ -33,7 +33,8 @@ from visioncal.stages.detect import detect
 from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.intrinsics import estimate_intrinsics
-from visioncal.stages.judge import Findings, judge
+from visioncal.stages.judge import Arm as ArmFindings
+from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked
 from visioncal.stages.measured import components
 from visioncal.stages.motion import waits_for_clock
@@ -410,28 +411,35 @@ def _judge(known: Known) -> Known:
     held, diagnosis, agreed = known.held_out, known.diagnosis, known.agreed
     if held is None or diagnosis is None or agreed is None:
         raise RuntimeError("the verdict comes before what it is made of")
-    telling = known.telling
-    findings = Findings(
-        views=view_results(known),
-        stops=len(np.unique(known.stops)),
-        lost=[
-            Rejection(view, reason)
-            for view, reason in known.reasons.items()
-            if view not in known.held_back
-        ],
-        disagreeing=agreed.rejections,
-        hand_eye=known.solved,
-        rms=used_rms(known),
-        held_out=rms_of(held.away_m, held.away_rad, held.rms_px),
-        holdout=holdout_rms(known),
-        pixel_px=known.pixel_px,
-        robot=known.robot_noise,
-        diagnosis=diagnosis,
-        warnings=known.warnings,
-        notes=known.notes,
+    telling, noise, views = known.telling, known.robot_noise, view_results(known)
+    lost = [Rejection(*it) for it in known.reasons.items() if it[0] not in known.held_back]
+    pair = Pair(
+        views,
+        used_rms(known),
+        rms_of(held.away_m, held.away_rad, held.rms_px),
+        holdout_rms(known),
+        agreed.rejections,
+    )
+    sensor = Sensor(
+        sum(it.used for it in views), lost, [it.view for it in agreed.rejections], known.pixel_px
+    )
+    arm = ArmFindings(
+        len(np.unique(known.stops)),
+        None if noise is None else 1e3 * noise.sigma_m,
+        None if noise is None else float(np.rad2deg(noise.sigma_rad)),
+        errs=diagnosis.arm is not None,
         workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
-        mount=known.session.mount,
         modelled=known.robot is not None,
+    )
+    findings = Findings(
+        (pair,),
+        (sensor,),
+        (arm,),
+        known.solved.worst,
+        (Place("Where the views look, a point", diagnosis.budget_mm, diagnosis.radius95_mm),),
+        known.warnings,
+        known.notes,
+        known.session.mount,
     )
     return replace(known, findings=findings, verdict=judge(findings))
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from visioncal.calibration import Calibration, ViewResult
 from visioncal.figures import significant
-from visioncal.stages.judge import JudgeOptions
+from visioncal.stages.judge import Limits
 
 # Views whose residual is this many times the median are named, as by the verdict.
-_STANDS_OUT = JudgeOptions.outlier
+_STANDS_OUT = Limits.outlier
 # Sentences of a verdict that start so say what to do.
 _IMPERATIVE = re.compile("(Add|Check|Compare|Let|Look|Measure|Move|Print|Record|Take|Use) ")
 # And one that starts so is about views that disagree.

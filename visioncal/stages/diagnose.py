@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.chance import chi2_limit
 from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
 from visioncal.estimation.boards import Boards
-from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance
+from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.closure import Closure, fit_closure
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
@@ -101,7 +100,7 @@ def diagnose(
     return Diagnosis(
         point,
         {name: 1e3 * _length(it) for name, it in at_work.items()},
-        1e3 * _radius95(at_work["total"]),
+        1e3 * radius95(at_work["total"]),
         intervals,
         _spectrum(inflation * result.covariance[:12, :12]),
         inflation,
@@ -150,17 +149,6 @@ def _length(spread: FloatArray) -> float:
     # Errors of lens and board hang together; each takes half of what is common, which may leave one
     # of them less than nothing.
     return float(np.sqrt(max(np.trace(spread), 0.0)))
-
-
-def _radius95(spread: FloatArray) -> float:
-    """Radius of the ball that holds a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
-    values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
-    first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
-    if not third > 0.0:
-        return 0.0
-    freedom = second**3 / third**2
-    quantile = (chi2_limit(0.05, freedom) - freedom) * np.sqrt(second / freedom) + first
-    return float(np.sqrt(max(quantile, 0.0)))
 
 
 def _spectrum(spread: FloatArray) -> FloatArray:

@@ -1,15 +1,13 @@
-"""Whether the result can be trusted, in plain sentences."""
+"""Whether a result can be trusted, in plain sentences: of one camera and robot, or of many."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.observability import Direction
 from visioncal.figures import figure
-from visioncal.stages.diagnose import Diagnosis
-from visioncal.stages.handeye import HandEyeResult
 from visioncal.stages.proposing import with_proposal
 from visioncal.types import Mount, Rejection
 
@@ -31,7 +29,7 @@ _LEAST_RUN = 3
 
 
 @dataclass(frozen=True)
-class JudgeOptions:
+class Limits:
     """Where doubt begins and where trust ends: (check, bad) limits.
 
     Attributes:
@@ -40,6 +38,7 @@ class JudgeOptions:
         sigma_mm: Predicted sigma of the worst direction of an edge [mm].
         sigma_deg: The same in rotation [deg].
         pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
+        level: How much more a camera's poses scatter than its corners say.
         robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and
             what is beyond is seldom independent from stop to stop, as the covariance takes it.
         robot_deg: The same in rotation [deg].
@@ -55,6 +54,7 @@ class JudgeOptions:
     sigma_mm: tuple[float, float] = (1.0, 3.0)
     sigma_deg: tuple[float, float] = (0.1, 0.3)
     pixel_px: tuple[float, float] = (0.7, 3.0)
+    level: float = 2.0
     robot_mm: float = 0.2
     robot_deg: float = 0.02
     stops: tuple[int, int] = (10, 5)
@@ -65,45 +65,136 @@ class JudgeOptions:
 
 
 @dataclass(frozen=True)
+class Pair:
+    """What one camera or instrument saw of one target.
+
+    Attributes:
+        views: What became of each view.
+        rms: Residuals of the used ones.
+        held_out: Residuals of these, left out in turn.
+        holdout: Residuals of those held back by the session; None where there are none.
+        disagreeing: Those whose robot pose and image do not belong together.
+        name: Both, by name; empty where there are no others.
+    """
+
+    views: Sequence[ViewResult]
+    rms: Rms
+    held_out: Rms
+    holdout: Rms | None = None
+    disagreeing: Sequence[Rejection] = ()
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A camera or an instrument.
+
+    Attributes:
+        used: How many of its views are used.
+        lost: Those that could not be; those held back on purpose are not among them.
+        disagreeing: How many of these have a robot pose and an image that do not belong together.
+        pixel_px: Noise of a corner's coordinate; None without images [px].
+        level: By how much more its poses scatter than their noise says.
+        name: Its frame; empty where there is no other.
+    """
+
+    used: int
+    lost: Sequence[Rejection] = ()
+    disagreeing: Sequence[int] = ()
+    pixel_px: float | None = None
+    level: float = 1.0
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A robot.
+
+    Attributes:
+        stops: At how many stops it has a part in the fit.
+        away_mm: Noise of its flange; None where that cannot be told from the cameras' [mm].
+        away_deg: The same in rotation [deg].
+        errs: Whether its errors follow its posture, which is said elsewhere.
+        workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
+            the median; None for a nominal arm [mm].
+        modelled: Whether its model is known.
+        name: Its name; empty where there is no other.
+    """
+
+    stops: int
+    away_mm: float | None = None
+    away_deg: float | None = None
+    errs: bool = False
+    workspace_mm: float | None = None
+    modelled: bool = False
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """How well a place is known where it counts.
+
+    Attributes:
+        words: What it is, in words.
+        budget_mm: Its standard deviation by source, and as a `total` [mm].
+        radius95_mm: It is right to within this in 95 % of cases [mm].
+    """
+
+    words: str
+    budget_mm: Mapping[str, float]
+    radius95_mm: float
+
+
+@dataclass(frozen=True)
 class Findings:
     """What the verdict is made of.
 
     Attributes:
-        views: What became of each view.
-        stops: Number of the robot's stops in the fit.
-        lost: Views that could not be used; those held back on purpose are not among them.
-        disagreeing: Those of them whose robot pose and image do not belong together.
-        hand_eye: The fit.
-        rms: Residuals of the used views.
-        held_out: Residuals of views left out in turn.
-        holdout: Residuals of views held back by the session; None where there are none.
-        pixel_px: Noise of a corner's coordinate; None without images [px].
-        robot: Noise of the flange; None where it cannot be told from the camera's.
-        diagnosis: What the residuals show beyond noise, and where the uncertainty comes from.
+        pairs: What each camera saw of each target.
+        sensors: The cameras and instruments.
+        arms: The robots.
+        worst: The worst directions of all unknown edges; the first is told of in a good verdict.
+        places: How well places are known.
         warnings: What earlier stages had to say.
         notes: What of it is no reason for doubt.
-        workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
-            the median; None for a nominal arm [mm].
         mount: What observed whom.
-        modelled: Whether the robot's model is known.
     """
 
-    views: Sequence[ViewResult]
-    stops: int
-    lost: Sequence[Rejection]
-    disagreeing: Sequence[Rejection]
-    hand_eye: HandEyeResult
-    rms: Rms
-    held_out: Rms
-    holdout: Rms | None
-    pixel_px: float | None
-    robot: Noise | None
-    diagnosis: Diagnosis
-    warnings: Sequence[str]
+    pairs: Sequence[Pair]
+    sensors: Sequence[Sensor]
+    arms: Sequence[Arm]
+    worst: Sequence[Direction]
+    places: Sequence[Place]
+    warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
-    workspace_mm: float | None = None
     mount: Mount = "eye-in-hand"
-    modelled: bool = False
+
+    @property
+    def rms(self) -> Rms:
+        """Residuals of all used views."""
+        return self._pooled(lambda it: it.rms)
+
+    @property
+    def held_out(self) -> Rms:
+        """Residuals of all of them, left out in turn."""
+        return self._pooled(lambda it: it.held_out)
+
+    def _pooled(self, of: Callable[[Pair], Rms]) -> Rms:
+        if len(self.pairs) == 1:
+            return of(self.pairs[0])
+        counts = np.array([sum(view.used for view in it.views) for it in self.pairs])
+
+        def pooled(values: Sequence[float | None]) -> float | None:
+            known = [
+                (it, count) for it, count in zip(values, counts, strict=True) if it is not None
+            ]
+            if not any(count for _, count in known):
+                return None
+            squares, weights = np.array(known).T
+            return float(np.sqrt(np.average(squares**2, weights=weights)))
+
+        each = [of(it) for it in self.pairs]
+        return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
 
 
 @dataclass(frozen=True)
@@ -114,28 +205,30 @@ class _Doubt:
     is_fatal: bool = False
 
 
-def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
+def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
     """Says whether the result can be trusted, why, and what to do next.
 
     Args:
         findings: What is known.
-        options: Where doubt begins.
+        limits: Where doubt begins.
 
     Returns:
         `bad` with a reason that settles it, `check` with doubts, `good` without.
     """
-    options = options or JudgeOptions()
-    scatter = list(_scatter_doubts(findings, options))
+    limits = limits or Limits()
+    scatter = list(_scatter_doubts(findings, limits))
+    pairs, sensors = findings.pairs, findings.sensors
     doubts = [
         *scatter,
-        *_disagreement_doubts(findings),
-        *_outlier_doubts(findings, options),
-        *_holdout_doubts(findings, options),
+        *(doubt for it in pairs for doubt in _disagreement_doubts(it)),
+        *_outlier_doubts(findings, limits),
+        *(doubt for it in pairs for doubt in _holdout_doubts(it, findings.mount, limits)),
         # Views that disagree wildly have no sigma worth a word about the motion.
-        *([] if any(it.is_fatal for it in scatter) else _worth_doubts(findings, options)),
-        *_view_doubts(findings, options),
-        *_pixel_doubts(findings, options),
-        *([] if scatter else _robot_doubts(findings, options)),
+        *([] if any(it.is_fatal for it in scatter) else _worth_doubts(findings, limits)),
+        *_stop_doubts(findings, limits),
+        *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
+        *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
+        *([] if scatter else _robot_doubts(findings, limits)),
         *(_Doubt(sentence) for sentence in findings.warnings),
     ]
     if not doubts:
@@ -143,18 +236,25 @@ def judge(findings: Findings, options: JudgeOptions | None = None) -> Verdict:
     status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
     ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     sentences = tuple(doubt.sentence for doubt in ordered)
-    if findings.pixel_px is not None:
-        sentences = with_proposal(sentences, modelled=findings.modelled)
+    if any(it.pixel_px is not None for it in sensors):
+        modelled = all(it.modelled for it in findings.arms)
+        sentences = with_proposal(sentences, modelled=modelled)
     return Verdict(status, (*sentences, *findings.notes))
 
 
-def is_scattered(findings: Findings, options: JudgeOptions | None = None) -> bool:
+def is_scattered(findings: Findings, limits: Limits | None = None) -> bool:
     """Whether views disagree with each other by more than a sound cell's do."""
-    return any(_scatter_doubts(findings, options or JudgeOptions()))
+    return any(_scatter_doubts(findings, limits or Limits()))
+
+
+def _named(name: str, sentence: str) -> str:
+    """A sentence with whom it is of, where there are several."""
+    return f"{name}: {sentence[0].lower()}{sentence[1:]}" if name else sentence
 
 
 def _praise(findings: Findings) -> str:
-    used, worst = sum(view.used for view in findings.views), findings.hand_eye.worst[0]
+    used = sum(view.used for it in findings.pairs for view in it.views)
+    worst = findings.worst[0]
     return (
         f"All {used} used views agree: left out of the fit, they are predicted to "
         f"{_both(findings.held_out)} (rms), and "
@@ -175,36 +275,40 @@ def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
     return pairs
 
 
-def _scatter_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    held, inside = findings.held_out, findings.rms
-    limits = (options.scatter_mm, options.scatter_deg)
+def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+    for it in findings.pairs:
+        yield from _pair_doubts(it, findings.mount, limits)
+    ratios = [
+        outside / within
+        for outside, within in _pairs(findings.held_out, findings.rms)
+        if outside > _ROUNDING and within > 0.0
+    ]
+    ratio = max(ratios, default=0.0)
+    if ratio > limits.optimism[0]:
+        yield _Doubt(
+            f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
+            "views for their noise. Add 5 or more, tilted about different axes.",
+            ratio > limits.optimism[1],
+        )
+
+
+def _pair_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[_Doubt]:
+    held = pair.held_out
     beyond = [
         (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
         for value, unit, (check, bad) in zip(
-            (held.mm, held.deg), ("mm", "deg"), limits, strict=True
+            (held.mm, held.deg), ("mm", "deg"), (limits.scatter_mm, limits.scatter_deg), strict=True
         )
         if value is not None and value > check
     ]
     if beyond:
-        yield _Doubt(
+        sentence = (
             f"Left out of the fit, views disagree with the others by "
             f"{' and '.join(words for words, _ in beyond)}, rms; the worst are "
-            f"{_worst_views(findings.views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
-            "arm with large model errors.",
-            any(is_fatal for _, is_fatal in beyond),
+            f"{_worst_views(pair.views)}. Possible causes: {_CAUSES[mount]}, or an "
+            "arm with large model errors."
         )
-    ratios = [
-        outside / within
-        for outside, within in _pairs(held, inside)
-        if outside > _ROUNDING and within > 0.0
-    ]
-    ratio = max(ratios, default=0.0)
-    if ratio > options.optimism[0]:
-        yield _Doubt(
-            f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
-            "views for their noise. Add 5 or more, tilted about different axes.",
-            ratio > options.optimism[1],
-        )
+        yield _Doubt(_named(pair.name, sentence), any(is_fatal for _, is_fatal in beyond))
 
 
 def _worst_views(views: Sequence[ViewResult]) -> str:
@@ -213,22 +317,23 @@ def _worst_views(views: Sequence[ViewResult]) -> str:
     return ", ".join(f"view {view.view} ({_residual(view)})" for view in measured[:_LISTED_VIEWS])
 
 
-def _disagreement_doubts(findings: Findings) -> Iterator[_Doubt]:
+def _disagreement_doubts(pair: Pair) -> Iterator[_Doubt]:
     """Names the views that were left out because they contradict the others."""
-    out = findings.disagreeing
+    out = pair.disagreeing
     if not out:
         return
     if len(out) == 1:
-        yield _Doubt(f"View {out[0].view} was left out: it {out[0].reason}.")
+        yield _Doubt(_named(pair.name, f"View {out[0].view} was left out: it {out[0].reason}."))
         return
     named, first = ", ".join(str(it.view) for it in out), out[0].view
-    yield _Doubt(f"Views {named} were left out; view {first} {out[0].reason}.{_run(findings)}")
+    sentence = f"Views {named} were left out; view {first} {out[0].reason}.{_run(pair)}"
+    yield _Doubt(_named(pair.name, sentence))
 
 
-def _run(findings: Findings) -> str:
+def _run(pair: Pair) -> str:
     """Says so where the views that were left out follow each other, with no other between them."""
-    out = [it.view for it in findings.disagreeing]
-    compared = [it.view for it in findings.views if it.used or it.view in out]
+    out = [it.view for it in pair.disagreeing]
+    compared = [it.view for it in pair.views if it.used or it.view in out]
     first = compared.index(out[0])
     end = first + len(out)
     if len(out) < _LEAST_RUN or compared[first:end] != out:
@@ -239,26 +344,31 @@ def _run(findings: Findings) -> str:
     return f" They follow each other: {when}, something had moved."
 
 
-def _outlier_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     """Names single views whose residual stands out from the others'.
 
     Where the corners tell how well each view sees the board, the consensus has judged them better.
     """
-    if findings.robot is not None:
+    if any(it.away_mm is not None for it in findings.arms):
         return
-    for view, ratio in outlying_views(findings.views, options.outlier):
-        yield _Doubt(
-            f"View {view.view} stands out: it places the target {_residual(view, ' and ')} from "
-            f"the others, {ratio:.0f} times what is typical. It is in the fit and pulls at it: "
-            "look at its image and its pose, and take it out of views.csv if one of them is wrong."
-        )
+    for pair in findings.pairs:
+        for view, ratio in outlying_views(pair.views, limits.outlier):
+            sentence = (
+                f"View {view.view} stands out: it places the target {_residual(view, ' and ')} "
+                f"from the others, {ratio:.0f} times what is typical. It is in the fit and pulls "
+                "at it: look at its image and its pose, and take it out of views.csv if one of "
+                "them is wrong."
+            )
+            yield _Doubt(_named(pair.name, sentence))
 
 
 def outlying_views(
-    views: Sequence[ViewResult], limit: float = JudgeOptions.outlier
+    views: Sequence[ViewResult], limit: float = Limits.outlier
 ) -> tuple[tuple[ViewResult, float], ...]:
     """The used views whose residual is over so many times the median, with their ratios."""
     used = [view for view in views if view.used]
+    if not used:
+        return ()
     away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
     ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
     return tuple((view, float(it)) for view, it in zip(used, ratios, strict=True) if it > limit)
@@ -269,51 +379,54 @@ def _residual(view: ViewResult, between: str = ", ") -> str:
     return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
-def _holdout_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    holdout, held = findings.holdout, findings.held_out
+def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[_Doubt]:
+    holdout, held = pair.holdout, pair.held_out
     if holdout is None:
         return
     pairs = _pairs(holdout, held)
     ratio = max(back / max(left, _ROUNDING) for back, left in pairs)
-    if ratio > options.holdout and max(back for back, _ in pairs) > _ROUNDING:
-        observed = "readings" if findings.mount == "instrument" else "images"
-        yield _Doubt(
+    if ratio > limits.holdout and max(back for back, _ in pairs) > _ROUNDING:
+        observed = "readings" if mount == "instrument" else "images"
+        sentence = (
             f"The views that the session holds back are missed by {_both(holdout)}, {ratio:.0f} "
             "times worse than views left out in turn. They lie where the result does not hold, or "
             f"their poses or {observed} are wrong."
         )
+        yield _Doubt(_named(pair.name, sentence))
 
 
-def _worth_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     """Judges the answer where it counts.
 
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
     the first and the last link, which its poses make up for.
     """
-    if findings.workspace_mm is None:
-        yield from _sigma_doubts(findings, options)
-        yield from _budget_doubts(findings, options)
-    elif findings.workspace_mm > options.sigma_mm[0]:
-        board = (
-            "The board's size counts in it, as no view can tell an arm and a board that are both "
-            "too large: measure its squares, and state square_sigma_m. "
-        )
-        yield _Doubt(
-            "All over the workspace the calibrated arm places its tool to "
-            f"{figure(findings.workspace_mm)} mm (sigma, in the median; doubt begins at "
-            f"{options.sigma_mm[0]:g}). {'' if findings.pixel_px is None else board}Add views in "
-            "which the arm stands otherwise, all over the workspace.",
-            findings.workspace_mm > options.sigma_mm[1],
-        )
+    if all(it.workspace_mm is None for it in findings.arms):
+        yield from _sigma_doubts(findings, limits)
+        yield from _budget_doubts(findings, limits)
+    for it in findings.arms:
+        if it.workspace_mm is not None and it.workspace_mm > limits.sigma_mm[0]:
+            seen = any(sensor.pixel_px is not None for sensor in findings.sensors)
+            board = (
+                "The board's size counts in it, as no view can tell an arm and a board that are "
+                "both too large: measure its squares, and state square_sigma_m. "
+            )
+            sentence = (
+                "All over the workspace the calibrated arm places its tool to "
+                f"{figure(it.workspace_mm)} mm (sigma, in the median; doubt begins at "
+                f"{limits.sigma_mm[0]:g}). {board if seen else ''}Add views in "
+                "which the arm stands otherwise, all over the workspace."
+            )
+            yield _Doubt(_named(_robot(it), sentence), it.workspace_mm > limits.sigma_mm[1])
 
 
-def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     weak, is_fatal = [], False
-    for direction in findings.hand_eye.worst:
+    for direction in findings.worst:
         scale, unit, (check, bad) = (
-            (np.rad2deg(1.0), "deg", options.sigma_deg)
+            (np.rad2deg(1.0), "deg", limits.sigma_deg)
             if direction.is_rotation
-            else (1e3, "mm", options.sigma_mm)
+            else (1e3, "mm", limits.sigma_mm)
         )
         sigma = direction.sigma * scale
         if sigma > check:
@@ -322,43 +435,49 @@ def _sigma_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]
     if weak:
         yield _Doubt(
             f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt begins "
-            f"at {options.sigma_mm[0]:g} mm and {options.sigma_deg[0]:g} deg. Add views tilted by "
+            f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg. Add views tilted by "
             "20 to 40 degrees about axes across these directions.",
             is_fatal,
         )
 
 
-def _budget_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     """Says what makes the result uncertain where it is to be used."""
-    budget = findings.diagnosis.budget_mm
-    if not budget["total"] > options.sigma_mm[0]:
-        return
-    parts = sorted((it for it in budget.items() if it[0] != "total"), key=lambda it: -it[1])
-    yield _Doubt(
-        f"Where the views look, a point is placed to {figure(budget['total'])} mm (sigma; 95 % "
-        f"within {figure(findings.diagnosis.radius95_mm)} mm): "
-        + ", ".join(
-            f"{figure(mm)} mm from the {name.replace('_', ' ')}"
-            for name, mm in parts[:_LISTED_PARTS]
-        )
-        + ".",
-        budget["total"] > options.sigma_mm[1],
-    )
-
-
-def _view_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    used, lost = sum(view.used for view in findings.views), findings.lost
-    check, bad = options.stops
-    if findings.stops < check:
-        counted = f"{used} views" if findings.stops == used else f"{findings.stops} stops"
+    for it in findings.places:
+        budget = it.budget_mm
+        if not budget["total"] > limits.sigma_mm[0]:
+            continue
+        parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
         yield _Doubt(
-            f"Only {counted} are used; {check} or more give the result something to be checked "
-            "with.",
-            findings.stops < bad,
+            f"{it.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
+            f"within {figure(it.radius95_mm)} mm): "
+            + ", ".join(
+                f"{figure(mm)} mm from the {name.replace('_', ' ')}"
+                for name, mm in parts[:_LISTED_PARTS]
+            )
+            + ".",
+            budget["total"] > limits.sigma_mm[1],
         )
+
+
+def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+    used = sum(view.used for it in findings.pairs for view in it.views)
+    check, bad = limits.stops
+    for it in findings.arms:
+        if it.stops < check:
+            counted = f"{used} views" if it.stops == used else f"{it.stops} stops"
+            sentence = (
+                f"Only {counted} are used; {check} or more give the result something to be checked "
+                "with."
+            )
+            yield _Doubt(_named(_robot(it), sentence), it.stops < bad)
+
+
+def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
+    lost, used = sensor.lost, sensor.used
     share = len(lost) / max(used + len(lost), 1)
-    if share > options.lost_share[0]:
-        told, disagree = "", {it.view for it in findings.disagreeing}
+    if share > limits.lost_share[0]:
+        told, disagree = "", {*sensor.disagreeing}
         others = [it for it in lost if it.view not in disagree]
         if disagree:
             count = len(disagree) if others else "all"
@@ -366,39 +485,52 @@ def _view_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
         if others:
             told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             told += others[0].reason
-        yield _Doubt(
-            f"{len(lost)} of {used + len(lost)} views are not used{told}.",
-            share > options.lost_share[1],
-        )
+        sentence = f"{len(lost)} of {used + len(lost)} views are not used{told}."
+        yield _Doubt(_named(sensor.name, sentence), share > limits.lost_share[1])
 
 
-def _pixel_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
-    check, bad = options.pixel_px
-    noise = findings.pixel_px
-    if noise is not None and noise > check:
-        yield _Doubt(
+def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
+    check, bad = limits.pixel_px
+    noise = sensor.pixel_px
+    if noise is None:
+        return
+    if noise > check:
+        sentence = (
             f"Corners deviate by {figure(noise)} px from any pose of a flat board (doubt begins at "
             f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
-            "are blurred.",
-            noise > bad,
+            "are blurred."
         )
+        yield _Doubt(_named(sensor.name, sentence), noise > bad)
+    if sensor.level > limits.level:
+        sentence = (
+            f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
+            "of few pixels, blur, or a lens that is not as stated. Go nearer, or show it larger "
+            "squares."
+        )
+        yield _Doubt(_named(sensor.name, sentence))
 
 
-def _robot_doubts(findings: Findings, options: JudgeOptions) -> Iterator[_Doubt]:
+def _robot(arm: Arm) -> str:
+    return f"Robot {arm.name}" if arm.name else ""
+
+
+def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     """An arm is a good instrument: what looks like its error is often something else's."""
-    if findings.robot is None or findings.diagnosis.arm is not None:
-        return
-    away_mm, away_deg = 1e3 * findings.robot.sigma_m, np.rad2deg(findings.robot.sigma_rad)
-    if away_mm > options.robot_mm or away_deg > options.robot_deg:
-        cause = (
-            "the instrument reads worse than is stated of it, was moved, or the arm's model is off "
-            "by as much. Read a few stops twice to see how well readings repeat."
-            if findings.mount == "instrument"
-            else "the board is of another size than stated, or warped, the intrinsics are not this "
-            "camera's, or the arm's model is off by as much. Measure the board's squares first."
-        )
-        yield _Doubt(
-            f"To explain what is seen, the flange would have to be off by {figure(away_mm)} mm "
-            f"and {figure(away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
-            f"{cause}"
-        )
+    for it in findings.arms:
+        if it.away_mm is None or it.away_deg is None or it.errs:
+            continue
+        if it.away_mm > limits.robot_mm or it.away_deg > limits.robot_deg:
+            cause = (
+                "the instrument reads worse than is stated of it, was moved, or the arm's model is "
+                "off by as much. Read a few stops twice to see how well readings repeat."
+                if findings.mount == "instrument"
+                else "the board is of another size than stated, or warped, the intrinsics are not "
+                "this camera's, or the arm's model is off by as much. Measure the board's squares "
+                "first."
+            )
+            sentence = (
+                f"To explain what is seen, the flange would have to be off by {figure(it.away_mm)} "
+                f"mm and {figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More "
+                f"likely {cause}"
+            )
+            yield _Doubt(_named(_robot(it), sentence))

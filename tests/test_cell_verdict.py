@@ -1,0 +1,136 @@
+"""The verdict on a whole cell names what is wrong: a camera, a pose, a board, the motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
+
+from visioncal.alignment import align
+from visioncal.session import Session
+from visioncal.simulation import BoardAt, CameraAt, fine_camera, simulate_network
+
+# Three cameras, so that two or more see by way of a robot at most stops.
+CELL = replace(
+    OPTIONS,
+    cameras=(
+        *OPTIONS.cameras,
+        CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=fine_camera()),
+    ),
+    boards=(
+        BoardAt("floor", place_m=(0.0, 0.0, 0.05), target=FLOOR),
+        BoardAt("plate_a", on="a", target=FLOOR),
+        BoardAt("plate_b", on="b", target=PLATE),
+    ),
+    stops=16,
+)
+
+
+@pytest.fixture(scope="module")
+def session():
+    return recorded(simulate_network(CELL))
+
+
+def rewritten(session, change, document=None):
+    """The session with its rows as `change` makes them: a function of the view and its texts."""
+    rows = []
+    for view in session.views:
+        row = {it: view.cell(it) for it in session.columns}
+        change(view, row)
+        rows.append(list(row.values()))
+    return Session.assemble(
+        document or session.document,
+        session.columns,
+        rows,
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+        corners=session.corner_table,
+    )
+
+
+def of_plate(session, plate, stop):
+    """The views of a plate at a stop, one of which has the pose of its robot."""
+    return [it.number for it in session.views if it.stop == stop and it.text["target"] == plate]
+
+
+def seen_often(session, plate):
+    """The stops at which several cameras see a plate, after the first ones."""
+    return [it for it in range(3, CELL.stops) if len(of_plate(session, plate, it)) > 1]
+
+
+def poses(session, robot):
+    """The rows that have a robot's pose by stop, without its joints: they go with the pose."""
+    rows = {}
+    for view in session.views:
+        if view.text.get("robot") == robot and view.cell("x_m"):
+            row = {it: view.cell(it) for it in session.columns[5:]}
+            rows[view.stop] = row | {it: "" for it in row if it.endswith("_rad")}
+    return rows
+
+
+def test_a_sound_cell_is_good_and_says_how_good(session):
+    verdict = align(session).verdict
+    assert verdict.status == "good"
+    (reason,) = verdict.reasons
+    used = sum(it.used for it in align(session).sights)
+    assert reason.startswith(
+        f"All {used} used views agree: left out of the fit, they are predicted"
+    )
+    assert "offset along the cell's" in reason
+
+
+def test_one_wrong_pose_of_a_robot_is_named(session):
+    stop = seen_often(session, "plate_b")[0]
+    mine, pose = of_plate(session, "plate_b", stop), poses(session, "b")[stop]
+
+    def push(view, row):
+        if view.stop == stop and view.text.get("robot") == "b" and view.cell("x_m"):
+            row.update(pose | {"x_m": repr(float(pose["x_m"]) + 0.02)})
+
+    found = align(rewritten(session, push))
+    (reason,) = [it for it in found.verdict.reasons if "Robot b did not stand" in it]
+    assert f"at stop {stop} where its pose says: all {len(mine)} views" in reason
+    assert "moved by 20 mm" in reason
+    assert all(str(it) in reason for it in mine)
+    assert found.verdict.status == "check"
+    # What a fault explains is not said once more of each camera.
+    assert not any("were left out; view" in it for it in found.verdict.reasons)
+    why = {it.view: it.reason for it in found.sights if not it.used}
+    assert sorted(why) == mine
+    assert all(f"the pose of robot b at stop {stop} is wrong" in it for it in why.values())
+
+
+def test_poses_of_a_robot_that_are_exchanged_are_named(session):
+    first, second = seen_often(session, "plate_b")[:2]
+    told = poses(session, "b")
+
+    def exchange(view, row):
+        other = {first: second, second: first}.get(view.stop)
+        if other is not None and view.text.get("robot") == "b" and view.cell("x_m"):
+            row.update(told[other])
+
+    found = align(rewritten(session, exchange))
+    words = f"The poses of robot b at stops {first} and {second} are exchanged: views"
+    assert any(it.startswith(words) for it in found.verdict.reasons)
+    out = [it.view for it in found.sights if not it.used]
+    assert out == [*of_plate(session, "plate_b", first), *of_plate(session, "plate_b", second)]
+
+
+def test_a_camera_whose_corners_are_bad_is_named(session):
+    table = session.corner_table
+    mine = {it.number for it in session.views if it.text.get("camera") == "right"}
+    noise = np.random.default_rng(0).normal(0.0, 1.5, table.px.shape)
+    blurred = np.where(np.isin(table.views, list(mine))[:, None], table.px + noise, table.px)
+    verdict = align(replace(session, corner_table=replace(table, px=blurred))).verdict
+    assert verdict.status == "check"
+    (reason,) = [it for it in verdict.reasons if "corners deviate" in it]
+    assert reason.startswith("cam_right: corners deviate by 1.5 px")
+    assert not any(it.startswith(("cam_left: ", "cam_hand: ")) for it in verdict.reasons)
+
+
+def test_few_stops_are_told_by_robot(session):
+    verdict = align(part(session, 0, 8)).verdict
+    assert verdict.status == "check"
+    for robot in ("a", "b"):
+        assert any(it.startswith(f"Robot {robot}: only 8 stops are used") for it in verdict.reasons)
