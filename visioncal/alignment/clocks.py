@@ -5,20 +5,24 @@ that both have seen, as `calibrate` does; its error is an effect of the joint fi
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from visioncal.alignment.cell import Cell, robot_key
+from visioncal.alignment.looking import Looked
 from visioncal.errors import VisioncalError
 from visioncal.estimation.effects.clock import clock_effect
+from visioncal.estimation.effects.delays import Delay
 from visioncal.estimation.problem import Effect
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.tables import ClockTable
 from visioncal.stages.clock import Clocked, Sweep, set_clock
 from visioncal.stages.motion import has_motion, is_open, motion_of
+from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
+from visioncal.targets import numbered_positions
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,10 @@ class Pair:
         """The effect of their clocks' offset, by its name."""
         return f"clock of {self.words}"
 
+    def delay(self, of: Delay) -> str:
+        """The effect of a time within the camera's images, by its name."""
+        return f"{of.name} of {self.words}"
+
 
 @dataclass(frozen=True, eq=False)
 class Clocks:
@@ -47,6 +55,7 @@ class Clocks:
         session: The session; rows that waited for a stream have poses now.
         found: The clock of each pair.
         reasons: Why rows have no pose, by view.
+        poses: Poses that were made anew of corners taken before or after their stamp.
         warnings: Reasons for doubt, in words.
         notes: What is good to know.
     """
@@ -54,25 +63,35 @@ class Clocks:
     session: Session
     found: Mapping[Pair, Clocked]
     reasons: Mapping[int, str]
+    poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def effects(self, cell: Cell) -> tuple[Effect, ...]:
-        """The errors of the offsets [s], as effects on the cell's rows."""
-        moving = {it: clocked for it, clocked in self.found.items() if clocked.clock.speeds}
-        return tuple(
-            _effect(cell, pair, clocked)
-            for pair, clocked in moving.items()
-            if robot_key(pair.robot) in cell.poses
-        )
+        """The errors of offsets and times within images [s], as effects on the cell's rows."""
+        views = [it.view for it in cell.rows]
+        found: list[Effect] = []
+        for pair, clocked in self.found.items():
+            if clocked.clock.speeds and robot_key(pair.robot) in cell.poses:
+                found.append(_effect(cell, pair, clocked.clock))
+                found += [
+                    it.effect(views, pair.delay(it.of))
+                    for it in clocked.clock.delays
+                    if it.is_clear
+                ]
+        return tuple(found)
+
+    def looked(self, before: Looked) -> Looked:
+        """What the cameras saw, with poses that were made anew."""
+        return replace(before, poses={**before.poses, **self.poses})
 
 
-def set_clocks(session: Session, poses: Mapping[int, ViewPoses]) -> Clocks:
+def set_clocks(session: Session, looked: Looked) -> Clocks:
     """Gives rows the poses of robots at their times.
 
     Args:
         session: A whole cell.
-        poses: What its cameras saw, by view.
+        looked: What its cameras saw.
 
     Raises:
         DataError: A stream has no poses, and no joints that its robot's model knows.
@@ -83,7 +102,7 @@ def set_clocks(session: Session, poses: Mapping[int, ViewPoses]) -> Clocks:
             waiting.setdefault(Pair(it.seer, it.lacks[0]), []).append(it)
     clocks = Clocks(session, {}, {})
     for pair, rows in waiting.items():
-        clocks = _with_pair(clocks, pair, rows, poses)
+        clocks = _with_pair(clocks, pair, rows, looked)
     return clocks
 
 
@@ -93,9 +112,7 @@ def stream_of(session: Session, robot: str) -> str:
     return name if name in session.streams and has_motion(session.streams[name]) else ""
 
 
-def _with_pair(
-    clocks: Clocks, pair: Pair, rows: list[Observation], poses: Mapping[int, ViewPoses]
-) -> Clocks:
+def _with_pair(clocks: Clocks, pair: Pair, rows: list[Observation], looked: Looked) -> Clocks:
     session = clocks.session
     document = session.robot_documents.get(pair.robot)
     model = None if document is None else Robot.from_document(document)
@@ -105,9 +122,11 @@ def _with_pair(
         "eye-in-hand" if session.frames[pair.camera] == flange else "eye-to-hand",
         tuple(it.view for it in rows),
         _stated_s(session, pair.camera),
+        looked.cameras[pair.camera].camera if pair.camera in looked.cameras else None,
+        numbered_positions(tuple(session.boards.values())),
     )
     try:
-        clocked = set_clock(sweep, poses)
+        clocked = set_clock(sweep, looked.poses)
     except VisioncalError as error:
         words = f"{pair.words}: {error.message} {error.next_step}".strip()
         lost = dict.fromkeys((it.view.number for it in rows), f"no pose: {error.message}")
@@ -121,6 +140,7 @@ def _with_pair(
         replace(session, views=views),
         {**clocks.found, pair: clocked},
         {**clocks.reasons, **lost},
+        {**clocks.poses, **clocked.poses},
         (*clocks.warnings, *(f"{pair.words}: {it}" for it in clocked.warnings)),
         (*clocks.notes, *(f"{pair.words}: {it}" for it in clocked.notes)),
     )
@@ -140,13 +160,13 @@ def _stated_s(session: Session, camera: str) -> float | None:
     return clock.camera_minus_robot_s if clock.model_fields_set else None
 
 
-def _effect(cell: Cell, pair: Pair, clocked: Clocked) -> Effect:
-    speeds = clocked.clock.speeds
+def _effect(cell: Cell, pair: Pair, clock: Clock) -> Effect:
+    speeds = clock.speeds
     concerned = np.array([it.view in speeds for it in cell.rows], dtype=bool)
     robot = robot_key(pair.robot)
     moving = np.zeros((len(cell.poses[robot]), 6))
     for row in cell.rows:
         if row.view in speeds:
             moving[row.station] = speeds[row.view]
-    found = clock_effect(moving, clocked.clock.sigma_s, pair.effect, robot)
+    found = clock_effect(moving, clock.sigma_s, pair.effect, robot)
     return replace(found, concerned=concerned)

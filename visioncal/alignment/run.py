@@ -45,6 +45,7 @@ from visioncal.errors import DataError
 from visioncal.estimation.solve import covariance_of
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
+from visioncal.stages.delays import FoundDelay
 from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.offset import Clock
@@ -86,7 +87,8 @@ def align(
     if progress is not None:
         progress("align", 0, 1)
     with one_blas_thread():
-        clocks = set_clocks(loaded, looked.poses)
+        clocks = set_clocks(loaded, looked)
+        looked = clocks.looked(looked)
         cell = read_cell(clocks.session)
         cell = replace(cell, reasons={**cell.reasons, **clocks.reasons})
         solved = solve(cell, looked, clocks, level)
@@ -225,7 +227,19 @@ def _fitted_clock(pair: Pair, clock: Clock, solved: Solved, spread: FloatArray) 
         clock,
         camera_minus_robot_s=clock.camera_minus_robot_s + float(late_s),
         sigma_s=float(np.sqrt(spread[columns.start, columns.start])),
+        delays=tuple(_fitted_delay(pair, it, solved, spread) for it in clock.delays),
     )
+
+
+def _fitted_delay(pair: Pair, delay: FoundDelay, solved: Solved, spread: FloatArray) -> FoundDelay:
+    """A time within images as the fit of the whole cell has it, where that estimates it."""
+    problem, name = solved.agreed.problem, pair.delay(delay.of)
+    columns = problem.effect_columns.get(name)
+    if columns is None:
+        return delay
+    (late_s,) = problem.values_of(name, solved.agreed.fit.state)
+    sigma_s = float(np.sqrt(spread[columns.start, columns.start]))
+    return replace(delay, time_s=delay.time_s + float(late_s), sigma_s=sigma_s)
 
 
 def _clock_words(clocks: Clocks, solved: Solved, spread: FloatArray) -> Iterator[str]:

@@ -215,10 +215,35 @@ def compress(
     """
     shape = basis[stack.ids]
     bent = stack.with_points(stack.points + shape @ appearance.board)
-    fit = fit_poses(bent, appearance.camera, starts)
-    now = reproject(bent, appearance.camera, fit.cam_from_target)
-    by_board = now.by_pose[:, :, 3:] @ shape
-    by_shared = np.concatenate([now.by_intrinsics, by_board], axis=2)
+    found = compress_points(bent, appearance.camera, starts, shape)
+    # A larger board farther away looks the same: what is left is rounding.
+    if scales is not None:
+        information, pull = found.shared_information, found.shared_pull
+        information[scales] = information[:, scales] = 0.0
+        pull[scales] = 0.0
+    return found
+
+
+def compress_points(
+    stack: CornerStack,
+    camera: Camera,
+    starts: FloatArray,
+    by_values: FloatArray,
+    *,
+    lens: bool = True,
+) -> Compressed:
+    """Compresses corners to normal equations in poses, lens and whatever moves corners.
+
+    Args:
+        stack: The corners of v views, where they are on the target.
+        camera: The intrinsics.
+        starts: (v, 4, 4) `cam_from_target` to start from.
+        by_values: (n, 3, s) how the corners move on the target with s values.
+        lens: Whether the intrinsics come first of what is shared; else they are held.
+    """
+    fit = fit_poses(stack, camera, starts)
+    now = reproject(stack, camera, fit.cam_from_target, lens=lens)
+    by_shared = np.concatenate([now.by_intrinsics, now.by_pose[:, :, 3:] @ by_values], axis=2)
     between = stack.products_by_view(now.by_pose, by_shared)
     answer = -covariance(fit.information) @ between
     # What is left once the poses have followed, squared: never less than none, and as exact as the
@@ -227,10 +252,6 @@ def compress(
     flat = left.reshape(-1, left.shape[2])
     information = flat.T @ flat
     pull = flat.T @ now.residuals.reshape(-1)
-    # A larger board farther away looks the same: what is left is rounding.
-    if scales is not None:
-        information[scales] = information[:, scales] = 0.0
-        pull[scales] = 0.0
     return Compressed(
         fit.cam_from_target,
         fit.information,

@@ -72,8 +72,12 @@ class Boards:
             camera_covariance=None
             if known is None
             else carried @ known @ np.swapaxes(carried, 1, 2),
-            effects=tuple(it.carried(carried) for it in data.effects),
+            effects=tuple(map(self.carried, data.effects)),
         ).with_more(self._effect())
+
+    def carried(self, effect: Effect) -> Effect:
+        """Returns an effect on the views' own boards as one on the first board."""
+        return effect.carried(adjoint(invert(self.from_first[self.shown])))
 
     def _effect(self) -> Effect:
         """Where the further boards are, as unknowns of the chain."""

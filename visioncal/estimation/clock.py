@@ -10,18 +10,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.estimation.chain import chain
+from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
+from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
+from visioncal.estimation.joint import chance_limit
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.outliers import closed_form
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import Solution, fisher_information, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
+from visioncal.estimation.variance import Knowledge
 from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import Camera, FloatArray, IntArray, Mask
 
 # A start from more frames is no better; a fit of more takes long.
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4
+# So many tell times within images well enough: each has dozens of corners.
+_MOST_DELAYED = 400
 _ROUNDS, _SETTLED_S = 12, 1e-7
 # Frames that are off by so many times what is typical are wrong ones.
 _OUTLYING = 4.0
@@ -48,6 +54,62 @@ class ClockFit:
     frames: int
 
 
+@dataclass(frozen=True, eq=False)
+class DelayedFit:
+    """An offset with times by which corners are taken later than others.
+
+    Attributes:
+        clock: The offset and both edges.
+        delays: The effects.
+        times_s: (k,) their times [s].
+        sigmas_s: (k,) the standard deviations of these [s].
+    """
+
+    clock: ClockFit
+    delays: tuple[Delay, ...]
+    times_s: FloatArray
+    sigmas_s: FloatArray
+
+    @property
+    def is_clear(self) -> Mask:
+        """(k,) which of the times are beyond chance."""
+        return np.asarray((self.times_s / self.sigmas_s) ** 2 > chance_limit(1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Late:
+    """Effects of time within images, with where their times are [s]; none without a camera."""
+
+    camera: Camera | None
+    delays: tuple[Delay, ...]
+    times_s: FloatArray
+
+    def problem(self, robot: Trajectory, frames: Frames, offset_s: float, state: State) -> Problem:
+        """The problem of some frames, with changes of the offset and of the times [s]."""
+        stack = frames.stack
+        if self.camera is None or stack is None:
+            return clock_problem(robot, frames, offset_s)
+        at_s, poses = frames.stamps_s - offset_s, frames.cam_from_target
+        flange, speeds = robot.at(at_s), robot.speeds(at_s)
+        moved = target_twists(frames.mount, flange, state.edges[0], poses, speeds)
+        shares = shares_of(self.delays, stack, self.camera)
+        seen = compress_delayed(stack, self.camera, shares, moved, self.times_s, poses)
+        unknowns = 6 * len(frames) + len(self.times_s)
+        weight = floored_sigma_px(stack.sigma_px(seen.residuals, unknowns)) ** -2.0
+        prior = np.array([it.sigma_s for it in self.delays]) ** -2.0
+        known = Knowledge(
+            weight * seen.shared_information + np.diag(prior),
+            weight * seen.shared_pull + prior * self.times_s,
+        )
+        return chain(
+            frames.mount,
+            flange,
+            seen.cam_from_target,
+            covariance(weight * seen.information),
+            effects=[clock_effect(speeds), Effect.free("delays", known, seen.by_shared)],
+        )
+
+
 def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tuple[ClockFit, ...]:
     """Fits the offset and both edges together, from several starts.
 
@@ -64,15 +126,40 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tu
     near_s = NEAR_S if frames.are_dense else WIDEST_OFFSET_S
     with one_blas_thread():
         some = frames.only(_evenly(len(frames), _MOST_FRAMES))
+        on_time = _Late(None, (), np.zeros(0))
         fits = [
-            fit
+            fit.clock
             for it in starts
-            if (fit := _fitted(robot, some, it)) is not None and abs(fit.offset_s - it) <= near_s
+            if (fit := _fitted(robot, some, it, None, on_time)) is not None
+            and abs(fit.clock.offset_s - it) <= near_s
         ]
     # Few frames agree with anything.
     most = max((it.frames for it in fits), default=0)
     whole = (it for it in fits if 2 * it.frames > most)
     return tuple(sorted(whole, key=_left))
+
+
+def fit_delays(
+    robot: Trajectory, frames: Frames, camera: Camera, start: ClockFit, delays: Sequence[Delay]
+) -> DelayedFit | None:
+    """Fits times within images, the offset and both edges together.
+
+    Args:
+        robot: `base_from_flange` over the robot's time.
+        frames: What the camera saw.
+        camera: The intrinsics.
+        start: The fit without them.
+        delays: The effects.
+
+    Returns:
+        The fit; None where too few frames are covered, or their corners are not known.
+    """
+    if frames.stack is None or not delays:
+        return None
+    with one_blas_thread():
+        some = frames.only(_evenly(len(frames), _MOST_DELAYED))
+        late = _Late(camera, tuple(delays), np.zeros(len(delays)))
+        return _fitted(robot, some, start.offset_s, start.fit.state, late)
 
 
 def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | None:
@@ -98,36 +185,46 @@ def _evenly(count: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def _fitted(robot: Trajectory, frames: Frames, offset_s: float) -> ClockFit | None:
+def _fitted(
+    robot: Trajectory, frames: Frames, offset_s: float, start: State | None, late: _Late
+) -> DelayedFit | None:
     """Fits from one start, and once more without the frames that contradict the others."""
-    fit = _settled(robot, frames, offset_s, None)
-    if fit is None:
+    found = _settled(robot, frames, offset_s, start, late)
+    if found is None:
         return None
-    near = _covered(robot, frames, fit.offset_s)
-    sound = _sound(clock_problem(robot, near, fit.offset_s), fit.fit)
-    return fit if sound.all() else _settled(robot, near.only(sound), fit.offset_s, fit.fit.state)
+    late, clock = replace(late, times_s=found.times_s), found.clock
+    near = _covered(robot, frames, clock.offset_s)
+    sound = _sound(late.problem(robot, near, clock.offset_s, clock.fit.state), clock.fit)
+    if sound.all():
+        return found
+    return _settled(robot, near.only(sound), clock.offset_s, clock.fit.state, late)
 
 
 def _settled(
-    robot: Trajectory, frames: Frames, offset_s: float, start: State | None
-) -> ClockFit | None:
-    """Moves the offset and both edges until they rest; None where too few frames are covered."""
+    robot: Trajectory, frames: Frames, offset_s: float, start: State | None, late: _Late
+) -> DelayedFit | None:
+    """Moves times, offset and both edges until they rest; None where too few frames are covered."""
     for _ in range(_ROUNDS):
         near = _covered(robot, frames, offset_s)
         if len(near) < _FEWEST_FRAMES:
             return None
-        problem = clock_problem(robot, near, offset_s)
-        at = closed_form(problem, _evenly(len(near), _START_FRAMES)) if start is None else start
-        if at is None:
+        if start is None:
+            first = _evenly(len(near), _START_FRAMES)
+            start = closed_form(clock_problem(robot, near, offset_s), first)
+        if start is None:
             raise RuntimeError("no closed form gives a start")
-        found = fit_problem(problem, State(at.edges, problem.start_values))
+        problem = late.problem(robot, near, offset_s, start)
+        found = fit_problem(problem, State(start.edges, problem.start_values))
         # A step farther than angles are compared over is a slope that misleads.
-        step_s = float(np.clip(found.state.values[0], -WINDOW_S, WINDOW_S))
-        start, offset_s = found.state, offset_s + step_s
-        if abs(step_s) < _SETTLED_S:
+        step_s = np.clip(found.state.values, -WINDOW_S, WINDOW_S)
+        start, offset_s = found.state, offset_s + float(step_s[0])
+        late = replace(late, times_s=late.times_s + step_s[1:])
+        if np.abs(step_s).max() < _SETTLED_S:
             break
     fit = replace(found, state=State(found.state.edges, problem.start_values))
-    return ClockFit(offset_s, _sigma_s(problem, fit, near.stamps_s), fit, len(near))
+    sigmas_s = _sigmas_s(problem, fit, near.stamps_s)
+    clock = ClockFit(offset_s, float(sigmas_s[0]), fit, len(near))
+    return DelayedFit(clock, late.delays, late.times_s, sigmas_s[1:])
 
 
 def _covered(robot: Trajectory, frames: Frames, offset_s: float) -> Frames:
@@ -155,8 +252,8 @@ def _sound(problem: Problem, fit: Solution) -> Mask:
     return np.asarray(squares <= _OUTLYING**2 * float(np.median(squares)))
 
 
-def _sigma_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> float:
-    """The offset's standard deviation: the larger of two.
+def _sigmas_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> FloatArray:
+    """Standard deviations of the offset and of times: the larger of two each.
 
     One takes the errors of all frames for independent. The other takes those of a stretch of time
     together, as they are: where a lens or an arm errs the same for a while, it is the honest one
@@ -164,11 +261,11 @@ def _sigma_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> float:
     """
     # A direction without information has a very large variance here.
     spread = covariance(fisher_information(problem, fit.state, fit.noise))
-    independent = float(spread[12, 12])
+    independent = np.diag(spread)[12:]
     stretches = np.unique((stamps_s - stamps_s[0]) // _STRETCH_S, return_inverse=True)[1]
     count = int(stretches.max()) + 1
     if count < _FEWEST_STRETCHES:
-        return float(np.sqrt(independent))
+        return np.sqrt(independent)
     linear = problem.linear(fit.state)
     residuals, jacobian = linear.residuals, linear.jacobian
     blocks = problem.total_covariance(linear, fit.noise)
@@ -176,4 +273,4 @@ def _sigma_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> float:
     scores = np.zeros((count, jacobian.shape[2]))
     np.add.at(scores, stretches, np.einsum("mij,mi->mj", jacobian, weighted))
     together = spread @ (scores.T @ scores) @ spread * count / max(count - 1, 1)
-    return float(np.sqrt(max(independent, float(together[12, 12]))))
+    return np.asarray(np.sqrt(np.maximum(independent, np.diag(together)[12:])))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
@@ -33,12 +34,14 @@ class Frames:
         stamps_s: (m,) times [s], ascending.
         cam_from_target: (m, 4, 4) [m].
         covariance: (m, 6, 6) of their right perturbations; None where unknown.
+        stack: The corners that the poses were made from, frame by frame; None without any.
     """
 
     mount: Mount
     stamps_s: FloatArray
     cam_from_target: FloatArray
     covariance: FloatArray | None = None
+    stack: CornerStack | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_s)
@@ -49,13 +52,15 @@ class Frames:
         return len(self) > 2 and float(np.median(np.diff(self.stamps_s))) <= WINDOW_S
 
     def only(self, chosen: Mask | IntArray) -> "Frames":
-        """Returns some of them."""
-        known = self.covariance
+        """Returns some of them, in ascending order."""
+        known, stack = self.covariance, self.stack
+        rows = np.arange(len(self))[chosen]
         return replace(
             self,
             stamps_s=self.stamps_s[chosen],
             cam_from_target=self.cam_from_target[chosen],
             covariance=None if known is None else known[chosen],
+            stack=None if stack is None else stack.keep(np.isin(stack.view_of, rows)),
         )
 
 

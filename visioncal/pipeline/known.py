@@ -162,9 +162,7 @@ class Known:
     def seeing(self, refined: Refined) -> Self:
         """Takes over lens, board and poses, and makes the poses of all other views anew."""
         seen = {it.view: it for it in refined.views}
-        known = replace(
-            self, free=refined.free, pixel_px=refined.sigma_px, arm=refined.arm, notes=refined.notes
-        )
+        known = replace(self, free=refined.free, pixel_px=refined.sigma_px, arm=refined.arm)
         known = known.posed([it for view, it in self.poses.items() if view not in seen])
         return replace(known, poses={**known.poses, **seen})
 
@@ -281,7 +279,7 @@ class Known:
             data = data.with_more(self.free.effect(still))
         data = self.shown(views).brought(data)
         if self.clock is not None and self.clock.speeds and poses:
-            data = data.with_more(self.clock.effect(views))
+            data = data.with_more(*map(self.shown(views).carried, self.clock.effects(views)))
         if self.thermal is not None and self.heated_by is not None and poses:
             data = data.with_more(self.thermal.effect(self._thermal_stops(views), self.heated_by))
         if self.arm is not None and self.arm.is_estimated and poses:

@@ -118,11 +118,13 @@ def _clock(known: Known) -> Known:
     session = known.session
     if not waits_for_clock(session):
         return known
-    clocked = set_clock(sweep_of(session, known.robot), known.poses)
+    camera = None if known.camera is None else known.camera.camera
+    clocked = set_clock(sweep_of(session, known.robot, camera), known.poses)
     known = replace(
         known,
         clock=clocked.clock,
         spared=clocked.spared,
+        poses={**known.poses, **clocked.poses},
         notes=(*known.notes, *clocked.notes),
     ).noting(clocked.rejections, clocked.warnings)
     return _reported(known, replace(session, views=clocked.views))
@@ -285,10 +287,11 @@ def _refine(known: Known) -> Known:
         problem = known.closure(known.used).merged(known.stops).problem
         frames = dict(zip(problem.unknown, agreed.edges.state.edges, strict=True))
         return replace(known, arm=arm_errors(_arm(known), problem, frames))
+    notes = known.notes
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
         result = refine(scene, views, _arm(known), known.frames_at(agreed.edges))
-        known = known.seeing(result)
+        known = replace(known.seeing(result), notes=(*notes, *result.notes))
         before, all_of = agreed.mask, known.candidates
         boards = known.shown(all_of)
         agreed = agree(known.closure(all_of), all_of, known.stops_of(all_of), agreed, boards)

@@ -5,14 +5,16 @@ camera's clock is ahead of the robot's is estimated from the motion that both ha
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.estimation.clock import ClockFit, clear_fit, fit_offset
+from visioncal.estimation.clock import ClockFit, DelayedFit, clear_fit, fit_offset
+from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.turned import Frames, Match, turning_matches
 from visioncal.robot import Robot
 from visioncal.session import Session, View
+from visioncal.stages.delays import find_delays, straighten
 from visioncal.stages.motion import Motion, at_rest, is_open, motion_of, slow_and_new
 from visioncal.stages.offset import (
     FEWEST_VIEWS,
@@ -27,7 +29,8 @@ from visioncal.stages.offset import (
     why_untold,
 )
 from visioncal.stages.pnp import ViewPoses
-from visioncal.types import FloatArray, IntArray, Mask, Mount, Rejection
+from visioncal.targets import numbered_positions
+from visioncal.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
 
 # A stated offset is taken to be known so well [s].
 _STATED_SIGMA_S = 1e-3
@@ -49,6 +52,7 @@ class Clocked:
         views: Those that have a pose now, or had one before, in the session's order.
         rejections: Those that have none, and why.
         spared: Why the others of very many are not needed, by view.
+        poses: Poses that were made anew of corners taken before or after their stamp.
         warnings: What gives reason for doubt.
         notes: What is good to know.
     """
@@ -59,6 +63,7 @@ class Clocked:
     spared: Mapping[int, str]
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
+    poses: Mapping[int, ViewPoses] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,27 +75,48 @@ class Sweep:
         mount: Where the camera is.
         views: The rows; those that have a time and no pose of the robot wait for the clock.
         stated_s: The stated offset; None where none is stated.
+        camera: The camera's intrinsics; None where it is not known how it took its images.
+        positions: (c, 3) corners of all boards, numbered through [m].
     """
 
     motion: Motion
     mount: Mount
     views: tuple[View, ...]
     stated_s: float | None
+    camera: Camera | None = None
+    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> Frames:
+        """What the camera saw over time, each view by its best pose."""
+        known = [it.corners for _, it in seen]
+        corners = {view.number: it for (view, _), it in zip(seen, known, strict=True) if it}
+        measured = bool(seen) and len(corners) == len(seen)
+        stacked = measured and self.camera is not None
+        return Frames(
+            "eye-in-hand" if self.mount == "eye-in-hand" else "eye-to-hand",
+            np.array([view.stamp_s for view, _ in seen], dtype=float),
+            np.array([it.cam_from_target[0] for _, it in seen]).reshape(-1, 4, 4),
+            np.array([it.covariance[0] for _, it in seen]) if measured else None,
+            CornerStack.of(corners, self.positions) if stacked else None,
+        )
 
 
-def sweep_of(session: Session, robot: Robot | None) -> Sweep:
+def sweep_of(session: Session, robot: Robot | None, camera: Camera | None = None) -> Sweep:
     """The sweep of a session of one camera and one robot that `waits_for_clock`.
 
     Args:
         session: The session.
         robot: Its nominal robot, where it names a known one.
+        camera: Its camera's intrinsics, where they are known.
 
     Raises:
         DataError: The stream has no poses, and no joints that the robot's model knows.
     """
     clock = session.declaration.clock
     stated_s = clock.camera_minus_robot_s if clock.model_fields_set else None
-    return Sweep(motion_of(session, robot), session.mount, session.views, stated_s)
+    positions = numbered_positions(tuple(session.boards.values()))
+    motion = motion_of(session, robot)
+    return Sweep(motion, session.mount, session.views, stated_s, camera, positions)
 
 
 def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
@@ -110,7 +136,7 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     views.sort(key=lambda view: view.stamp_s or 0.0)
     fitted = [view for view in views if not view.holdout]
     stated_s = sweep.stated_s
-    frames = _frames(sweep.mount, fitted, poses)
+    frames = _frames(sweep, fitted, poses)
     matches = turning_matches(motion.flange, frames, stated_s or 0.0)
     sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
     starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
@@ -119,35 +145,32 @@ def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         nearest_s = fit.offset_s
         match = min(sound, key=lambda it: abs(it.offset_s - nearest_s))
-        return _by_motion(sweep, views, (fit, match))
+        return _by_motion(sweep, views, (fit, match), frames, poses)
     if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
         return _by_turning(sweep, views, sound[0])
     return _untold(sweep, views, (fits, matches))
 
 
-def _frames(mount: Mount, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
+def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
     """What the camera saw over time: of several boards one, and where it can be of clear poses."""
     seen = [(view, poses[view.number]) for view in views]
     boards = [it.board for _, it in seen]
     most = max(sorted(set(boards)), key=boards.count, default=0)
     seen = [it for it in seen if it[1].board == most]
     clear = [it for it in seen if len(it[1].cam_from_target) == 1]
-    seen = clear if 2 * len(clear) > len(seen) else seen
-    measured = bool(seen) and all(it.corners is not None for _, it in seen)
-    return Frames(
-        "eye-in-hand" if mount == "eye-in-hand" else "eye-to-hand",
-        np.array([view.stamp_s for view, _ in seen], dtype=float),
-        np.array([it.cam_from_target[0] for _, it in seen]).reshape(-1, 4, 4),
-        np.array([it.covariance[0] for _, it in seen]) if measured else None,
-    )
+    return sweep.frames(clear if 2 * len(clear) > len(seen) else seen)
 
 
 def _by_motion(
     sweep: Sweep,
     views: Sequence[View],
     told: tuple[ClockFit, Match],
+    frames: Frames,
+    poses: Mapping[int, ViewPoses],
 ) -> Clocked:
     fit, match = told
+    late, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
+    fit = fit if late is None else late.clock
     clock = Clock(
         fit.offset_s,
         fit.sigma_s,
@@ -156,9 +179,45 @@ def _by_motion(
         fit.frames,
         match.correlation,
         speeds={},
+        delays=delays,
     )
     words, warnings = told_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
-    return _placed(sweep, views, clock, warnings, [words])
+    notes = [words, *(it.words for it in delays if it.is_clear)]
+    placed = _placed(sweep, views, clock, warnings, notes)
+    return placed if late is None else _straightened(sweep, placed, views, poses, late)
+
+
+def _straightened(
+    sweep: Sweep,
+    placed: Clocked,
+    views: Sequence[View],
+    poses: Mapping[int, ViewPoses],
+    late: DelayedFit,
+) -> Clocked:
+    """Sets the corners straight of all views that the stream covers."""
+    flange, clock = sweep.motion.flange, placed.clock
+    seen = [(view, poses[view.number]) for view in views if poses[view.number].corners is not None]
+    at_s = np.array([view.stamp_s for view, _ in seen], dtype=float) - clock.camera_minus_robot_s
+    covered = flange.covers(at_s)
+    seen, at_s = [it for it, ok in zip(seen, covered, strict=True) if ok], at_s[covered]
+    if sweep.camera is None:
+        return placed
+    found = straighten(
+        sweep.frames(seen),
+        (flange.at(at_s), flange.speeds(at_s)),
+        [it for _, it in seen],
+        sweep.camera,
+        late,
+    )
+    slopes = {view: it for view, it in found.slopes.items() if view in clock.speeds}
+    places = {it: at for at, it in enumerate(late.delays)}
+    delays = tuple(
+        replace(it, slopes={view: by[:, places[it.of]] for view, by in slopes.items()})
+        if it.of in places
+        else it
+        for it in clock.delays
+    )
+    return replace(placed, clock=replace(clock, delays=delays), poses=found.poses)
 
 
 def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:

@@ -13,6 +13,7 @@ from visioncal.estimation.problem import Effect
 from visioncal.estimation.turned import Match
 from visioncal.figures import figure
 from visioncal.session import View
+from visioncal.stages.delays import FoundDelay
 from visioncal.stages.motion import Motion
 from visioncal.types import FloatArray, Mask
 
@@ -39,6 +40,7 @@ class Clock:
         frames: How many frames in motion told it.
         correlation: Of the angles by which camera and robot turned; None where none was found.
         speeds: (6,) how fast the flange moved, by view, in its own frame [rad/s, m/s].
+        delays: Times within the images that were looked for.
     """
 
     camera_minus_robot_s: float
@@ -48,16 +50,18 @@ class Clock:
     frames: int
     correlation: float | None
     speeds: Mapping[int, FloatArray]
+    delays: tuple[FoundDelay, ...] = ()
 
-    def effect(self, views: Sequence[int]) -> Effect:
-        """The offset's error as an unknown of the chain of some views.
+    def effects(self, views: Sequence[int]) -> tuple[Effect, ...]:
+        """The errors of offset and times within images as unknowns of the chain of some views.
 
-        It is known beforehand as well as it was told: the few used views, slow ones, count twice in
-        that, and tell little of it.
+        Each is known beforehand as well as it was told: the few used views, slow ones, count twice
+        in that, and tell little of it.
         """
         still = np.zeros(6)
         speeds = np.array([self.speeds.get(view, still) for view in views]).reshape(-1, 6)
-        return clock_effect(speeds, self.sigma_s)
+        delays = (it.effect(views) for it in self.delays if it.is_clear)
+        return clock_effect(speeds, self.sigma_s), *delays
 
     def document(self) -> dict[str, object]:
         """What calibration.json says of it."""
@@ -73,6 +77,8 @@ class Clock:
             known["frames"] = self.frames
         if self.correlation is not None:
             known["correlation"] = self.correlation
+        for it in self.delays:
+            known |= it.document()
         return known
 
 

@@ -1,1 +1,9 @@
-"""Effects: vectors of unknowns that move many observations together, one file each."""
+"""Effects: vectors of unknowns that move many observations together, one file each.
+
+Those of time within an image are looked for wherever a camera sees a moving target beside a
+robot's stream: an effect of the kind is a file, and its entry in `EFFECTS`.
+"""
+
+from visioncal.estimation.effects.delays import Delay
+
+EFFECTS: tuple[Delay, ...] = ()
