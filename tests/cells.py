@@ -10,7 +10,7 @@ from visioncal.pipeline.layout import numbered_through
 from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import Cell
+from visioncal.simulation import Cell, Sweep
 from visioncal.simulation.records import approach_text, load_row
 from visioncal.simulation.second import BOARDS
 from visioncal.transforms import invert, log
@@ -72,6 +72,21 @@ def known_of(cell: Cell, *, joints: bool = True, **changes) -> Known:
 def calibrated(cell: Cell, **changes) -> Known:
     """What is known at the end of the way."""
     known = known_of(cell, **changes)
+    for stage in STAGES:
+        if stage.name not in ("robot", "detect"):
+            known = stage.run(known)
+    return known
+
+
+def calibrated_sweep(moved: Sweep) -> Known:
+    """What is known at the end of the way, from the corners of a sweep's frames."""
+    known = replace(known_of(moved.cell, joints=False), base_from_flange={})
+    views = [
+        replace(view, numbers={"stamp_s": stamp_s})
+        for view, stamp_s in zip(known.session.views, moved.frames_s.tolist(), strict=True)
+    ]
+    session = replace(known.session, views=tuple(views)).with_streams({"robot": moved.robot})
+    known = replace(known, session=session)
     for stage in STAGES:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)

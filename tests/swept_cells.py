@@ -52,13 +52,19 @@ def swept_session(
     (arm,) = [it for it in cell.options.robots if it.name == robot]
     sigma = np.repeat([arm.sigma_rad, arm.sigma_m], 3)
     jitter = exp(rng.standard_normal((len(taken_s), 6)) * sigma)
-    flanges = forward(cell.true_arms[robot], way(taken_s)) @ jitter
     seen_from = invert(cell.transforms[f"cam_{SIDE.name}"]) @ cell.transforms[f"base_{robot}"]
-    poses = seen_from @ flanges @ cell.transforms[f"target_{board}"]
     optics, sheet = camera_named(cell.options, SIDE.name).camera, sheet_named(cell.options, board)
     number = 1 + max(it.number for it in session.views)
-    for stamp_s, pose in zip(taken_s.tolist(), poses, strict=True):
-        points = corners_m(sheet) @ pose[:3, :3].T + pose[:3, 3]
+    for stamp_s, off in zip(taken_s.tolist(), jitter, strict=True):
+        late_s = np.zeros(len(corners_m(sheet)))
+        # When a row is taken depends on where its corner is then: settled after three or four.
+        for _ in range(5 if how.readout_s else 1):
+            flanges = forward(cell.true_arms[robot], way(stamp_s + late_s)) @ off
+            poses = seen_from @ flanges @ cell.transforms[f"target_{board}"]
+            points = (poses[:, :3, :3] @ corners_m(sheet)[:, :, None])[:, :, 0] + poses[:, :3, 3]
+            rows = project(optics, points)[:, 1]
+            late_s = how.readout_s * (rows / (optics.resolution[1] - 1) - 0.5)
+        pose = poses[0]
         ids = np.flatnonzero(sees(optics, points, 2.0)).astype(np.int64)
         if len(ids) < 12 or pose[2, 2] < 0.5:
             continue

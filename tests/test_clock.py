@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cells import known_of
+from cells import calibrated_sweep
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DataError, DegenerateError
@@ -112,17 +112,7 @@ def test_stamps_that_jitter_are_told_worse(moved):
 
 
 def test_images_are_placed_in_time_by_their_corners(moved):
-    known = replace(known_of(moved.cell, joints=False), base_from_flange={})
-    views = [
-        replace(view, numbers={"stamp_s": stamp_s})
-        for view, stamp_s in zip(known.session.views, moved.frames_s.tolist(), strict=True)
-    ]
-    timed = replace(known.session, views=tuple(views)).with_streams({"robot": moved.robot})
-    known = replace(known, session=timed)
-    for stage in STAGES:
-        if stage.name not in ("robot", "detect"):
-            known = stage.run(known)
-    result = result_of(known)
+    result = result_of(calibrated_sweep(moved))
     assert abs(result.stages["clock"]["camera_minus_robot_s"] - AHEAD_S) < 1e-4
     assert result.noise["pixel_px"] == pytest.approx(0.1, rel=0.05)
     error, covariance = x_error(moved.cell, result)

@@ -86,6 +86,13 @@ def simulate_command(
     clock_offset_ms: Annotated[
         float, typer.Option(help="With --sweep: what the camera's clock is ahead [ms].")
     ] = 37.0,
+    readout_ms: Annotated[
+        float,
+        typer.Option(
+            help="With --sweep: how long after its first row an image's last is taken [ms]; other "
+            "than 0, the frames have corners (corners.csv) in the place of poses."
+        ),
+    ] = 0.0,
     warm_up: Annotated[
         bool,
         typer.Option(
@@ -181,11 +188,18 @@ def simulate_command(
         how = WarmUpOptions(options, round=Round(first=views))
         write_warm_up(simulate_warm_up(how), folder, temperatures=not currents)
     elif sweep:
-        clocks = SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms)
+        clocks = SweepOptions(
+            camera_minus_robot_s=1e-3 * clock_offset_ms, readout_s=1e-3 * readout_ms
+        )
         write_sweep(swept(options, clocks), folder)
     else:
         _single(options, folder, images=images, touches=touches)
     messages().print(f"wrote {folder}\nwrote {truth_path(folder)}")
+
+
+def _timed(clock_offset_ms: float, readout_ms: float) -> SweepOptions:
+    """When the frames of a sweep are stamped, and their rows taken."""
+    return SweepOptions(camera_minus_robot_s=1e-3 * clock_offset_ms, readout_s=1e-3 * readout_ms)
 
 
 def _single(options: CellOptions, folder: Path, *, images: bool, touches: bool) -> None:

@@ -19,7 +19,7 @@ _ARM = frozenset(("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sig
 _ALONG = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
-    "sweep": _SINGLE | {"clock_offset_ms"},
+    "sweep": _SINGLE | {"clock_offset_ms", "readout_ms"},
     "warm_up": _SINGLE | {"currents"},
     "cell": _ARM
     | _ALONG

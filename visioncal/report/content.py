@@ -283,12 +283,22 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         camera = calibration.camera.camera
         width, height = camera.resolution
         facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
-    clock = read_stage(calibration, "clock", _clock_fact)
-    return (*facts, *_instrument_facts(calibration), *(() if clock is None else (clock,)))
+    clock = read_stage(calibration, "clock", _clock_facts)
+    return (*facts, *_instrument_facts(calibration), *(clock or ()))
+
+
+def _clock_facts(clock: Mapping[str, Any]) -> tuple[Fact, ...]:
+    """How far the camera's clock is ahead of the robot's, and when an image's rows are taken."""
+    shutter = clock.get("shutter")
+    if shutter is None:
+        return (_clock_fact(clock),)
+    sigma_ms = 1e3 * float(shutter["readout_sigma_s"])
+    late = f"{matched(1e3 * float(shutter['readout_s']), sigma_ms)} ms"
+    note = f"{PLUS_MINUS} {significant(sigma_ms)}, from an image's first row to its last"
+    return _clock_fact(clock), Fact(f"{shutter['kind']} shutter", late, note)
 
 
 def _clock_fact(clock: Mapping[str, Any]) -> Fact:
-    """How far the camera's clock is ahead of the robot's."""
     ahead_ms, method = 1e3 * float(clock["camera_minus_robot_s"]), str(clock["method"])
     if "sigma_s" not in clock:
         return Fact("camera's clock", f"{ahead_ms:+.4g} ms", "taken so: views at rest")

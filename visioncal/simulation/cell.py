@@ -30,7 +30,7 @@ from visioncal.types import Camera, Corners, FloatArray
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
 LEAST_DEXTERITY = 0.04
 # A corner nearer to the image's edge is not detected [px].
-_EDGE_PX = 2.0
+EDGE_PX = 2.0
 
 
 class Stream(IntEnum):
@@ -369,7 +369,7 @@ def seen_by(
     for view, (sheet, pose) in enumerate(zip(sheets, cam_from_target, strict=True)):
         points = corners_m(sheet)
         points_cam = points @ pose[:3, :3].T + pose[:3, 3]
-        ids = np.flatnonzero(sees(options.camera, points_cam, _EDGE_PX))
+        ids = np.flatnonzero(sees(options.camera, points_cam, EDGE_PX))
         px = project(options.camera, points_cam[ids])
         seen.append(Corners(view, ids.astype(np.int64), px, options.blur_px))
     return tuple(seen)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DataError
 from visioncal.files import decode_text, read_bytes, write_atomically
 from visioncal.session import MemoryImages, Session, View
+from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project
@@ -88,8 +89,9 @@ def write_session(
 def write_sweep(moved: Sweep, folder: Path | str) -> Path:
     """Writes a sweep as a session's folder, and its truth beside it.
 
-    Each frame is a view with its time and `cam_from_target` as a PnP would measure it; the robot's
-    poses and joints are in `streams/robot.csv`, by another clock.
+    Each frame is a view with its time and `cam_from_target` as a PnP would measure it, or with its
+    corners where the camera takes an image row by row; the robot's poses and joints are in
+    `streams/robot.csv`, by another clock.
 
     Returns:
         The session's folder.
@@ -99,13 +101,16 @@ def write_sweep(moved: Sweep, folder: Path | str) -> Path:
     """
     folder = Path(folder)
     sweep_session(moved, folder.name).save(folder)
-    clock = {"camera_minus_robot_s": moved.options.camera_minus_robot_s}
+    how = moved.options
+    clock = {"camera_minus_robot_s": how.camera_minus_robot_s, "readout_s": how.readout_s}
     write_truth(folder, truth_of(moved.cell) | clock)
     return folder
 
 
 def sweep_session(moved: Sweep, name: str) -> Session:
-    """The session of a sweep: frames with measured poses, and the robot's stream."""
+    """The session of a sweep: frames with measured poses or corners, and the robot's stream."""
+    if moved.options.readout_s:
+        return _sweep_of_corners(moved, name)
     numbers = [
         {"stamp_s": stamp_s} | {f"cft_{key}": value for key, value in pose_row(pose).items()}
         for stamp_s, pose in zip(moved.frames_s.tolist(), measured_poses(moved.cell), strict=True)
@@ -114,6 +119,24 @@ def sweep_session(moved: Sweep, name: str) -> Session:
     columns, document = ("view", *numbers[0]), _document(moved.cell, name)
     session = Session(document, columns, views, None, None, MemoryImages({}))
     return session.with_streams({"robot": moved.robot})
+
+
+def _sweep_of_corners(moved: Sweep, name: str) -> Session:
+    """The session of a sweep whose frames have the corners that a detector found in them."""
+    cell = moved.cell
+    document = {**_document(cell, name), **_targets(cell), "camera": _camera_table(cell)}
+    views = [
+        View(at, numbers={"stamp_s": it}, has_corners=True)
+        for at, it in enumerate(moved.frames_s.tolist())
+    ]
+    found = CornerTable(
+        np.repeat([it.view for it in cell.corners], [len(it.ids) for it in cell.corners]),
+        np.concatenate([it.ids for it in cell.corners]),
+        np.concatenate([it.px for it in cell.corners]),
+        ("",) * sum(len(it.ids) for it in cell.corners),
+    )
+    session = _session(cell, document, ("view", "stamp_s"), views, MemoryImages({}))
+    return replace(session, corner_table=found).with_streams({"robot": moved.robot})
 
 
 def truth_path(folder: Path | str) -> Path:

@@ -15,14 +15,27 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DataError
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import forward
-from visioncal.simulation.cell import Cell, Stream, simulate, stream
+from visioncal.simulation.boards import corners_m
+from visioncal.simulation.cell import (
+    EDGE_PX,
+    Cell,
+    Stream,
+    before_camera,
+    detected,
+    simulate,
+    stream,
+)
+from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
-from visioncal.simulation.second import Shown
+from visioncal.simulation.second import Shown, chains
+from visioncal.transforms import invert
 from visioncal.types import FloatArray
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # A frame that shows less of the board gives no pose.
 _FEWEST_CORNERS = 8
+# In which row a corner is depends on when it is taken: by a few thousandths of itself each time.
+_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,8 @@ class SweepOptions:
         pace_s: How long it takes from one to the next [s].
         robot_hz: Samples of the controller in a second.
         frames_hz: Frames of the camera in a second.
+        readout_s: How long after the image's first row the last is taken, the stamp being that of
+            the middle [s]; 0 for a global shutter.
         camera_minus_robot_s: What the camera's stamps are ahead of the controller's [s].
         jitter_s: Noise of the camera's stamps, as a standard deviation [s].
         encoder_sigma_rad: Noise of the joint angles that the controller tells [rad].
@@ -43,6 +58,7 @@ class SweepOptions:
     pace_s: float = 1.7
     robot_hz: float = 125.0
     frames_hz: float = 30.0
+    readout_s: float = 0.0
     camera_minus_robot_s: float = 0.0
     jitter_s: float = 0.0
     encoder_sigma_rad: float = 2e-6
@@ -87,6 +103,8 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
     taken_s = np.arange(0.5 / how.frames_hz, end_s, 1.0 / how.frames_hz)
     options = replace(options, views=len(taken_s), wrong_views=0)
     frames = simulate(options, way(taken_s))
+    if how.readout_s:
+        frames = _by_rows(frames, way, taken_s, how.readout_s)
     seen = [at for at, it in enumerate(frames.exact_corners) if len(it.ids) >= _FEWEST_CORNERS]
     if len(seen) < 2:
         raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
@@ -102,6 +120,27 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
         taken_s + ahead_s,
         _recorded(robot_s, told, forward(frames.arm, told)),
     )
+
+
+def _by_rows(cell: Cell, way: CubicSpline, taken_s: FloatArray, readout_s: float) -> Cell:
+    """The cell with every corner where it was when its row was taken."""
+    options, height = cell.options, cell.options.camera.resolution[1]
+    jitter = invert(cell.flange_at(cell.joints)) @ cell.true_base_from_flange
+    shown, boards = cell.shown, [*chains(cell.transforms)]
+    exact = list(cell.exact_corners)
+    for at, (stop, board) in enumerate(zip(shown.stops, shown.boards, strict=True)):
+        points = corners_m(cell.sheets[board])
+        middle = points @ cell.cam_from_target[at, :3, :3].T + cell.cam_from_target[at, :3, 3]
+        px = project(options.camera, middle)
+        for _ in range(_ROUNDS):
+            late_s = readout_s * (px[:, 1] / (height - 1) - 0.5)
+            flange = cell.flange_at(way(taken_s[stop] + late_s)) @ jitter[at]
+            poses = before_camera(boards[board], flange)
+            seen = (poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3]
+            px = project(options.camera, seen)
+        ids = np.flatnonzero(sees(options.camera, seen, EDGE_PX))
+        exact[at] = replace(exact[at], ids=ids.astype(np.int64), px=px[ids])
+    return replace(cell, exact_corners=tuple(exact), corners=detected(options, tuple(exact)))
 
 
 def _only(cell: Cell, seen: Sequence[int]) -> Cell:

@@ -5,5 +5,6 @@ robot's stream: an effect of the kind is a file, and its entry in `EFFECTS`.
 """
 
 from visioncal.estimation.effects.delays import Delay
+from visioncal.estimation.effects.rolling_shutter import ROLLING_SHUTTER
 
-EFFECTS: tuple[Delay, ...] = ()
+EFFECTS: tuple[Delay, ...] = (ROLLING_SHUTTER,)

@@ -1,0 +1,38 @@
+"""Effect of a rolling shutter: the rows of an image are taken one after the other."""
+
+import numpy as np
+
+from visioncal.estimation.effects.delays import Delay
+from visioncal.types import FloatArray
+
+# Sensors read an image out within some tens of milliseconds [s].
+_READOUT_SIGMA_S = 0.02
+
+
+def _shares(px: FloatArray, resolution: tuple[int, int]) -> FloatArray:
+    """By which share of the readout corners are taken later: the middle row has the stamp."""
+    return np.asarray(px[:, 1] / (resolution[1] - 1) - 0.5)
+
+
+def _document(
+    readout_s: float, sigma_s: float, is_clear: bool, resolution: tuple[int, int]
+) -> dict[str, object]:
+    return {
+        "shutter": {
+            "kind": "rolling" if is_clear else "global",
+            "readout_s": readout_s,
+            "readout_sigma_s": sigma_s,
+            "line_s": readout_s / (resolution[1] - 1),
+        }
+    }
+
+
+def _words(readout_s: float, sigma_s: float) -> str:
+    late = "after" if readout_s > 0.0 else "before"
+    return (
+        f"The camera has a rolling shutter, which is taken into account: the image's last line is "
+        f"taken {1e3 * abs(readout_s):.2f} ms {late} the first (sigma {1e3 * sigma_s:.2g} ms)."
+    )
+
+
+ROLLING_SHUTTER = Delay("rolling shutter", _READOUT_SIGMA_S, _shares, _document, _words)
