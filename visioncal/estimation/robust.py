@@ -129,7 +129,7 @@ def widened(
         fit: Their fit.
         among: (m,) the units to choose from, of which most are inliers; the noise is scaled by
             their median, because that of the nearest half is less than that of all. Where None, all
-            are chosen from, by the noise of those that are used.
+            are chosen from, within their limits at the noise of those that are used.
     """
     fewest = int(used.sum()) if among is not None else 1
     for _ in range(_ROUNDS):
@@ -137,7 +137,8 @@ def widened(
         directions = np.maximum(it.directions, 1)
         shares = it.squares / chi2_limit(0.5, directions)
         scale = max(float(np.median(shares[used if among is None else among])), 1.0)
-        reached = (it.squares < scale * chi2_limit(_MISSED, directions)) | (it.directions < 1)
+        limit = it.limit if among is None else chi2_limit(_MISSED, directions)
+        reached = (it.squares < scale * limit) | (it.directions < 1)
         if among is not None:
             reached &= among
         if np.array_equal(reached, used) or reached.sum() < fewest:
