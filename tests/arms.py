@@ -6,7 +6,8 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimation.linalg import covariance
-from visioncal.stages.handeye import HandEyeResult, robot_part
+from visioncal.estimation.problem import ROBOT
+from visioncal.stages.handeye import robot_part
 from visioncal.stages.tell import ArmData
 from visioncal.transforms import exp, invert
 
@@ -42,6 +43,17 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     model = erring(robot, blocks)
     data, edges = closure_of(model, mount, q), Edges(X, Z, np.zeros(len(model.values)))
     spread = covariance(closure_information(data, edges, NOISE))
-    nothing = np.zeros(len(spread))
-    result = HandEyeResult(edges, spread, NOISE, (), nothing)
-    return ArmData(data, result, model, ERROR_RAD, q, np.zeros(3))
+    return ArmData(
+        data.problem,
+        edges.state,
+        NOISE.levels,
+        spread,
+        ROBOT,
+        model,
+        np.arange(12, len(spread)),
+        ERROR_RAD,
+        np.arange(len(q)),
+        q,
+        np.zeros(3),
+        np.arange(12),
+    )

@@ -10,16 +10,13 @@ from visioncal.errors import ConvergenceError
 from visioncal.estimation import joint
 from visioncal.estimation.closure import (
     Closure,
-    closure_jacobian,
-    components_of,
     fit_closure,
-    knowledge_of,
     normal_equations,
     residual_blocks,
     solve_closure,
 )
 from visioncal.estimation.problem import ROBOT, Effect
-from visioncal.estimation.solve import RATIO_PRIOR, left_out_residuals
+from visioncal.estimation.solve import RATIO_PRIOR, left_out_residuals, robot_likelihood
 from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -97,12 +94,11 @@ def test_views_of_a_stop_move_with_the_lens_by_their_information():
 def test_the_likelihood_slopes_as_its_differences_say(given):
     data, fit = answered(given, views=10, seed=4)
     edges = fit.edges.moved(np.full(12 + len(fit.edges.shared), 1e-5))
-    residuals = residual_blocks(data, edges, fit.noise)[0]
-    known = knowledge_of(data, edges)
+    found = robot_likelihood(data.problem, edges.state, fit.noise.levels)
+    errors, slopes = found.reduced.errors, found.reduced.slopes[:, :, found.moving]
 
     def at(logs):
-        jacobian, parts = closure_jacobian(data, edges), components_of(data, edges.z)
-        return _likelihood(residuals, jacobian, parts, known, logs, RATIO_PRIOR)
+        return _likelihood(errors, slopes, found.components, found.known, logs, RATIO_PRIOR)
 
     logs, step = np.log(2.0 * fit.noise.sigmas), 1e-4
     for level in range(2):
@@ -116,7 +112,7 @@ def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
     def runs_away(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(joint, "fit_closure", runs_away)
+    monkeypatch.setattr(joint, "fit_problem", runs_away)
     with pytest.raises(ConvergenceError, match="poses of other views than the images"):
         calibrated(simulate(replace(FINE, views=6)))
 

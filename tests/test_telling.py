@@ -5,17 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import ERROR_RAD, NOISE, TOOL, arm_data, closure_of, erring
+from arms import ERROR_RAD, NOISE, TOOL, X, Z, arm_data, closure_of, erring
 from cells import calibrated
 from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Closure, closure_information
+from visioncal.estimation.closure import Edges
 from visioncal.estimation.indices import Indices, singular_values
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parameters import free_parameters, parameter_moves
-from visioncal.estimation.problem import Effect
+from visioncal.estimation.problem import Effect, Problem
+from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures, tool_slopes
 from visioncal.pipeline.arm import telling_of
@@ -145,11 +146,11 @@ def test_a_second_board_adds_six_values(mount):
     arm = arm_data(robot, postures(robot)[:40], mount)
     seen = np.where(np.arange(40)[:, None, None] % 2 == 1, np.eye(6), 0.0)
     place = Effect.free("board", Knowledge(np.zeros((6, 6)), np.zeros(6)), seen)
-    data = replace(arm.data, effects=(place, *arm.data.effects))
-    edges = replace(arm.result.edges, shared=np.zeros(6 + len(arm.units)))
-    spread = covariance(closure_information(data, edges, NOISE))
-    result = replace(arm.result, edges=edges, covariance=spread)
-    telling = tell(replace(arm, data=data, result=result, frames=np.arange(18)))
+    problem = arm.problem.with_effects([place, *arm.problem.effects])
+    state = replace(arm.state, values=problem.start_values)
+    spread = covariance(fisher_information(problem, state, arm.noise))
+    further = {"frames": np.arange(18), "columns": 6 + arm.columns}
+    telling = tell(replace(arm, problem=problem, state=state, covariance=spread, **further))
     told = telling.told
     assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
     # Half of the stops have a board of their own to place: they tell less of the arm.
@@ -266,20 +267,20 @@ def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     arm = arm_data(robot, postures(robot)[:15], mount)
     telling = tell(arm)
     anywhere = postures(arm.model.robot)
-    place = tool_slopes(arm.model, arm.result.edges, mount, arm.at, anywhere)
+    place = tool_slopes(arm.model, Edges(X, Z, np.zeros(0)), mount, arm.at, anywhere)
 
-    def variance(data: Closure) -> float:
-        fitted = covariance(closure_information(data, arm.result.edges, NOISE))
+    def variance(problem: Problem) -> float:
+        fitted = covariance(fisher_information(problem, arm.state, arm.noise))
         return float(np.mean(np.einsum("mij,jk,mik->m", place, fitted, place)))
 
-    whole = variance(arm.data)
+    whole = variance(arm.problem)
     for stop in range(15):
-        rest = arm.data.subset(np.arange(15) != stop)
+        rest = arm.problem.subset(np.arange(15) != stop)
         # Exact but for rounding.
         assert telling.worth[stop] == pytest.approx(variance(rest) / whole - 1.0, rel=1e-6)
     assert telling.worth.min() > 0.0
     assert telling.sigmas_m == pytest.approx(
-        np.sqrt(np.einsum("mij,jk,mik->m", place, arm.result.covariance, place))
+        np.sqrt(np.einsum("mij,jk,mik->m", place, arm.covariance, place))
     )
 
 
@@ -297,9 +298,14 @@ def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
         seen = exact.camera @ exp(rng.normal(size=(25, 6)) * np.repeat([5e-5, 3e-5], 3))
         result = solve_hand_eye(replace(exact, camera=seen))
         found = model.moved(result.edges.shared)
-        data = closure_of(found, "eye-in-hand", q)
+        data = replace(closure_of(found, "eye-in-hand", q), camera=seen)
         arm = replace(
-            arm_data(robot, q), data=replace(data, camera=seen), result=result, model=found
+            arm_data(robot, q),
+            problem=data.problem,
+            state=result.edges.state,
+            noise=result.noise.levels,
+            covariance=result.covariance,
+            model=found,
         )
         telling = tell(arm, convention)
         like = convert_table(table_from_document(robot.document), convention)

@@ -47,14 +47,15 @@ def calibrate(
     """
     loaded = session if isinstance(session, Session) else Session.load(session)
     if is_whole_cell(loaded):
-        check_whole(solver, level, convention)
-        return Calibration.whole(align(loaded, level=level, progress=progress))
+        check_whole(solver, level)
+        found = align(loaded, level=level, convention=convention, progress=progress)
+        return Calibration.whole(found)
     return pipeline.calibrate(
         loaded, solver=solver, level=level, convention=convention, progress=progress
     )
 
 
-def check_whole(solver: SolverName, level: str, convention: Convention | None) -> None:
+def check_whole(solver: SolverName, level: str) -> None:
     """Refuses what is not asked of a whole cell.
 
     Raises:
@@ -63,7 +64,6 @@ def check_whole(solver: SolverName, level: str, convention: Convention | None) -
     given = {
         "solver": solver if solver != "joint" else "",
         "level": level if level not in LEVELS else "",
-        "convention": convention or "",
     }
     wrong = [f"{name} {it}" for name, it in given.items() if it]
     if wrong:

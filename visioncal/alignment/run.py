@@ -42,15 +42,17 @@ from visioncal.alignment.unseen import budget_mm, left_out
 from visioncal.alignment.written import corner_residuals, fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.solve import covariance_of
-from visioncal.robot import Robot
+from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.delays import FoundDelay
 from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.offset import Clock
+from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
-from visioncal.targets import target_document
+from visioncal.targets import corner_positions, target_document
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, Progress
 
@@ -59,6 +61,7 @@ def align(
     session: Session | Path | str,
     *,
     level: str = "auto",
+    convention: Convention | None = None,
     corners: Mapping[int, Corners] | None = None,
     progress: Progress | None = None,
 ) -> Alignment:
@@ -70,6 +73,7 @@ def align(
         session: A session, or the path of its folder or recording.
         level: How far each arm is calibrated, as `calibrate` has it; beyond `hand-eye` it takes
             joint angles and a model.
+        convention: Of the joint table in which calibrated arms' numbers are told.
         corners: What was found in its images before, by view; None to look.
         progress: Told of long work.
 
@@ -82,6 +86,8 @@ def align(
     """
     if level not in LEVELS:
         raise DataError(f"level {level!r} is not one of {', '.join(LEVELS)}.")
+    if convention is not None and convention not in CONVENTIONS:
+        raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
     looked = look_around(read_cell(loaded), corners, progress)
     if progress is not None:
@@ -92,11 +98,16 @@ def align(
         cell = read_cell(clocks.session)
         cell = replace(cell, reasons={**cell.reasons, **clocks.reasons})
         solved = solve(cell, looked, clocks, level)
-        return alignment_of(loaded, cell, looked, clocks, solved)
+        return alignment_of(loaded, cell, looked, clocks, solved, convention)
 
 
 def alignment_of(
-    session: Session, cell: Cell, looked: Looked, clocks: Clocks, solved: Solved
+    session: Session,
+    cell: Cell,
+    looked: Looked,
+    clocks: Clocks,
+    solved: Solved,
+    convention: Convention | None = None,
 ) -> Alignment:
     """Puts the result together.
 
@@ -106,6 +117,7 @@ def alignment_of(
         looked: What its cameras saw.
         clocks: The offsets of clocks by which its rows have poses.
         solved: The fit of what of it is tied.
+        convention: Of the joint table in which calibrated arms' numbers are told.
 
     Raises:
         DegenerateError: The observations leave a frame open.
@@ -125,6 +137,7 @@ def alignment_of(
         for name, it in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
+    told = tellings(solved, spread, convention)
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
     moved, noise, faults = movements(solved), _noise(solved), pose_faults(solved)
     held_out = left_out(solved)
@@ -144,7 +157,11 @@ def alignment_of(
             *(moved_words(it) for it in moved),
             *(f"{it.frame} is tied to nothing. {it.remedy}" for it in untied),
         ],
-        notes=(*clocks.notes, *_clock_words(clocks, solved, spread), *notes_on_arms(solved.arms)),
+        notes=(
+            *clocks.notes,
+            *_clock_words(clocks, solved, spread),
+            *notes_on_arms(solved.arms, told),
+        ),
     )
     return Alignment(
         session_name=session.name,
@@ -164,7 +181,7 @@ def alignment_of(
         weakest=weakest_link(solved.cell, last),
         verdict=judge(findings),
         details=_details(clocks, solved, spread),
-        arms=_arms(session, solved, spread),
+        arms=_arms(session, solved, spread, told),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
         stages={
             **fit_sections(session, solved, spread, len(edges)),
@@ -175,14 +192,37 @@ def alignment_of(
     )
 
 
-def _arms(session: Session, solved: Solved, spread: FloatArray) -> dict[str, RobotResult]:
+def tellings(
+    solved: Solved, spread: FloatArray, convention: Convention | None
+) -> dict[str, Telling]:
+    """What the stops tell of the calibrated arms, by robot."""
+    agreed, plates = solved.agreed, solved.cell.session.plates
+    middles = {
+        frame_name("target", name): corner_positions(it).mean(axis=0) for name, it in plates.items()
+    }
+    part = agreed.problem.subset(agreed.used)
+    found = {
+        name: arm.tell(part, agreed.fit, spread, middles, convention)
+        for name, arm in solved.arms.items()
+    }
+    return {name: it for name, it in found.items() if it is not None}
+
+
+def _arms(
+    session: Session, solved: Solved, spread: FloatArray, told: Mapping[str, Telling]
+) -> dict[str, RobotResult]:
     models = session.robot_documents
     found = {
         robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
         for name in session.robots
     }
+    first: dict[int, int] = {}
+    for row in solved.cell.rows:
+        first.setdefault(row.station, row.view)
+    part = solved.agreed.problem.subset(solved.agreed.used)
     for name, arm in solved.arms.items():
-        stages = arm.documents(solved.agreed.problem, spread)
+        stops = stops_of(part, name).tolist()
+        stages = arm.documents(part, spread, told.get(name), [first[it] for it in stops])
         found[name] = replace(found[name], stages=stages)
     return found
 

@@ -19,6 +19,7 @@ from visioncal.cli.console import (
 from visioncal.figures import figure
 from visioncal.joining import leftover
 from visioncal.outputs import write_alignment
+from visioncal.robot import Convention
 from visioncal.session import Session
 
 # Levels of noise that are nearer to what is said are not worth a word.
@@ -52,11 +53,13 @@ def align_command(
         typer.echo(json.dumps(found.document(), indent=2))
 
 
-def align_into(session: Session, out: Path, *, level: str, quiet: bool) -> Alignment:
+def align_into(
+    session: Session, out: Path, *, level: str, quiet: bool, convention: Convention | None = None
+) -> Alignment:
     """Aligns a session's cell, writes the result into a folder and tells of it."""
     left = leftover(out)
     with shown_progress(quiet=quiet) as told:
-        result = align(session, level=level, progress=told)
+        result = align(session, level=level, convention=convention, progress=told)
     if left is not None:
         left.keep()
     written = write_alignment(out, session, result)

@@ -62,8 +62,9 @@ def calibrate_command(
     """
     loaded = Session.load(session)
     if is_whole_cell(loaded):
-        check_whole(solver, level, convention)
-        document = whole_document(align_into(loaded, out, level=level, quiet=as_json))
+        check_whole(solver, level)
+        found = align_into(loaded, out, level=level, convention=convention, quiet=as_json)
+        document = whole_document(found)
         if as_json:
             typer.echo(json.dumps(document, indent=2))
         return

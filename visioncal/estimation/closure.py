@@ -40,8 +40,8 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.solve import (
     normal_equations as information_and_gradient,
 )
-from visioncal.estimation.variance import Components, Knowledge
-from visioncal.transforms import adjoint, exp, invert, log, mean_transform, rotation_angle
+from visioncal.estimation.variance import Knowledge
+from visioncal.transforms import exp, invert, log, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
 
 # Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
@@ -334,29 +334,6 @@ def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatAr
     return information + np.diag(np.where(problem.moving, 0.0, _CHOSEN * scale)), gradient
 
 
-def weighted_slopes(
-    data: Closure, edges: Edges, noise: Noise
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What makes up the score, where the chain closes exactly.
-
-    Returns:
-        (m, 6, 12 + k) inverse covariance of each residual times its derivatives, and the (m, 6, 6)
-        covariances that the camera and the robot contribute to the residual.
-    """
-    jacobian, camera, total = _where_it_closes(data, edges, noise)
-    return np.asarray(np.linalg.solve(total, jacobian), dtype=float), camera, total - camera
-
-
-def _where_it_closes(
-    data: Closure, edges: Edges, noise: Noise
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Derivatives of residuals at exact poses, and covariances: the camera's, and all."""
-    problem = data.problem
-    linear = problem.linear(State(edges.state.edges, problem.start_values), ideal=True)
-    camera = problem.covariance(noise.levels)
-    return linear.jacobian, camera, problem.total_covariance(linear, noise.levels)
-
-
 def residual_blocks(
     data: Closure, edges: Edges, noise: Noise
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -375,26 +352,6 @@ def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
     problem = data.problem
     levels, value = robot_levels(problem, edges.state, starting_noise(problem), from_above=True)
     return _noise(replace(starting_noise(problem), robots=levels)), value
-
-
-def knowledge_of(data: Closure, edges: Edges) -> Knowledge:
-    """What is known of the unknowns without the robot: of edges and of what is shared."""
-    return data.problem.knowledge(edges.state)
-
-
-def components_of(data: Closure, z: FloatArray) -> Components:
-    """How the camera's known noise and the two levels make up the residuals' covariance."""
-    levels = np.zeros((2, 6, 6))
-    levels[0, :3, :3] = levels[1, 3:, 3:] = np.eye(3)
-    if data.camera_covariance is None:
-        return Components(
-            np.zeros((len(data), 6, 6)), np.repeat(levels[:, None], len(data), axis=1)
-        )
-    # The flange's error, seen in the target's frame; the camera's is there already.
-    flange_from_target = invert(data.robot) @ z if data.mount == "eye-in-hand" else z[None]
-    carried = np.broadcast_to(adjoint(invert(flange_from_target)), (len(data), 6, 6))
-    parts = carried @ levels[:, None] @ np.swapaxes(carried, 1, 2)
-    return Components(data.camera_covariance, parts)
 
 
 def _edges(state: State) -> Edges:

@@ -437,6 +437,14 @@ class Problem:
         return found, np.concatenate([robots.reshape(-1, none.shape[1]), none])
 
     @cached_property
+    def shared_units(self) -> tuple[tuple[int, IntArray], ...]:
+        """The units of several observations, each with these."""
+        of, members = self.units
+        count = np.bincount(of[of >= 0], minlength=len(members))
+        several = np.flatnonzero(count > 1).tolist()
+        return tuple((unit, np.flatnonzero(of == unit)) for unit in several)
+
+    @cached_property
     def alone(self) -> Mask:
         """(n,) which poses share the error of one robot's flange with no other observation."""
         of, members = self.units

@@ -455,11 +455,12 @@ def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArr
     total = problem.total_covariance(linear, noise)
     left = total - linear.spread(fitted)
     found = (total @ covariance(left) @ linear.residuals[:, :, None])[:, :, 0]
-    (of, members), errors = problem.units, problem.error_covariance(noise)
-    count = np.bincount(of[of >= 0], minlength=len(members))
-    own, jacobian = problem.covariance(noise), linear.jacobian
-    for unit in np.flatnonzero(count > 1).tolist():
-        rows = np.flatnonzero(of == unit)
+    errors, own, jacobian = (
+        problem.error_covariance(noise),
+        problem.covariance(noise),
+        linear.jacobian,
+    )
+    for unit, rows in problem.shared_units:
         by_errors, slopes = (
             it[rows].reshape(6 * len(rows), -1) for it in (linear.by_errors, jacobian)
         )
@@ -467,6 +468,35 @@ def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArr
         without = covariance(among - slopes @ fitted @ slopes.T)
         found[rows] = (among @ without @ linear.residuals[rows].ravel()).reshape(-1, 6)
     return np.asarray(found)
+
+
+def whitened_slopes(
+    problem: Problem, state: State, noise: Noise, measured: Mask | None = None
+) -> FloatArray:
+    """Derivatives (n, d, p) of residuals of unit covariance, where all chains close exactly.
+
+    Their squares, summed, are all of `fisher_information` but what is known beside the
+    observations. Rows of one unit are made independent of those before them.
+
+    Args:
+        problem: The observations.
+        state: Where.
+        noise: Its levels.
+        measured: (6,) the d components of the poses that count; None for all.
+    """
+    linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
+    kept = np.flatnonzero(np.ones(6, dtype=bool) if measured is None else measured)
+    jacobian, by_errors = linear.jacobian[:, kept], linear.by_errors[:, kept]
+    own = own[:, kept][:, :, kept]
+    total = problem.total_covariance(linear, noise)[:, kept][:, :, kept]
+    found = np.asarray(np.linalg.solve(np.linalg.cholesky(total), jacobian))
+    errors = problem.error_covariance(noise)
+    for unit, rows in problem.shared_units:
+        slopes = by_errors[rows].reshape(len(rows) * len(kept), -1)
+        among = block_diag(*own[rows]) + slopes @ errors[unit] @ slopes.T
+        flat = jacobian[rows].reshape(len(slopes), -1)
+        found[rows] = np.linalg.solve(np.linalg.cholesky(among), flat).reshape(jacobian[rows].shape)
+    return found
 
 
 def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:

@@ -9,13 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure, Edges, Noise, components_of, weighted_slopes
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import FloatArray
 
 # Directions that move the pose by less than this share of the best told move nothing.
 LEAST_SHARE = 1e-7
-EDGES = np.arange(12)
-WHOLE_POSE: Mask = np.ones(6, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,46 +56,6 @@ class Slopes:
         basis, sizes, _ = np.linalg.svd(self.frames[:, shown] / scale[shown], full_matrices=False)
         basis = basis[:, sizes > LEAST_SHARE * sizes[0]]
         return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
-
-
-def stop_slopes(
-    data: Closure,
-    edges: Edges,
-    noise: Noise,
-    arm_units: FloatArray,
-    *,
-    frames: IntArray = EDGES,
-    measured: Mask = WHOLE_POSE,
-) -> Slopes:
-    """The stops' slopes, in units of their noise.
-
-    Args:
-        data: The views, one a stop; the arm's errors are the last of what they share.
-        edges: The answer.
-        noise: Of the flange, or of both together.
-        arm_units: (p,) the size of each error.
-        frames: Which of the unknowns are of the frames; others are held.
-        measured: (6,) which components of the target's pose are seen (rotation, translation).
-    """
-    weighted, camera, robot = weighted_slopes(data, edges, noise)
-    spread = camera + robot
-    slopes = (spread @ weighted)[:, measured]
-    root = np.linalg.cholesky(spread[:, measured][:, :, measured])
-    return _split(np.linalg.solve(root, slopes), frames, arm_units)
-
-
-def mean_weight(data: Closure, edges: Edges, noise: Noise, measured: Mask) -> FloatArray:
-    """(6, 6) what makes noise of a pose like the stops' white; nothing of what is not seen."""
-    spread = components_of(data, edges.z).total(noise.sigmas)[:, measured][:, :, measured]
-    weight = np.zeros((6, 6))
-    root = np.linalg.cholesky(np.linalg.inv(spread).mean(axis=0))
-    weight[np.ix_(measured, measured)] = root.T
-    return weight
-
-
-def posture_slopes(slopes: FloatArray, weight: FloatArray, arm_units: FloatArray) -> Slopes:
-    """Slopes (m, 6, 12 + p) of poses at any postures, in units of a noise like the stops'."""
-    return _split(weight @ slopes, EDGES, arm_units)
 
 
 def what_is_told(stops: Slopes, anywhere: Slopes) -> Told:
@@ -157,8 +114,3 @@ def frames_apart(frames: FloatArray, arm: FloatArray) -> FloatArray:
     sizes, turned = right_vectors(free)
     null = turned[sizes <= LEAST_SHARE * sizes[0]]
     return np.asarray(np.eye(arm.shape[1]) - null.T @ null)
-
-
-def _split(slopes: FloatArray, frames: IntArray, arm_units: FloatArray) -> Slopes:
-    flat, size = slopes.reshape(-1, slopes.shape[2]), len(arm_units)
-    return Slopes(flat[:, frames], flat[:, flat.shape[1] - size :] * arm_units)

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.estimation.parameters import Parameter
 from visioncal.estimation.told import LEAST_SHARE, Slopes, right_vectors
 from visioncal.robot import Robot, parallel_axes
-from visioncal.types import FloatArray, Mount
+from visioncal.types import FloatArray
 
 # Entries of a null direction below this share of its largest are rounding.
 _NOTHING = 1e-6
@@ -32,7 +32,7 @@ class Null:
 
     Attributes:
         directions: (r, k) reduced to row echelon form: each but for a few numbers is zero.
-        frames: (12, r) how the frames at both ends of the chain make up for each.
+        frames: (12, r) how the frames of the base and of what the arm carries make up for each.
     """
 
     directions: FloatArray
@@ -80,22 +80,19 @@ def imitated(numbers: Slopes, arm: Slopes, directions: FloatArray) -> FloatArray
     return np.asarray(np.linalg.lstsq(by_numbers, by_arm @ directions, rcond=LEAST_SHARE)[0])
 
 
-def null_words(
-    null: Null, parameters: Sequence[Parameter], robot: Robot, mount: Mount
-) -> Iterator[str]:
+def null_words(null: Null, parameters: Sequence[Parameter], robot: Robot) -> Iterator[str]:
     """Says what no stops can tell, number by number.
 
     Args:
         null: What that is.
         parameters: The table's numbers.
         robot: The nominal arm.
-        mount: Where the camera is.
     """
     for rows in _connected(null.directions):
         involved = np.flatnonzero(null.directions[rows].any(axis=0)).tolist()
         named = [parameters[at] for at in involved]
         if len(named) == 1:
-            frame = _frame(null.frames[:, rows[0]], mount)
+            frame = _frame(null.frames[:, rows[0]])
             yield f"{_thing(named[0], robot)} cannot be told from the {frame} frame"
         elif len(rows) < len(named) - 1:
             left = len(named) - len(rows)
@@ -125,10 +122,10 @@ def _is_sum(directions: FloatArray, named: Sequence[Parameter]) -> bool:
     return alike and bool(np.abs(directions.sum(axis=1)).max() < _NOTHING)
 
 
-def _frame(edges: FloatArray, mount: Mount) -> str:
-    """The end of the chain whose frame makes up for a change of the arm."""
-    x, z = np.linalg.norm(edges.reshape(2, 6), axis=1)
-    return "tool" if (x > z) == (mount == "eye-in-hand") else "base"
+def _frame(frames: FloatArray) -> str:
+    """The end of the arm whose frame makes up for a change of it."""
+    base, tool = np.linalg.norm(frames.reshape(2, 6), axis=1)
+    return "tool" if tool > base else "base"
 
 
 def _summed(named: Sequence[Parameter], robot: Robot) -> str:

@@ -2,25 +2,32 @@
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure, Edges, Noise, closure_information, weighted_slopes
-from visioncal.estimation.linalg import covariance, gram
+from visioncal.estimation.linalg import covariance, covariance_among, gram
+from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.solve import fisher_information, whitened_slopes
 from visioncal.types import FloatArray, IntArray
 
 
 def stop_worth(
-    data: Closure, edges: Edges, noise: Noise, place: FloatArray, free: IntArray
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    stops: IntArray,
+    place: FloatArray,
+    free: IntArray,
 ) -> FloatArray:
     """By which share the mean variance of some places would grow without each stop.
 
     The mean variance over a region is the criterion of I-optimality (Atkinson, Donev and Tobias
-    2007, section 10.6). Leaving a stop out takes six rows away, so the covariance without it
+    2007, section 10.6). Leaving a stop out takes its rows away, so the covariance without it
     follows from that of all stops (Woodbury's identity) exactly, with the noise and the knowledge
     beforehand as they are.
 
     Args:
-        data: The views, one a stop.
-        edges: The answer.
-        noise: Of the flange, or of both together.
+        problem: The observations.
+        state: The answer.
+        noise: Its levels.
+        stops: (m,) the stops to be left out in turn.
         place: (k, 3, f) derivatives of the places by the free unknowns.
         free: (f,) which of the unknowns these are; others are held, such as the board's size, of
             which no stop tells much.
@@ -28,12 +35,15 @@ def stop_worth(
     Returns:
         (m,) shares; large where a stop alone tells something.
     """
-    weighted, camera, robot = weighted_slopes(data, edges, noise)
-    spread = camera + robot
-    slopes = (spread @ weighted)[:, :, free]
-    fitted = covariance(closure_information(data, edges, noise)[np.ix_(free, free)])
+    moving = np.isin(np.arange(problem.size), free) & problem.counted
+    fitted = covariance_among(fisher_information(problem, state, noise), moving)
+    fitted = fitted[np.ix_(free, free)]
+    slopes = whitened_slopes(problem, state, noise)[:, :, free]
     mean = gram(place, place) / len(place)
-    gain = slopes @ fitted
-    left = spread - gain @ np.swapaxes(slopes, 1, 2)
-    growth = np.einsum("mij,mji->m", covariance(left), gain @ mean @ np.swapaxes(gain, 1, 2))
+    growth = np.zeros(len(stops))
+    for at, stop in enumerate(stops.tolist()):
+        rows = slopes[problem.observations.stops == stop].reshape(-1, len(free))
+        gain = rows @ fitted
+        left = covariance(np.eye(len(rows)) - gain @ rows.T)
+        growth[at] = np.sum(left * (gain @ mean @ gain.T))
     return np.asarray(growth / np.sum(fitted * mean))

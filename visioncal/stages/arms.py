@@ -1,21 +1,31 @@
 """The robots' arms: where each stood, which of its errors show, and how they are unknowns."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from visioncal.estimation.arm import ArmErrors, find_arm_errors, link_basis, pose_basis
-from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
+from visioncal.estimation.arm import (
+    ArmErrors,
+    find_arm_errors,
+    link_basis,
+    pose_basis,
+    stops_of,
+)
+from visioncal.estimation.armmodel import BACKLASH, RIGID, ArmModel, blocks_of
+from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.told import frames_apart
 from visioncal.estimation.workspace import postures
-from visioncal.robot import Loads
+from visioncal.guess.joints import JointReading
+from visioncal.robot import Convention, Loads
 from visioncal.stages.backlash import plays_of
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import Kinematics, choose_level
+from visioncal.stages.tell import ArmData, Telling, tell
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray, Mask
 
@@ -86,12 +96,59 @@ class RobotArm:
         )
         return replace(self, errors=found)
 
-    def documents(self, problem: Problem, spread: FloatArray) -> dict[str, Any]:
+    def tell(
+        self,
+        problem: Problem,
+        fit: Solution,
+        spread: FloatArray,
+        middles: Mapping[str, FloatArray],
+        convention: Convention | None = None,
+    ) -> Telling | None:
+        """What the stops tell of it; None where it stands as stated, but for play in its joints.
+
+        Args:
+            problem: The observations that agree, with its errors among the unknowns.
+            fit: Their fit.
+            spread: (p, p) its covariance.
+            middles: (3,) the middle of each printed target by its frame, in that [m].
+            convention: Of the table that is wanted; see `stages.tell`.
+        """
+        model, errors = self.model, self.errors
+        if model is None or errors is None or not model.weights.keys() - {BACKLASH}:
+            return None
+        if self.joints_rad is None:
+            return None
+        (effect,) = self.effects()
+        stops, every = stops_of(problem, self.robot), np.arange(problem.size)
+        observed = ArmPair.of(problem, fit.state, self.robot).observed
+        edges = every[: 6 * len(problem.unknown)]
+        seen = ArmData(
+            problem,
+            fit.state,
+            fit.noise,
+            spread,
+            self.robot,
+            model,
+            every[problem.effect_columns[effect.name]],
+            errors.sigma,
+            stops,
+            self.joints_rad[np.searchsorted(np.flatnonzero(self.stood), stops)],
+            middles.get(observed, np.zeros(3)),
+            edges[problem.counted[edges]],
+            apart=block_diag(*(self._apart(model, name) for name in model.weights)),
+        )
+        return tell(seen, convention)
+
+    def documents(
+        self, problem: Problem, spread: FloatArray, telling: Telling | None, views: Sequence[int]
+    ) -> dict[str, Any]:
         """What was found of it, as calibration.json has it: one section a stage.
 
         Args:
             problem: The problem that has its errors.
             spread: (p, p) covariance of its unknowns.
+            telling: What the stops tell of it.
+            views: By which views the stops of that go.
         """
         found: dict[str, Any] = {}
         if self.errors is not None:
@@ -104,6 +161,8 @@ class RobotArm:
                 plays = [it.document() for it in plays_of(self.model, spread[mine, mine])]
                 found["kinematics"] |= {"backlash": plays} if plays else {}
                 found["kinematics"]["robot"] = dict(self.model.robot.document)
+                if telling is not None:
+                    found["kinematics"] |= telling.document(self.model.nominal, views, self._zero)
         return found
 
     def _any_errors(self) -> FloatArray:
@@ -138,7 +197,14 @@ class RobotArm:
         if self.joints_rad is None:
             raise RuntimeError("an arm is calibrated by its joints")
         columns = self._by_stop(model.columns(name, self.joints_rad, self.loads))
-        return columns @ self.apart[name] if name in self.apart else columns
+        return columns @ self._apart(model, name)
+
+    def _apart(self, model: ArmModel, name: str) -> FloatArray:
+        return self.apart[name] if name in self.apart else np.eye(model.size_of(name))
+
+    @property
+    def _zero(self) -> JointReading | None:
+        return None if self.matched is None else self.matched.zero
 
     def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
         """Linearises the calibrated arm anew where a fit has it.

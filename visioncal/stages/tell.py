@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import Closure
+from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.lacking import Move, joints_to_move
 from visioncal.estimation.parameters import (
@@ -15,17 +16,9 @@ from visioncal.estimation.parameters import (
     parameter_moves,
     parameter_slopes,
 )
-from visioncal.estimation.told import (
-    EDGES,
-    WHOLE_POSE,
-    Slopes,
-    Told,
-    count_told,
-    mean_weight,
-    posture_slopes,
-    stop_slopes,
-    what_is_told,
-)
+from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.solve import whitened_slopes
+from visioncal.estimation.told import Slopes, Told, count_told, what_is_told
 from visioncal.estimation.untold import (
     dominant_words,
     imitated,
@@ -34,9 +27,10 @@ from visioncal.estimation.untold import (
     null_of,
     null_words,
 )
-from visioncal.estimation.workspace import chain_slopes, pose_slopes, postures, tool_slopes
+from visioncal.estimation.workspace import postures
 from visioncal.estimation.worth import stop_worth
 from visioncal.figures import figure
+from visioncal.guess.joints import JointReading
 from visioncal.robot import (
     Convention,
     DHTable,
@@ -46,9 +40,11 @@ from visioncal.robot import (
     table_from_document,
     table_of,
 )
-from visioncal.stages.handeye import HandEyeResult
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Mask
+
+# So many places are enough for a map.
+_PLACES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,41 +92,119 @@ class Telling:
     places: FloatArray
     sigmas_m: FloatArray
 
+    def document(
+        self, robot: Robot, views: Sequence[int], lost: JointReading | None = None
+    ) -> dict[str, Any]:
+        """It as calibration.json has it.
+
+        Args:
+            robot: The nominal arm.
+            views: (m,) by which views the stops go.
+            lost: A joint whose zero was found far from where it was stated.
+        """
+        ordered = sorted(zip(self.worth.tolist(), views, strict=True), key=lambda it: -it[0])
+        return {
+            "convention": self.convention,
+            "parameters": [_number(it, robot, lost) for it in self.estimates],
+            "workspace_sigma_mm": {
+                "median": 1e3 * float(np.median(self.sigmas_m)),
+                "p95": 1e3 * float(np.quantile(self.sigmas_m, 0.95)),
+            },
+            "workspace_map": [
+                dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_mm": 1e3 * sigma}
+                for place, sigma in list(
+                    zip(self.places.tolist(), self.sigmas_m.tolist(), strict=True)
+                )[:_PLACES]
+            ],
+            "observability": self._observability(),
+            "not_told": list(self.not_told),
+            "stops": [{"view": view, "worth": worth} for worth, view in ordered],
+        }
+
+    def _observability(self) -> dict[str, Any]:
+        told, indices = self.told, self.indices
+        counted = {
+            "columns": told.columns,
+            "identifiable": told.identifiable,
+            "told": told.told,
+        }
+        if indices is None:
+            return counted
+        return counted | {
+            "condition": indices.condition,
+            "o1": indices.o1,
+            "o2": indices.o2,
+            "o3": indices.o3,
+            "o4": indices.o4,
+            "o5": indices.o5,
+        }
+
+
+def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> dict[str, Any]:
+    joint, nominal = estimate.parameter.joint, estimate.nominal
+    if lost is not None and estimate.parameter.name == "theta_rad":
+        # The fit starts where the zero was found; what is told starts where it was stated.
+        nominal -= float(robot.chain.functions[joint, 1] * lost.zeros[joint])
+    return {
+        "joint": robot.joint_names[joint],
+        "name": estimate.parameter.name,
+        "nominal": nominal,
+        "identified": estimate.identified,
+        "change": estimate.identified - nominal,
+        "sigma": estimate.sigma,
+    }
+
 
 @dataclass(frozen=True, eq=False)
 class ArmData:
-    """What was seen of an arm whose errors are estimated.
+    """What was seen of a robot's arm whose errors are estimated.
 
     Attributes:
-        data: The views, one a stop; the arm's errors are the last of what they share.
-        result: The answer.
+        problem: The observations.
+        state: The unknowns.
+        noise: The noise's levels.
+        covariance: (u, u) of the unknowns.
+        robot: The robot.
         model: The arm.
-        error_rad: The size of its errors.
-        q: (m, n) joint angles of the stops [rad].
-        at: (3,) the point of a target that the flange carries, in its frame [m].
-        frames: (f,) which of the unknowns are frames of which nothing is known, x and z first.
-        measured: (6,) which components of the target's pose are seen (rotation, translation).
+        columns: (p,) which of the unknowns are its errors.
+        error_rad: Their size.
+        stops: (m,) the stops at which it was observed.
+        q: (m, n) joint angles there [rad].
+        at: (3,) the point of a target that counts, in its frame [m].
+        frames: (f,) which of the unknowns are frames of which nothing is known.
+        measured: (6,) which components of the poses are seen (rotation, translation).
+        apart: (p, p) projection of its errors on those that are not the frames'; None for all.
     """
 
-    data: Closure
-    result: HandEyeResult
+    problem: Problem
+    state: State
+    noise: Noise
+    covariance: FloatArray
+    robot: str
     model: ArmModel
+    columns: IntArray
     error_rad: float
+    stops: IntArray
     q: FloatArray
     at: FloatArray
-    frames: IntArray = field(default_factory=EDGES.copy)
-    measured: Mask = field(default_factory=WHOLE_POSE.copy)
-
-    @property
-    def units(self) -> FloatArray:
-        """(p,) the size of each of the arm's errors."""
-        return np.full(len(self.model.values), self.error_rad)
+    frames: IntArray
+    measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
+    apart: FloatArray | None = None
 
     @property
     def chain(self) -> IntArray:
         """(f + p,) which of the unknowns are frames and the arm's errors."""
-        size, errors = len(self.result.covariance), len(self.model.values)
-        return np.concatenate([self.frames, np.arange(size - errors, size)])
+        return np.concatenate([self.frames, self.columns])
+
+    @property
+    def pair(self) -> ArmPair:
+        """The frames that the arm is seen by."""
+        return ArmPair.of(self.problem, self.state, self.robot)
+
+    def basis(self, q: FloatArray) -> FloatArray:
+        """(k, 6, p) how the flange moves with the arm's errors."""
+        found = self.model.basis(q)
+        return found if self.apart is None else found @ self.apart
 
 
 def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
@@ -144,8 +218,7 @@ def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
     anywhere = postures(arm.model.robot)
     with one_blas_thread():
         numbers = _numbers(arm.model, convention)
-        noise = arm.result.noise
-        weight = mean_weight(arm.data, arm.result.edges, noise, arm.measured)
+        weight = arm.pair.weight(arm.noise, arm.measured)
         by_arm, by_numbers = _at(arm, anywhere, weight), _by_numbers(arm, numbers, anywhere, weight)
         told, null = what_is_told(_at_stops(arm), by_arm), null_of(by_numbers)
         lacking = None
@@ -154,17 +227,18 @@ def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
                 imitated(by_numbers, by_arm, told.missing), _moves(arm, told, weight)
             )
         place = _place_slopes(arm, anywhere)
-        seen = arm.result.covariance[np.ix_(arm.chain, arm.chain)]
+        seen = arm.covariance[np.ix_(arm.chain, arm.chain)]
         sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, seen, place))
-        worth = stop_worth(arm.data, arm.result.edges, noise, place, arm.chain)
+        fitted = (arm.problem, arm.state, arm.noise)
+        worth = stop_worth(*fitted, arm.stops, place, arm.chain)
     nominal = arm.model.nominal
     return Telling(
         convention=numbers.before.convention,
         estimates=tuple(_estimates(arm, numbers)),
         told=told,
-        indices=Indices.of(told.values, len(arm.data)) if len(told.values) else None,
+        indices=Indices.of(told.values, len(arm.stops)) if len(told.values) else None,
         not_told=(
-            *null_words(null, numbers.parameters, nominal, arm.data.mount),
+            *null_words(null, numbers.parameters, nominal),
             *([_missing_words(lacking, numbers.parameters, nominal)] if lacking else []),
         ),
         advice=_advice(lacking, told, numbers.parameters, nominal) if lacking else "",
@@ -209,20 +283,16 @@ def _stated_table(robot: Robot) -> DHTable:
 
 
 def _at_stops(arm: ArmData) -> Slopes:
-    return stop_slopes(
-        arm.data,
-        arm.result.edges,
-        arm.result.noise,
-        arm.units,
-        frames=arm.frames,
-        measured=arm.measured,
-    )
+    """The stops' slopes, in units of their noise."""
+    slopes = whitened_slopes(arm.problem, arm.state, arm.noise, arm.measured)
+    flat = slopes.reshape(-1, arm.problem.size)
+    return Slopes(flat[:, arm.frames], flat[:, arm.columns] * arm.error_rad)
 
 
 def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Slopes:
-    """Slopes at other stops, with joint angles (m, n)."""
-    slopes = pose_slopes(arm.model, arm.result.edges, arm.data.mount, q)
-    return posture_slopes(slopes, weight, arm.units)
+    """Slopes at any postures, in units of a noise like the stops'."""
+    flange = arm.model.base_from_flange(q)
+    return _through(arm.pair, flange, arm.basis(q) * arm.error_rad, weight)
 
 
 def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArray) -> Slopes:
@@ -230,8 +300,14 @@ def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArr
     model, parameters = arm.model, numbers.parameters
     moved = parameter_slopes(numbers.before, parameters, q, model.flange_from_reported)
     flange = model.nominal.base_from_flange(q) @ model.flange_from_reported
-    slopes = chain_slopes(arm.result.edges, arm.data.mount, flange, moved)
-    return posture_slopes(slopes, weight, np.array([it.unit for it in parameters]))
+    return _through(arm.pair, flange, moved * [it.unit for it in parameters], weight)
+
+
+def _through(pair: ArmPair, flange: FloatArray, moved: FloatArray, weight: FloatArray) -> Slopes:
+    """Slopes of the pair by the frames at both ends, and by (k, 6, p) motions of the flange."""
+    carried = weight @ pair.at(flange)[0].by_errors
+    frames, arm = carried @ pair.frame_slopes(flange), carried @ moved
+    return Slopes(frames.reshape(-1, 12), arm.reshape(-1, moved.shape[2]))
 
 
 def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
@@ -244,15 +320,18 @@ def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
 
 
 def _place_slopes(arm: ArmData, q: FloatArray) -> FloatArray:
-    """How the place of what the flange carries moves with the chain's unknowns, (m, 3, f + p)."""
-    place = tool_slopes(arm.model, arm.result.edges, arm.data.mount, arm.at, q)
-    others = np.zeros((len(q), 3, len(arm.frames) - len(EDGES)))
-    return np.concatenate([place[:, :, EDGES], others, place[:, :, len(EDGES) :]], axis=2)
+    """How the place of what the flange carries moves with the chain's unknowns, (k, 3, f + p)."""
+    pair = arm.pair
+    linear, poses = pair.at(arm.model.base_from_flange(q))
+    slopes = np.zeros((len(q), 6, arm.problem.size))
+    slopes[:, :, : linear.size] = linear.jacobian
+    slopes[:, :, arm.columns] = linear.by_errors @ arm.basis(q)
+    return pair.place_slopes(slopes[:, :, arm.chain], poses, arm.at)
 
 
 def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
-    size, links = len(arm.units), arm.error_rad * arm.model.weights.get("links", 1.0)
-    spread = arm.result.covariance[-size:, -size:]
+    links = arm.error_rad * arm.model.weights.get("links", 1.0)
+    spread = arm.covariance[np.ix_(arm.columns, arm.columns)]
     sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, spread, numbers.moves))
     for parameter, sigma, moves in zip(numbers.parameters, sigmas, numbers.moves, strict=True):
         # Where the base or the flange takes a number's place it is as open as it was beforehand.

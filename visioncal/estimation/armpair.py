@@ -1,0 +1,132 @@
+"""One pair of frames with a robot's arm between them, as it is at any posture of the arm."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.estimation.problem import Linear, Noise, Observations, Problem, State
+from visioncal.transforms import adjoint, invert, skew
+from visioncal.types import FloatArray, IntArray, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPair:
+    """The frames that an arm parts, and that most of its stops observe of each other.
+
+    Attributes:
+        problem: The observations.
+        state: The unknowns.
+        robot: The robot.
+        observer: The frame that observes.
+        observed: The frame that is observed.
+    """
+
+    problem: Problem
+    state: State
+    robot: str
+    observer: str
+    observed: str
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, robot: str) -> "ArmPair":
+        """The pair of the most observations of poses, without another robot where there is one."""
+
+        def rank(at: int) -> tuple[bool, int]:
+            group = problem.groups[at]
+            robots = [it.robot for it in group.path if it.robot]
+            turned = int(problem.observations.has_rotation[group.rows].sum())
+            return robots == [robot], turned
+
+        mine = [
+            at for at, it in enumerate(problem.groups) if robot in {step.robot for step in it.path}
+        ]
+        row = int(problem.groups[max(mine, key=rank)].rows[0])
+        seen = problem.observations
+        return cls(problem, state, robot, seen.observers[row], seen.observed[row])
+
+    @property
+    def rows(self) -> IntArray:
+        """The observations of the pair."""
+        seen = self.problem.observations
+        pairs = zip(seen.observers, seen.observed, strict=True)
+        mine = (self.observer, self.observed)
+        return np.flatnonzero(np.array([it == mine for it in pairs], dtype=bool))
+
+    @property
+    def is_observer_carried(self) -> bool:
+        """Whether the arm carries the observer; else what it observes."""
+        path = self.problem.tree.path(self.observer, self.observed)
+        return next(it.is_up for it in path if it.robot == self.robot)
+
+    def at(self, base_from_flange: FloatArray) -> tuple[Linear, FloatArray]:
+        """The pair with its flange at (k, 4, 4), all other robots as at its first stop.
+
+        Returns:
+            How it moves with the edges of the problem, and with errors of this flange alone; and
+            (k, 4, 4) `observer_from_observed`.
+        """
+        count, stop = len(base_from_flange), self.problem.observations.stops[self.rows[0]]
+        poses = {
+            name: np.repeat(it[stop][None], count, axis=0)
+            for name, it in self.problem.poses.items()
+        }
+        seen = Observations(
+            (self.observer,) * count,
+            (self.observed,) * count,
+            np.arange(count),
+            np.full(count, -1),
+            np.tile(np.eye(4), (count, 1, 1)),
+            np.tile(np.eye(6), (count, 1, 1)),
+            np.ones(count, dtype=bool),
+        )
+        here = replace(
+            self.problem,
+            poses=poses | {self.robot: base_from_flange},
+            observations=seen,
+            effects=(),
+            is_combined=False,
+            with_repeats=False,
+        )
+        edges = State(self.state.edges, np.zeros(0))
+        linear = here.linear(edges, ideal=True)
+        slot = here.units[1][0].tolist().index(here.robots.index(self.robot))
+        errors = linear.by_errors[:, :, 6 * slot : 6 * slot + 6]
+        return replace(linear, by_errors=errors), here.predicted(edges)
+
+    def frame_slopes(self, base_from_flange: FloatArray) -> FloatArray:
+        """(k, 6, 12) how the flange moves with the frames of its base and of what it carries."""
+        branches = self.problem.tree.branches
+        flange = next(name for name, it in branches.items() if it.robot == self.robot)
+        carried = self.observer if self.is_observer_carried else self.observed
+        flange_from_end = self.problem.between(flange, carried, self.state, self.rows[:1])[0]
+        of_end = np.broadcast_to(adjoint(flange_from_end), (len(base_from_flange), 6, 6))
+        return np.concatenate([adjoint(invert(base_from_flange)), of_end], axis=2)
+
+    def place_slopes(self, slopes: FloatArray, poses: FloatArray, at: FloatArray) -> FloatArray:
+        """How the place of what the arm carries moves, seen from what stands still.
+
+        That is the observer's origin seen from what it observes, or a point of that seen from it.
+
+        Args:
+            slopes: (k, 6, p) of the poses, on their right.
+            poses: (k, 4, 4) `observer_from_observed`.
+            at: (3,) the point of what is observed, in its frame [m].
+
+        Returns:
+            (k, 3, p), up to a rotation [m].
+        """
+        places = np.broadcast_to(at, (len(poses), 3))
+        if self.is_observer_carried:
+            places = invert(poses)[:, :3, 3]
+        return np.asarray(-skew(places) @ slopes[:, :3] + slopes[:, 3:])
+
+    def weight(self, noise: Noise, measured: Mask) -> FloatArray:
+        """(6, 6) what makes noise like the pair's white; nothing of what is not measured."""
+        linear = self.problem.linear(self.state, ideal=True)
+        spread = self.problem.total_covariance(linear, noise)[self.rows][:, measured][
+            :, :, measured
+        ]
+        found = np.zeros((6, 6))
+        root = np.linalg.cholesky(np.linalg.inv(spread).mean(axis=0))
+        found[np.ix_(measured, measured)] = root.T
+        return found
