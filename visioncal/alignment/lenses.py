@@ -32,7 +32,7 @@ def with_looks(
     others: Sequence[Effect],
 ) -> tuple[Agreed, Seen]:
     """Fits lenses and boards with the rest, and with other effects."""
-    looks = _looks(cell, cameras, views)
+    looks = _looks(cell, cameras, views, _shares(cell, agreed))
     agreed, seen = settled_looks(cell, looks, looks.first, agreed, others)
     wider = _wider(cell, seen, agreed, others)
     if len(wider) > len(seen.free):
@@ -40,7 +40,18 @@ def with_looks(
     return agreed, seen
 
 
-def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPoses]) -> Looks:
+def _shares(cell: Cell, agreed: Agreed) -> dict[int, float]:
+    """As how much of a view those count for lenses that see a still board from a still camera."""
+    repeats = replace(agreed.problem, with_repeats=True).repeats
+    return {cell.rows[at].view: 1.0 / len(rows) for rows in repeats for at in rows.tolist()}
+
+
+def _looks(
+    cell: Cell,
+    cameras: Mapping[str, CameraLook],
+    views: Sequence[ViewPoses],
+    shares: Mapping[int, float],
+) -> Looks:
     targets = tuple(cell.session.boards.values())
     one = {it.view: it for it in views}
     problems, poses = {}, {}
@@ -60,7 +71,7 @@ def _looks(cell: Cell, cameras: Mapping[str, CameraLook], views: Sequence[ViewPo
         }
         problems[name] = CornerProblem.of(scene, corners)
         poses[name] = np.array([view.cam_from_target[0] for view in mine])
-    return Looks.of(problems, poses)
+    return Looks.of(problems, poses, shares)
 
 
 def settled_looks(
@@ -107,7 +118,8 @@ def _wider(cell: Cell, seen: Seen, agreed: Agreed, others: Sequence[Effect]) -> 
     if not all(it.has_spare_corners for it in looks.problems.values()):
         return seen.free
     every = np.unique(np.concatenate([seen.free, *groups]))
-    problem = with_seen(cell, agreed.problem, looks.seen(every), others)
+    repeated = replace(agreed.problem, with_repeats=True)
+    problem = with_seen(cell, repeated, looks.seen(every), others)
     bent = agreed.fit.state.values[len(seen.free) :]
     state = State(agreed.fit.state.edges, np.concatenate([looks.values[every], bent]))
     scores = normal_equations(problem.subset(agreed.used), state, agreed.fit.noise)

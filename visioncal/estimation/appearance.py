@@ -202,6 +202,7 @@ def compress(
     appearance: Appearance,
     starts: FloatArray,
     scales: IntArray | None = None,
+    shares: FloatArray | None = None,
 ) -> Compressed:
     """Compresses corners to normal equations in each view's pose and the shared appearance.
 
@@ -212,10 +213,12 @@ def compress(
         starts: (v, 4, 4) `cam_from_target` to start from.
         scales: Places of the boards' scales among the appearance's values, which views alone do
             not tell.
+        shares: (v,) as how much of a view each counts for the appearance: of those that show the
+            same as others, whatever is wrong with one is wrong with all.
     """
     shape = basis[stack.ids]
     bent = stack.with_points(stack.points + shape @ appearance.board)
-    found = compress_points(bent, appearance.camera, starts, shape)
+    found = compress_points(bent, appearance.camera, starts, shape, shares=shares)
     # A larger board farther away looks the same: what is left is rounding.
     if scales is not None:
         information, pull = found.shared_information, found.shared_pull
@@ -231,6 +234,7 @@ def compress_points(
     by_values: FloatArray,
     *,
     lens: bool = True,
+    shares: FloatArray | None = None,
 ) -> Compressed:
     """Compresses corners to normal equations in poses, lens and whatever moves corners.
 
@@ -240,6 +244,7 @@ def compress_points(
         starts: (v, 4, 4) `cam_from_target` to start from.
         by_values: (n, 3, s) how the corners move on the target with s values.
         lens: Whether the intrinsics come first of what is shared; else they are held.
+        shares: As `compress` has them.
     """
     fit = fit_poses(stack, camera, starts)
     now = reproject(stack, camera, fit.cam_from_target, lens=lens)
@@ -249,9 +254,13 @@ def compress_points(
     # What is left once the poses have followed, squared: never less than none, and as exact as the
     # square of their error. A difference of two squares would magnify it a millionfold.
     left = by_shared + now.by_pose @ answer[stack.view_of]
+    residuals = now.residuals
+    if shares is not None:
+        roots = np.sqrt(shares)[stack.view_of, None]
+        left, residuals = roots[..., None] * left, roots * residuals
     flat = left.reshape(-1, left.shape[2])
     information = flat.T @ flat
-    pull = flat.T @ now.residuals.reshape(-1)
+    pull = flat.T @ residuals.reshape(-1)
     return Compressed(
         fit.cam_from_target,
         fit.information,
