@@ -9,8 +9,9 @@ from cells import calibrated, session_of
 from commands import visioncal
 
 from visioncal.alignment import align
-from visioncal.calibration import Alignment
+from visioncal.calibration import Alignment, Calibration
 from visioncal.errors import DataError, DegenerateError
+from visioncal.exports import Selection, document
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, charuco_target, simulate
@@ -266,6 +267,15 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         # known to some 0.05 mrad by this many stops.
         assert told[[0, -1]] == pytest.approx(0.0, abs=1e-9)
         assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
+        zeros = [it for it in kinematics["parameters"] if it["name"] == "theta_rad"][1:-1]
+        surprises = ([it["change"] for it in zeros] - true[1:-1]) / [it["sigma"] for it in zeros]
+        assert np.abs(surprises).max() < 4.5  # one of eight in twenty thousand sessions
+        one = Calibration.whole(found).of("cam_left", robot, f"target_plate_{robot}")
+        np.testing.assert_allclose(
+            one.standing(cell.joints[robot]), arm.base_from_flange(cell.joints[robot]), atol=1e-12
+        )
+        written = document(Calibration.whole(found), "robot-dh", Selection(robot=robot))
+        assert f"theta_offset_rad = {told[1]:.6f}"[:-2] in written.text
     assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
     assert found.edges["cell_from_cam_left"].sigma_mm < 0.4 * (
         reported.edges["cell_from_cam_left"].sigma_mm

@@ -178,17 +178,13 @@ class Outcome:
 
 def outcome(seed: int) -> Outcome:
     it = world(seed)
-    found = align(it.session, corners=it.corners, arms="offsets")
+    found = align(it.session, corners=it.corners)
     truth = _regauged(it.cell)
     names = [edge.partition("_from_")[2] for edge in found.edges]
     error = np.concatenate(
         [log(invert(truth(name, found)) @ found.edge_of(name).matrix) for name in names]
     )
-    offsets = [
-        (np.array(found.details["arms"][robot]["values"]) - it.cell.true_arms[robot].offset[1:-1])
-        / np.array(found.details["arms"][robot]["sigmas"])
-        for robot in ("a", "b")
-    ]
+    offsets = [_zeros(found, it.cell, robot) for robot in ("a", "b")]
     (clock,) = found.details["clocks"].values()
     floor = found.stages["boards"]["floor"]
     return Outcome(
@@ -200,6 +196,14 @@ def outcome(seed: int) -> Outcome:
         not any("base_a_from_base_b" in reason for reason in found.verdict.reasons),
         found.verdict.status,
     )
+
+
+def _zeros(found: Alignment, cell: Network, robot: str) -> FloatArray:
+    """(k,) errors over their sigmas of the joints' zeros, from the second to the last but one."""
+    rows = found.arms[robot].stages["kinematics"]["parameters"]
+    zeros = [it for it in rows if it["name"] == "theta_rad"][1:-1]
+    away = [it["change"] for it in zeros] - cell.true_arms[robot].offset[1:-1]
+    return np.asarray(away / [it["sigma"] for it in zeros])
 
 
 def _regauged(cell: Network) -> Callable[[str, Alignment], FloatArray]:
