@@ -27,7 +27,7 @@ from visioncal.estimation.moves import (
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.problem import Noise, Problem, State
 from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 from visioncal.estimation.solve import (
     Solution,
@@ -88,14 +88,16 @@ class _Search:
     problem: Problem
 
     def fit(self, used: Mask, start: Solution) -> Solution:
-        fit = fit_problem(self.problem.subset(used), start.state, start.noise)
+        return self.fit_from(used, start.state, start.noise)
+
+    def fit_from(self, used: Mask, state: State, noise: Noise | None = None) -> Solution:
+        fit = fit_problem(self.problem.subset(used), state, noise)
         robots = np.minimum(fit.noise.robots, _MOST_NOISE)
         return replace(fit, noise=replace(fit.noise, robots=robots))
 
     def distances(self, used: Mask, fit: Solution) -> Distances:
         # What is far away is wrong, however little is known of where it should be.
-        found, away = distances(self.problem, used, fit), _away(self.problem, fit.state)
-        far = away > max(_FAR * float(np.median(away[used])), _NEAR_M)
+        found, far = distances(self.problem, used, fit), ~_near(self.problem, fit.state, used)
         return replace(found, squares=np.where(far, np.inf, found.squares))
 
 
@@ -244,17 +246,16 @@ def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Sol
 
     starts = _starts(part, state)
     mask, start = trimmed_start(starts, lambda it: _away(part, it), solve, half_of(len(rows)))
-    mask = _of_pairs(part, mask, start)
-    mask, fit = widened(
-        _Search(part), mask, fit_problem(part.subset(mask), start), np.ones(len(rows), dtype=bool)
-    )
+    search, mask = _Search(part), _of_pairs(part, mask, start)
+    every = np.ones(len(rows), dtype=bool)
+    mask, fit = widened(search, mask, search.fit_from(mask, start), every)
     used = among.copy()
     used[rows] = mask
     return used, fit
 
 
 def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
-    """The observations of a mask, and of each pair of frames the nearest half.
+    """The observations of a mask, and of each pair of frames the nearest half, as far as near.
 
     The nearest half of all may be of few pairs, such as the still boards of still cameras: frames
     that only others see would be free.
@@ -262,7 +263,7 @@ def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
     away, found = _away(problem, state), mask.copy()
     for group in problem.groups if len(problem.groups) > 1 else ():
         found[group.rows[np.argsort(away[group.rows])][: (len(group.rows) + 1) // 2]] = True
-    return found
+    return found & _near(problem, state, mask)
 
 
 def _starts(problem: Problem, state: State | None) -> Iterator[State]:
@@ -292,6 +293,12 @@ def _away(problem: Problem, state: State) -> FloatArray:
     between = invert(problem.predicted(state)) @ problem.measured(state)
     turned = np.where(problem.observations.has_rotation, rotation_angle(between), 0.0)
     return np.asarray(np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * turned)
+
+
+def _near(problem: Problem, state: State, used: Mask) -> Mask:
+    """(n,) whether an observation is where it is predicted, as most of some are."""
+    away = _away(problem, state)
+    return np.asarray(away <= max(_FAR * float(np.median(away[used])), _NEAR_M))
 
 
 def _fitted(problem: Problem, state: State | None, used: Mask) -> tuple[Mask, Solution]:
