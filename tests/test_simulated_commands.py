@@ -100,6 +100,11 @@ def test_a_second_board_is_placed_along(place):
     assert len(edges) == 3
     for name, truth in edges.items():
         assert misfit(found.edges[name], truth) < MOST, name
+    again = ("--second-board", "--no-images", "--views", 6, "--recording", 1)
+    done("simulate", place / "two-later", *again)
+    # Both boards are looked at, with no word on which is meant.
+    done("verify", place / "two-later", "--against", place / "two-out")
+    assert "without images" in visioncal("plan", place / "two", "--add", 2).err
 
 
 @pytest.mark.parametrize("name", cell_names())

@@ -6,6 +6,7 @@ from visioncal.calibration.result import Calibration
 from visioncal.session import Session
 from visioncal.session.choosing import PARTS, Choice, Part
 from visioncal.session.selecting import has_several, select
+from visioncal.session.single import is_to_be_parted
 
 
 def picked(
@@ -28,7 +29,7 @@ def picked(
     Raises:
         DataError: There is no such thing, or several are meant.
     """
-    several = has_several(session)
+    several = is_to_be_parted(session, choice) if parted else has_several(session)
     if several:
         session = select(session, choice, parted=parted)
     if calibration.cell is None:

@@ -21,7 +21,8 @@ from visioncal.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibr
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.session.choosing import ANY, LENS, Choice
-from visioncal.session.selecting import has_several, select
+from visioncal.session.selecting import select
+from visioncal.session.single import is_to_be_parted
 from visioncal.stored import load_calibration, load_stored
 from visioncal.targets import target_from_document
 from visioncal.transforms import compose
@@ -107,10 +108,10 @@ def chosen_part(source: Source, words: CellWords) -> tuple[Source, CellWords]:
     """
     session, result = source.session, source.calibration
     whole = result is not None and result.cell is not None
-    if not whole and (session is None or not has_several(session)):
-        return source, words
     choice = Choice(words.camera, words.robot, words.target)
-    if session is not None and has_several(session):
+    if not whole and (session is None or not is_to_be_parted(session, choice)):
+        return source, words
+    if session is not None and is_to_be_parted(session, choice):
         session = select(session, choice)
     if result is not None:
         result = result.chosen(choice)

@@ -2,8 +2,10 @@
 
 from visioncal.errors import DataError
 from visioncal.files import some_of
+from visioncal.session.choosing import Choice
 from visioncal.session.document import KINDS
 from visioncal.session.frames import frame_name
+from visioncal.session.selecting import has_several
 from visioncal.session.session import Session
 
 
@@ -14,6 +16,11 @@ def is_whole_cell(session: Session) -> bool:
     """
     both = bool(session.cameras and session.instruments)
     return bool(_several(session)) or (both and bool(session.declaration.frames))
+
+
+def is_to_be_parted(session: Session, choice: Choice) -> bool:
+    """Whether one of each is to be taken out: several boards of one pair go together otherwise."""
+    return is_whole_cell(session) or (bool(choice) and has_several(session))
 
 
 def check_one_of_each(session: Session) -> None:
