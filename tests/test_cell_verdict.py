@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from problems import observed, pose, world
 from whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
 from visioncal.alignment import align
-from visioncal.session import Session
+from visioncal.errors import DegenerateError
+from visioncal.session import MemoryImages, Session
 from visioncal.simulation import BoardAt, CameraAt, fine_camera, simulate_network
+from visioncal.simulation.records import POSE, pose_row
 
 # Three cameras, so that two or more see by way of a robot at most stops.
 CELL = replace(
@@ -134,3 +137,63 @@ def test_few_stops_are_told_by_robot(session):
     assert verdict.status == "check"
     for robot in ("a", "b"):
         assert any(it.startswith(f"Robot {robot}: only 8 stops are used") for it in verdict.reasons)
+
+
+def turned(tilt_deg, stops=14, noise=1.0):
+    """A session of measured poses in which robot b is tilted by so much, and turned about z."""
+    rng = np.random.default_rng(3)
+    cell = world(rng, stops, seen=1.0)
+    angles = rng.uniform(-1.0, 1.0, (stops, 3)) * [tilt_deg, tilt_deg, 35.0]
+    places = np.array([0.9, 0.1, 0.45]) + rng.uniform(-0.2, 0.2, (stops, 3))
+    flanges = [pose(*it) for it in zip(angles, places, strict=True)]
+    cell.flanges["b"] = np.linalg.inv(cell.truth["base_b"]) @ np.array(flanges)
+    problem = observed(cell, rng, noise=noise)
+    seen, rows, told = problem.observations, [], set()
+    for at, (camera, target, stop) in enumerate(cell.pairs):
+        row = {"view": at, "stop": stop, "camera": camera[4:], "target": target[7:]}
+        # Each robot's pose stands once a stop.
+        robot = {"target_a": "a", "target_b": "b"}.get(target)
+        fresh = robot is not None and (robot, stop) not in told
+        told.add((robot, stop))
+        row["robot"] = robot if fresh else ""
+        row |= pose_row(problem.poses[robot][stop]) if fresh else dict.fromkeys(POSE, "")
+        row |= {f"cft_{it}": value for it, value in pose_row(seen.measured[at]).items()}
+        rows.append(row)
+    document = {
+        "schema": 1,
+        "name": "turned",
+        "cameras": {"left": {}, "right": {}},
+        "robots": {"a": {}, "b": {}},
+        "targets": {it: {"target": "charuco_9x6_30mm"} for it in ("floor", "a", "b")},
+        "frames": {
+            **dict.fromkeys(("cam_left", "cam_right", "target_floor"), "cell"),
+            "target_a": "flange_a",
+            "target_b": "flange_b",
+        },
+    }
+    cells = [[str(value) for value in row.values()] for row in rows]
+    return Session.assemble(document, list(rows[0]), cells, MemoryImages({}))
+
+
+def test_motion_about_one_axis_is_refused_with_what_it_leaves_open():
+    with pytest.raises(
+        DegenerateError, match="all 14 stops of robot b turn about base_b's z"
+    ) as it:
+        align(turned(0.0))
+    assert it.value.culprits == ("base_b's offset along base_b's z",)
+    assert "Add 3 or more stops in which flange_b is tilted" in it.value.next_step
+
+
+def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
+    with pytest.raises(DegenerateError, match="offset along the cell's z has a predicted") as it:
+        align(turned(0.3))
+    assert "base_b's offset along the cell's z" in it.value.culprits
+    assert "all 14 stops of robot b turn about base_b's z to within 0." in it.value.message
+
+
+def test_noise_refuses_nothing():
+    # Thirty times a usual camera's and robot's.
+    verdict = align(turned(35.0, noise=30.0)).verdict
+    assert verdict.status == "bad"
+    assert any("Weakly determined by the motion" in it for it in verdict.reasons)
+    assert sum("Left out of the fit, views disagree" in it for it in verdict.reasons) == 1

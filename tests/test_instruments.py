@@ -96,7 +96,7 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options)
     # 40 readings of 20 um by an arm that repeats to 30 um; seen 0.03 mm.
     assert np.median(away) < 0.06
     # What the fit says of its own worth holds.
-    assert 0.3 < np.median(away) / known.findings.workspace_mm < 1.5
+    assert 0.3 < np.median(away) / known.findings.arms[0].workspace_mm < 1.5
     assert size == 36
 
 
@@ -219,8 +219,8 @@ def test_views_that_are_held_back_are_predicted():
     known = known_of(replace(session, views=views))
     assert len(known.used) == 90
     # Left out in turn, stops are predicted to 0.07 mm.
-    assert known.findings.holdout.mm < 0.12
-    assert known.findings.holdout.deg is None
+    assert known.findings.pairs[0].holdout.mm < 0.12
+    assert known.findings.pairs[0].holdout.deg is None
 
 
 def test_measured_poses_of_a_target_come_before_readings():

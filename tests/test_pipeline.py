@@ -115,7 +115,7 @@ def test_views_held_back_may_be_ambiguous(solver):
     assert known.used == tuple(it for it in range(20) if it % 4)
     assert all(len(known.poses[it].cam_from_target) == 1 for it in held)
     # Of the order of the used views': half a turn of the board would be metres.
-    assert known.findings.holdout.mm < 5 * known.findings.held_out.mm
+    assert known.findings.pairs[0].holdout.mm < 5 * known.findings.held_out.mm
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])

@@ -106,7 +106,7 @@ def arm_row(options: Tracked, worlds: int) -> str:
         q = postures(known.robot)
         error = rms(np.linalg.norm(places(known, q) - true_places(shop, q), axis=1))
         level = known.kinematics.levels[0]
-        predicted = known.findings.workspace_mm or float("nan")
+        predicted = known.findings.arms[0].workspace_mm or float("nan")
         found.append(
             (level.inside.mm, 1e3 * error, 1e3 * workspace_bound(shop, q), predicted, seconds)
         )
@@ -314,7 +314,8 @@ def told(known: Known) -> str:
     return (
         f"Level {known.kinematics.level} ({levels[0].inside.mm:.2f} mm with the nominal arm); left "
         f"out in turn, readings are predicted to {held.mm:.3f} mm rms; all over the workspace to "
-        f"{known.findings.workspace_mm:.2g} mm (sigma, median); verdict {known.verdict.status}."
+        f"{known.findings.arms[0].workspace_mm:.2g} mm (sigma, median); verdict "
+        f"{known.verdict.status}."
     )
 
 
@@ -324,7 +325,7 @@ def cross_validated(of: Callable[[list[int]], Session], stops: int) -> FloatArra
     for fold in range(10):
         held = list(range(fold, stops, 10))
         known = known_of(of(held))
-        for view in known.findings.views:
+        for view in known.findings.pairs[0].views:
             if view.view in held:
                 away[view.view] = view.residual_mm, view.residual_deg or 0.0
     return away

@@ -147,7 +147,7 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     return (*found, *_wrong_poses(solved, explained))
 
 
-def _by_way_of(problem: Problem, robot: str) -> Mask:
+def by_way_of(problem: Problem, robot: str) -> Mask:
     """(n,) the observations between whose frames a robot is."""
     found = np.zeros(len(problem), dtype=bool)
     for group in problem.groups:
@@ -171,7 +171,7 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
     for flange, branch in problem.tree.branches.items():
         if not branch.robot:
             continue
-        mine = _by_way_of(problem, branch.robot)
+        mine = by_way_of(problem, branch.robot)
         first = int(stops[mine & used].max(initial=-1)) + 1
         after = np.flatnonzero(mine & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
@@ -202,7 +202,7 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
     for branch in problem.tree.branches.values():
         if not branch.robot:
             continue
-        mine = _by_way_of(problem, branch.robot)
+        mine = by_way_of(problem, branch.robot)
         for stop in np.unique(stops[mine & ~used]).tolist():
             rows = np.flatnonzero(mine & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
@@ -347,7 +347,7 @@ def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
     rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
     found = []
     for robot in problem.robots:
-        mine = np.flatnonzero(_by_way_of(problem, robot)).tolist()
+        mine = np.flatnonzero(by_way_of(problem, robot)).tolist()
         pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
         for at in mine:
             if at in mutual:

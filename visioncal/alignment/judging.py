@@ -5,14 +5,21 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from visioncal.alignment.cell import Cell
-from visioncal.alignment.faults import PoseFault
+from visioncal.alignment.faults import PoseFault, by_way_of
 from visioncal.alignment.solving import Solved
+from visioncal.alignment.ties import robot_motion
 from visioncal.calibration import Edge, Sight
 from visioncal.calibration.whole import left_out_rms, rms_of, view_results
-from visioncal.errors import DegenerateError
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
-from visioncal.estimation.observability import Direction, edge_directions
+from visioncal.estimation.observability import (
+    Direction,
+    Scene,
+    check_determined,
+    edge_directions,
+)
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.stages.found import noise_words
@@ -137,24 +144,43 @@ def _arms(solved: Solved, noise: Mapping[str, Mapping[str, float]]) -> list[Arm]
     ]
 
 
-def check_determined(cell: Cell, edges: Mapping[str, Edge]) -> None:
-    """Refuses a cell in which a frame is not determined well enough for anybody.
+def check_cell(solved: Solved) -> None:
+    """Refuses a cell in which the motion does not determine a frame well enough for anybody.
 
     Args:
-        cell: The cell.
-        edges: The transforms that are to be known: of frames where they stood last.
+        solved: The fit.
 
     Raises:
-        DegenerateError: A direction's sigma is over the limit, or it is not determined at all.
+        DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
+            over the limit.
     """
-    for name, edge in edges.items():
-        worst = worst_direction(cell, name, edge)
-        if worst.sigma > worst.limit:
-            raise DegenerateError(
-                f"align: {worst.words} has a predicted sigma of {worst.figure}.",
-                culprits=[name],
-                next_step=_more(cell, name),
-            )
+    agreed, cell = solved.agreed, solved.cell
+    part = agreed.problem.subset(agreed.used)
+    names = {it: _names(part.tree, it) for it in part.unknown}
+    scene = Scene(
+        "align", names, lambda frame: _motion(cell, part, frame), lambda it, _: _more(cell, it)
+    )
+    state = State(agreed.fit.state.edges, np.zeros(0))
+    check_determined(part.with_effects(()), state, agreed.fit.noise, scene)
+
+
+def _names(tree: Tree, frame: str) -> tuple[str, str]:
+    """A frame's name in words, and that of the frame that it hangs on."""
+    parent = tree.branches[frame].parent
+    return frame.partition("@")[0], "the cell" if parent == tree.root else parent
+
+
+def _motion(cell: Cell, part: Problem, frame: str) -> str:
+    """Says how the robots stood by way of which a frame was observed."""
+    rows = np.zeros(len(part), dtype=bool)
+    for group in part.groups:
+        rows[group.rows] = any(step.frame == frame for step in group.path)
+    told = []
+    for branch in part.tree.branches.values():
+        if branch.robot:
+            stops = np.unique(part.observations.stops[rows & by_way_of(part, branch.robot)])
+            told += [robot_motion(cell, branch.parent, stops)] if len(stops) > 1 else []
+    return "; ".join(told) or f"{int(rows.sum())} observations are too few or too poor"
 
 
 def worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
@@ -165,14 +191,13 @@ def worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
 
 def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
     """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
-    parent = cell.tree.branches[frame].parent
-    named = "the cell" if parent == cell.tree.root else parent
-    found = edge_directions(edge.matrix, edge.covariance, frame, named)
+    found = edge_directions(edge.matrix, edge.covariance, *_names(cell.tree, frame))
     return [it for it in found if edge.oriented or not it.is_rotation]
 
 
 def _more(cell: Cell, frame: str) -> str:
     """What would determine a frame better."""
+    frame = frame.partition("@")[0]
     rows = [it for it in cell.rows if frame in (it.seer, it.seen)]
     others = sorted({it.seen if it.seer == frame else it.seer for it in rows})
     if not others:

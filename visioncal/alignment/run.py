@@ -29,7 +29,7 @@ from visioncal.alignment.faults import (
     versions,
 )
 from visioncal.alignment.judging import (
-    check_determined,
+    check_cell,
     findings_of,
     noise_warnings,
     size_warnings,
@@ -130,7 +130,7 @@ def alignment_of(
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
-    check_determined(solved.cell, last)
+    check_cell(solved)
     parents = {name: problem.tree.branches[it.key].parent for name, it in _by_name(named).items()}
     kept = {
         name: it.parent

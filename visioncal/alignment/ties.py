@@ -2,9 +2,14 @@
 
 from collections.abc import Collection, Iterator, Sequence
 
+import numpy as np
+
 from visioncal.alignment.cell import Cell
 from visioncal.errors import DegenerateError
+from visioncal.estimation.observability import motion_words, open_offset
 from visioncal.files import some_of
+from visioncal.transforms import invert
+from visioncal.types import IntArray
 
 
 def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
@@ -26,17 +31,59 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     words = [untied_words(cell, it) for it in bases]
     robots = "this robot" if len(bases) == 1 else "these robots"
     why = f"no observation links {robots} to the rest of the cell"
+    parts = []
     if seen:
-        stops = len({it.station for it in cell.rows})
+        told = [robot_motion(cell, it, _stations(cell, it)) for it in bases]
         why = (
             f"the observations that link {robots} to the rest of the cell are too few, too much "
-            f"alike, or wrong (it takes 3 stops or more, turned about two axes; {stops} have any)"
+            f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(told)}"
         )
+        parts = [part for it in bases if (part := _open_part(cell, it))]
+        if parts:
+            why += f", which does not determine {' and '.join(parts)}"
+            words = [
+                f"Add 3 or more stops in which {it} is tilted by 20 to 40 degrees about different "
+                "axes, not only about one."
+                for it in flanges
+            ]
     raise DegenerateError(
         f"align: nothing ties {some_of(bases)} to {cell.reference}: {why}.",
-        culprits=bases,
+        culprits=parts or bases,
         next_step=" ".join(words),
     )
+
+
+def _open_part(cell: Cell, base: str) -> str:
+    """What the motion of the robot on a base leaves open, where it turns about one axis alone."""
+    stations = _stations(cell, base)
+    if len(stations) < 2:
+        return ""
+    return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
+
+
+def _robot_on(cell: Cell, base: str) -> str:
+    branches = cell.tree.branches.values()
+    return next(it.robot for it in branches if it.robot and it.parent == base)
+
+
+def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
+    """Says how a robot stood at some stations, and what of it determines little."""
+    robot = _robot_on(cell, base)
+    poses = cell.poses[robot][stations]
+    if len(stations) < 2:
+        return f"robot {robot} was observed at {len(stations)} stop{'s' * (len(stations) != 1)}"
+    return motion_words(invert(poses), poses, f"{len(stations)} stops of robot {robot}", base)
+
+
+def _stations(cell: Cell, base: str) -> IntArray:
+    """The stations at which something was observed by way of the robot on a base."""
+    found = {
+        row.station
+        for row in cell.rows
+        for step in cell.tree.path(row.seer, row.seen)
+        if step.robot and cell.tree.branches[step.frame].parent == base
+    }
+    return np.array(sorted(found), dtype=np.int64)
 
 
 def untied_words(cell: Cell, frame: str) -> str:

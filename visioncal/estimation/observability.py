@@ -1,6 +1,6 @@
 """What the motion can tell about the two unknown edges, and what it leaves open, in words."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,10 @@ from visioncal.errors import DegenerateError
 from visioncal.estimation.boards import Boards, place
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
-from visioncal.estimation.linalg import Spectrum, covariance, spectrum
+from visioncal.estimation.linalg import covariance, covariance_among, spectrum
+from visioncal.estimation.problem import Noise as Levels
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import fisher_information
 from visioncal.figures import figure
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Mount
@@ -92,20 +95,9 @@ def check_observability(
     if data.effects and boards.unknowns:
         held = data.only(boards.places)
         still = replace(edges, shared=edges.shared[boards.places])
-    spread = spectrum(closure_information(held, still, noise))
-    if spread.ratio < _NULL_RATIO:
-        culprit = _null_direction(spread, edges, data.mount, boards)
-        verb = "are" if " and " in culprit else "is"
-        raise DegenerateError(
-            f"{title(data.mount)}: {culprit} {verb} not determined at all (information ratio "
-            f"{spread.ratio:.0e}, needs {_NULL_RATIO:.0e}): {_motion(data)}.",
-            culprits=[culprit],
-            next_step=f"{_or_measured(data.mount, culprit)}{_advice(data.mount)}",
-        )
+    check_determined(held.problem, still.state, noise.levels, _scene(data))
     plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
     worst = worst_directions(held, still, plausible, replace(boards, begin=0))
-    if any(it.sigma > it.limit for it in worst[:4]):
-        _refuse(data.mount, worst[:4], _motion(data), _advice(data.mount))
     for board, name in enumerate(boards.names[1:], start=1):
         _refuse(
             data.mount,
@@ -125,6 +117,104 @@ def check_observability(
             ),
             *_UNTOLD["instrument" if data.mount == "instrument" else "camera"],
         )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """How messages speak of a cell.
+
+    Attributes:
+        title: What they begin with.
+        names: What each unknown frame is called, and the frame that it hangs on.
+        motion: Says what is wrong with the motion, given the frame that it leaves open.
+        advice: Says what to do, given that frame and what of it is not determined at all, in words;
+            that may be nothing.
+    """
+
+    title: str
+    names: Mapping[str, tuple[str, str]]
+    motion: Callable[[str], str]
+    advice: Callable[[str, str], str]
+
+
+def check_determined(problem: Problem, state: State, noise: Levels, scene: Scene) -> None:
+    """Refuses motion that leaves a direction of an unknown frame open.
+
+    Args:
+        problem: The observations; effects that need not be determined are left out.
+        state: The answer.
+        noise: Of the residuals; see `check_observability`.
+        scene: The words.
+
+    Raises:
+        DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
+    """
+    counted = problem.counted
+    found = spectrum(fisher_information(problem, state, noise)[np.ix_(counted, counted)])
+    if found.ratio < _NULL_RATIO:
+        null = np.zeros((problem.size, int(np.sum(found.values < _NULL_RATIO * found.values[-1]))))
+        null[counted] = found.vectors[:, : null.shape[1]]
+        frame, culprit = _null_direction(null, problem, state, scene)
+        verb = "are" if " and " in culprit else "is"
+        raise DegenerateError(
+            f"{scene.title}: {culprit} {verb} not determined at all (information ratio "
+            f"{found.ratio:.0e}, needs {_NULL_RATIO:.0e}): {scene.motion(frame)}.",
+            culprits=[culprit],
+            next_step=scene.advice(frame, culprit),
+        )
+    most = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
+    plausible = replace(noise, robots=np.minimum(noise.robots, most))
+    spread = covariance_among(fisher_information(problem, state, plausible), counted)
+    beyond = [
+        (frame, it)
+        for frame in problem.unknown
+        for it in frame_directions(problem, state, spread, frame, scene.names[frame])
+        if it.sigma > it.limit
+    ]
+    if beyond:
+        frame, worst = beyond[0]
+        raise DegenerateError(
+            f"{scene.title}: {worst.words} has a predicted sigma of {worst.figure}: "
+            f"{scene.motion(frame)}.",
+            culprits=[it.words for _, it in beyond],
+            next_step=scene.advice(frame, ""),
+        )
+
+
+def frame_directions(
+    problem: Problem, state: State, spread: FloatArray, frame: str, names: tuple[str, str]
+) -> tuple[Direction, ...]:
+    """The worst directions of a frame: of its offset and, where it has one, of its rotation.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
+        frame: The frame.
+        names: What it is called, and the frame that it hangs on.
+    """
+    columns = problem.edge_columns(frame)
+    edge = state.edges[problem.unknown[frame]]
+    found = edge_directions(edge, spread[columns, columns], *names)
+    return found[:1] if frame in problem.points else found
+
+
+def _scene(data: Closure) -> Scene:
+    """How messages speak of one camera and one robot."""
+    things = (_names(edge, data.mount, Boards.one(0)) for edge in (0, 1))
+
+    def advice(_frame: str, open_part: str) -> str:
+        return f"{_or_measured(data.mount, open_part)}{_advice(data.mount)}"
+
+    return Scene(
+        title(data.mount),
+        {
+            name: (f"the {thing}", f"the {frame}")
+            for name, (thing, frame) in zip(data.problem.unknown, things, strict=True)
+        },
+        lambda _: _motion(data),
+        advice,
+    )
 
 
 def _refuse(mount: Mount, worst: Sequence[Direction], cause: str, next_step: str) -> None:
@@ -204,7 +294,7 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     culprit = f"the {_sensor(data.mount)}'s offset from the {_frame(data.mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
     if len(data) == 2:
-        culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data)))}"
+        culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data.robot)))}"
         cause = f"two views share that axis of rotation, and {cause}"
     stops = f"{len(data)} usable stops of the robot"
     if len(data) == 1 < views:
@@ -217,36 +307,33 @@ def refuse_too_few(data: Closure, views: int = 1) -> None:
     )
 
 
-def _null_direction(spread: Spectrum, edges: Edges, mount: Mount, boards: Boards) -> str:
-    """Names what the null directions leave open: of the camera's edge, or else the target's."""
-    null = spread.vectors[:, spread.values < _NULL_RATIO * spread.values[-1]]
-    for edge, transform in enumerate((edges.x, edges.z)):
-        rotation, translation = (
-            transform[:3, :3] @ null[6 * edge + at : 6 * edge + at + 3] for at in (0, 3)
-        )
+def _null_direction(
+    null: FloatArray, problem: Problem, state: State, scene: Scene
+) -> tuple[str, str]:
+    """The first frame that (p, k) null directions leave open, and what of it."""
+    for frame, at in problem.unknown.items():
+        turn, start = state.edges[at][:3, :3], problem.edge_columns(frame).start
+        rotation, translation = (turn @ null[start + it : start + it + 3] for it in (0, 3))
         parts = [
-            _open_part(edge, directions, mount, is_rotation, boards)
+            _open_part(scene.names[frame], directions, is_rotation)
             for directions, is_rotation in ((translation, False), (rotation, True))
         ]
         named = [part for part in parts if part]
         if named:
-            return " and ".join(named)
-    return "a combination of both edges"
+            return frame, " and ".join(named)
+    return next(iter(problem.unknown)), "a combination of all edges"
 
 
-def _open_part(
-    edge: int, directions: FloatArray, mount: Mount, is_rotation: bool, boards: Boards
-) -> str:
+def _open_part(names: tuple[str, str], directions: FloatArray, is_rotation: bool) -> str:
     """Names what (3, k) null directions leave open of a rotation or an offset, if anything."""
     vectors, sizes, _ = np.linalg.svd(directions)
-    # Null vectors have unit length over all twelve unknowns, a radian counting as a metre.
+    # Null vectors have unit length over all unknowns, a radian counting as a metre.
     rank = int(np.sum(sizes > _PART_OF_NULL))
-    thing, frame = _names(edge, mount, boards)
     if rank == 1:
-        return _words(f"the {thing}", f"the {frame}", vectors[:, 0], is_rotation)
+        return _words(*names, vectors[:, 0], is_rotation)
     if rank == 0:
         return ""
-    return f"the {thing}'s {'rotation' if is_rotation else 'offset from the ' + frame}"
+    return f"{names[0]}'s {'rotation' if is_rotation else 'offset from ' + names[1]}"
 
 
 def _words(thing: str, frame: str, direction: FloatArray, is_rotation: bool) -> str:
@@ -284,13 +371,13 @@ def _frame(mount: Mount) -> str:
     return "tool" if mount == "eye-in-hand" else "base"
 
 
-def _turns(data: Closure) -> FloatArray:
-    """Rotation vectors (p, 3) of the relative motions between all pairs of views [rad].
+def _turns(robot: FloatArray) -> FloatArray:
+    """Rotation vectors (p, 3) of the relative motions between all pairs of (m, 4, 4) poses [rad].
 
-    Of more views than can be paired in a moment, those that turn least and most are among them.
+    Of more poses than can be paired in a moment, those that turn least and most are among them.
     """
-    ranked = data.robot[np.argsort(rotation_angle(invert(data.robot[0]) @ data.robot))]
-    some = np.linspace(0, len(data) - 1, min(len(data), _PAIRED)).round().astype(np.int64)
+    ranked = robot[np.argsort(rotation_angle(invert(robot[0]) @ robot))]
+    some = np.linspace(0, len(robot) - 1, min(len(robot), _PAIRED)).round().astype(np.int64)
     i, j = np.triu_indices(len(some), 1)
     relative = invert(ranked[some[j]]) @ ranked[some[i]]
     return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
@@ -301,29 +388,58 @@ def _main_axis(turns: FloatArray) -> FloatArray:
 
 
 def _motion(data: Closure) -> str:
-    """Says what is wrong with the motion."""
-    turns, count = _turns(data), len(data)
-    largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
+    """Says what is wrong with the motion of one robot."""
     # The flange's own positions: the robot's part is inverted where the camera stands still.
     flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
-    spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
-    if largest < 0.5 and spread_mm < 1.0:
-        return f"the {count} used views are all from one pose of the robot"
-    if largest < 0.5:
-        return (
-            f"the {count} used views differ in position only (largest rotation between two of "
-            f"them: {largest:.1g} deg)"
-        )
+    return motion_words(data.robot, flange, f"{len(data)} used views", f"the {_frame(data.mount)}")
+
+
+def _lone_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:
+    """The main axis of turns, how far they turn beside it [deg], and whether that is little."""
     main = _main_axis(turns)
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
-    if aside < 0.1 * largest:
+    return main, float(aside), bool(aside < 0.1 * np.rad2deg(np.linalg.norm(turns, axis=1).max()))
+
+
+def open_offset(robot: FloatArray, thing: str, frame: str) -> str:
+    """What the turns of a robot about one axis leave open, in words; empty where there are more.
+
+    Args:
+        robot: (m, 4, 4) the robot's part of a chain, by whose differences it turns.
+        thing: What hangs by it.
+        frame: In which frame the robot's part turns, in words.
+    """
+    main, _, is_lone = _lone_axis(_turns(robot))
+    return _words(thing, frame, main, is_rotation=False) if is_lone else ""
+
+
+def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) -> str:
+    """Says what is wrong with the motion of a robot.
+
+    Args:
+        robot: (m, 4, 4) the robot's part of a chain, by whose differences it turns.
+        flange: (m, 4, 4) where its flange stood.
+        stops: What they are, in words.
+        frame: In which frame the robot's part turns, in words.
+    """
+    turns = _turns(robot)
+    largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
+    spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
+    if largest < 0.5 and spread_mm < 1.0:
+        return f"the {stops} are all from one pose of the robot"
+    if largest < 0.5:
         return (
-            f"all {count} used views turn about the {_frame(data.mount)}'s {axis_words(main)} to "
+            f"the {stops} differ in position only (largest rotation between two of "
+            f"them: {largest:.1g} deg)"
+        )
+    main, aside, is_lone = _lone_axis(turns)
+    if is_lone:
+        return (
+            f"all {stops} turn about {frame}'s {axis_words(main)} to "
             f"within {max(aside, 0.01):.2g} deg"
         )
     return (
-        f"the {count} used views turn by at most {largest:.2g} deg, and by {aside:.2g} deg "
-        "about a second axis"
+        f"the {stops} turn by at most {largest:.2g} deg, and by {aside:.2g} deg about a second axis"
     )
 
 

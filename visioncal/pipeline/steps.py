@@ -434,12 +434,13 @@ def _judge(known: Known) -> Known:
         workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
         modelled=known.robot is not None,
     )
+    budget = {name.replace("_", " "): mm for name, mm in diagnosis.budget_mm.items()}
     findings = Findings(
         (pair,),
         (sensor,),
         (arm,),
         known.solved.worst,
-        (Place("Where the views look, a point", diagnosis.budget_mm, diagnosis.radius95_mm),),
+        (Place("Where the views look, a point", budget, diagnosis.radius95_mm),),
         known.warnings,
         known.notes,
         known.session.mount,

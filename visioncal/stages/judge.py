@@ -276,8 +276,7 @@ def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
 
 
 def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
-    for it in findings.pairs:
-        yield from _pair_doubts(it, findings.mount, limits)
+    yield from _pair_doubts(findings, limits)
     ratios = [
         outside / within
         for outside, within in _pairs(findings.held_out, findings.rms)
@@ -292,23 +291,33 @@ def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
         )
 
 
-def _pair_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[_Doubt]:
-    held = pair.held_out
-    beyond = [
-        (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
-        for value, unit, (check, bad) in zip(
-            (held.mm, held.deg), ("mm", "deg"), (limits.scatter_mm, limits.scatter_deg), strict=True
-        )
-        if value is not None and value > check
-    ]
-    if beyond:
-        sentence = (
+def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+    words, views, is_fatal = [], list[ViewResult](), False
+    for pair in findings.pairs:
+        held = pair.held_out
+        beyond = [
+            (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
+            for value, unit, (check, bad) in zip(
+                (held.mm, held.deg),
+                ("mm", "deg"),
+                (limits.scatter_mm, limits.scatter_deg),
+                strict=True,
+            )
+            if value is not None and value > check
+        ]
+        if beyond:
+            away = " and ".join(it for it, _ in beyond)
+            words.append(f"{away} ({pair.name})" if pair.name else away)
+            views += pair.views
+            is_fatal |= any(it for _, it in beyond)
+    if words:
+        yield _Doubt(
             f"Left out of the fit, views disagree with the others by "
-            f"{' and '.join(words for words, _ in beyond)}, rms; the worst are "
-            f"{_worst_views(pair.views)}. Possible causes: {_CAUSES[mount]}, or an "
-            "arm with large model errors."
+            f"{', '.join(words)}, rms; the worst are "
+            f"{_worst_views(views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
+            "arm with large model errors.",
+            is_fatal,
         )
-        yield _Doubt(_named(pair.name, sentence), any(is_fatal for _, is_fatal in beyond))
 
 
 def _worst_views(views: Sequence[ViewResult]) -> str:
@@ -443,21 +452,23 @@ def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
 
 def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     """Says what makes the result uncertain where it is to be used."""
-    for it in findings.places:
-        budget = it.budget_mm
-        if not budget["total"] > limits.sigma_mm[0]:
-            continue
-        parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
-        yield _Doubt(
-            f"{it.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
-            f"within {figure(it.radius95_mm)} mm): "
-            + ", ".join(
-                f"{figure(mm)} mm from the {name.replace('_', ' ')}"
-                for name, mm in parts[:_LISTED_PARTS]
-            )
-            + ".",
-            budget["total"] > limits.sigma_mm[1],
-        )
+    beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
+    if not beyond:
+        return
+    worst = max(beyond, key=lambda it: it.budget_mm["total"])
+    budget = worst.budget_mm
+    parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
+    others = [
+        f"{it.words} ({figure(it.budget_mm['total'])} mm)" for it in beyond if it is not worst
+    ]
+    yield _Doubt(
+        f"{worst.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
+        f"within {figure(worst.radius95_mm)} mm): "
+        + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
+        + "."
+        + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
+        budget["total"] > limits.sigma_mm[1],
+    )
 
 
 def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
