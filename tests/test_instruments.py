@@ -17,8 +17,10 @@ from tracked import (
 
 import visioncal
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.closure import Closure, Edges
+from visioncal.estimation.chain import chain
+from visioncal.estimation.closure import Edges
 from visioncal.estimation.positions import Mounting, Places, fit_mounting, supplied_poses
+from visioncal.estimation.problem import State
 from visioncal.estimation.workspace import postures
 from visioncal.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.session import MemoryImages, Session
@@ -313,19 +315,18 @@ def test_supplied_poses_stand_for_the_places_that_they_came_from():
     read = in_base @ x[:3, :3].T + x[:3, 3]
     places = Places(flange, read, points, np.arange(8) // 2, np.full(8, 1e-4))
     poses, spread = supplied_poses(places, mounting)
-    edges = mounting.edges
-    data = Closure("instrument", invert(flange), poses, spread, guess=edges)
-    assert data.placed(edges.x) == pytest.approx(np.repeat(edges.z[None], 8, axis=0))
+    x, _ = mounting.edges
+    problem = chain("instrument", flange, poses, spread, turned_by_choice=True)
+    state = State(mounting.edges, np.zeros(0))
+    assert problem.predicted(state) == pytest.approx(poses)
     # A place tells three directions; two places of one stop tell all but a turn about their line.
-    assert data.told.tolist() == [3] * 8
-    assert data.merged(places.stops).told.tolist() == [5] * 4
+    assert problem.observations.directions.tolist() == [3] * 8
+    assert problem.merged(places.stops).observations.directions.tolist() == [5] * 4
     off = Mounting(
         mounting.base_from_instrument @ exp(np.full((1, 6), 0.05))[0], 0.8 * mounting.on_flange
     )
     found = fit_mounting(places, off, 2)
     assert found.on_flange == pytest.approx(mounting.on_flange, abs=1e-5)
-    moved = mounting.moved(
-        Edges(edges.x, compose(np.eye(3), np.ones(3)), np.array([0.1, 0.2, 0.3]))
-    )
+    moved = mounting.moved(Edges(x, compose(np.eye(3), np.ones(3)), np.array([0.1, 0.2, 0.3])))
     assert moved.on_flange[0] == pytest.approx(np.ones(3))
     assert moved.from_first[1] == pytest.approx(mounting.from_first[1] + [0.1, 0.2, 0.3])

@@ -7,8 +7,9 @@ import pytest
 from cells import calibrated, error_of
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.closure import Closure
+from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances, inliers
+from visioncal.estimation.problem import ROBOT
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 from visioncal.stages.agree import agree, whole_units
@@ -46,7 +47,7 @@ def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch
     # Poses that others measured: no covariance, and some are many times worse than most.
     noise = 3e-4 * np.random.default_rng(0).standard_t(3, (600, 6))
     seen = cell.cam_from_target @ exp(noise)
-    found = inliers(Closure("eye-in-hand", cell.base_from_flange, seen).problem)
+    found = inliers(chain("eye-in-hand", cell.base_from_flange, seen))
     # All views but one or two belong to the noise, of which the search first left out fifty.
     assert found.used.sum() >= 598
     assert len(fits) < 25
@@ -62,49 +63,51 @@ def test_two_exchanged_rows_are_found():
 
 def test_where_nothing_agrees_nothing_is_left_out():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
-    data = replace(known.closure(known.used), effects=())
-    mixed = replace(data, robot=np.roll(data.robot, 1, axis=0))
-    assert agree(mixed, range(20), np.arange(20)).mask.all()
+    problem = known.problem(known.used).with_effects([])
+    mixed = replace(problem, poses={ROBOT: np.roll(problem.poses[ROBOT], 1, axis=0)})
+    assert agree(mixed, range(20), "eye-in-hand").mask.all()
 
 
 def test_a_stop_is_right_or_wrong_as_a_whole():
     cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
     known = calibrated(cell)
     (wrong,) = cell.wrong_views
-    data = replace(known.closure(known.candidates), effects=())
-    twice = np.repeat(np.arange(20), 2)
-    doubled = Closure(
-        data.mount, data.robot[twice], data.camera[twice], data.camera_covariance[twice]
-    )
-    found = agree(doubled, list(range(40)), twice)
+    problem = known.problem(known.candidates).with_effects([])
+    doubled = problem.observations.take(np.repeat(np.arange(20), 2))
+    found = agree(replace(problem, observations=doubled), list(range(40)), "eye-in-hand")
     assert [it.view for it in found.rejections] == [2 * wrong, 2 * wrong + 1]
 
 
-def looked_at_again(data, times=2, seed=5):
+def looked_at_again(problem, times=2, seed=5):
     """Each stop looked at several times, with the camera's own noise each time."""
-    again = np.repeat(np.arange(len(data)), times)
-    noise = np.random.default_rng(seed).standard_normal((len(again), 6))
-    roots = np.linalg.cholesky(data.camera_covariance[again])
-    seen = data.camera[again] @ exp((roots @ noise[:, :, None])[:, :, 0])
-    return Closure(data.mount, data.robot[again], seen, data.camera_covariance[again]), again
+    seen = problem.observations.take(np.repeat(np.arange(len(problem)), times))
+    noise = np.random.default_rng(seed).standard_normal((len(seen), 6))
+    moved = exp((np.linalg.cholesky(seen.covariance) @ noise[:, :, None])[:, :, 0])
+    return replace(problem, observations=replace(seen, measured=seen.measured @ moved))
+
+
+def with_measured(problem, measured):
+    return replace(problem, observations=replace(problem.observations, measured=measured))
 
 
 @pytest.mark.parametrize("times", [2, 3])
 @pytest.mark.parametrize("measured", [True, False], ids=["covariance unknown", "covariance known"])
 def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    once = replace(known.closure(known.used), effects=())
-    data, stops = looked_at_again(once, times)
+    problem = looked_at_again(known.problem(known.used).with_effects([]), times)
     if measured:
-        data = replace(data, camera_covariance=None)
-    assert agree(data, range(20 * times), stops).rejections == ()
-    wrong = data.camera.copy()
-    wrong[4 * times + 1] = data.camera[11 * times]
-    found = agree(replace(data, camera=wrong), range(20 * times), stops)
+        unknown = np.zeros_like(problem.observations.covariance)
+        seen = replace(problem.observations, covariance=unknown)
+        problem = replace(problem, observations=seen, is_combined=True)
+    assert agree(problem, range(20 * times), "eye-in-hand").rejections == ()
+    wrong = problem.observations.measured.copy()
+    wrong[4 * times + 1] = problem.observations.measured[11 * times]
+    found = agree(with_measured(problem, wrong), range(20 * times), "eye-in-hand")
     (rejected,) = found.rejections
     assert rejected.view == 4 * times + 1
-    away = invert(once.placed(found.edges.x)[4]) @ (
-        once.robot[4] @ found.edges.x @ wrong[4 * times + 1]
+    away = (
+        invert(problem.predicted(problem.start(found.frames))[4 * times + 1])
+        @ (wrong[4 * times + 1])
     )
     assert f"places the target {1e3 * np.linalg.norm(away[:3, 3]):.0f} mm" in rejected.reason
     assert f"view {4 * times} of the same stop agrees" in rejected.reason
@@ -112,11 +115,12 @@ def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, meas
 
 def test_units_are_numbered_as_stops_are():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    data, stops = looked_at_again(replace(known.closure(known.used), effects=()))
-    np.testing.assert_array_equal(whole_units(data, stops), stops)
-    mixed = data.camera.copy()
-    mixed[9] = data.camera[30]
-    units = whole_units(replace(data, camera=mixed), stops)
+    problem = looked_at_again(known.problem(known.used).with_effects([]))
+    stops = problem.observations.stops
+    np.testing.assert_array_equal(whole_units(problem), stops)
+    mixed = problem.observations.measured.copy()
+    mixed[9] = mixed[30]
+    units = whole_units(with_measured(problem, mixed))
     np.testing.assert_array_equal(units, [*stops[:9], 5, *(stops[10:] + 1)])
 
 
@@ -130,7 +134,7 @@ def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
 
 def test_a_square_is_the_distance_from_what_the_others_predict():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
-    problem = replace(known.closure(known.used), effects=()).problem
+    problem = known.problem(known.used).with_effects([])
     everything = np.ones(12, dtype=bool)
     fit = fit_problem(problem, replace(known.solved.edges, shared=np.zeros(0)).state)
     inside = distances(problem, everything, fit)

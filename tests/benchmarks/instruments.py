@@ -185,7 +185,7 @@ def example(size: float, seed: int) -> Tracked:
 def before_mm(size: float, seed: int) -> float:
     """How far the nominal arm is off at its stops, frames fitted [mm]."""
     known = solved_of(session_of(tracked(example(size, seed))), level="hand-eye")
-    edges, nominal = known.solved.edges, replace(known.closure(known.used), shared=None)
+    edges, nominal = known.solved.edges, replace(known.closure(known.used), effects=())
     fit = fit_closure(nominal, Edges(edges.x, edges.z, np.zeros(0)))
     away = nominal.placed(fit.edges.x)[:, :3, 3] - fit.edges.z[:3, 3]
     return 1e3 * rms(np.linalg.norm(away, axis=1))
@@ -311,11 +311,11 @@ def talos() -> str:
 def told(known: Known) -> str:
     """What the method says of its trust."""
     held, levels = known.findings.held_out, known.kinematics.levels
+    workspace_mm = known.findings.arms[0].workspace_mm
     return (
         f"Level {known.kinematics.level} ({levels[0].inside.mm:.2f} mm with the nominal arm); left "
         f"out in turn, readings are predicted to {held.mm:.3f} mm rms; all over the workspace to "
-        f"{known.findings.arms[0].workspace_mm:.2g} mm (sigma, median); verdict "
-        f"{known.verdict.status}."
+        f"{workspace_mm:.2g} mm (sigma, median); verdict {known.verdict.status}."
     )
 
 

@@ -7,17 +7,15 @@ the rotation too, once their places on the flange are unknowns that all readings
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure, Edges
+from visioncal.estimation.closure import Edges
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
-from visioncal.estimation.problem import Effect
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, trimmed_start
-from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, compose, exp, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -72,9 +70,9 @@ class Mounting:
     on_flange: FloatArray
 
     @property
-    def edges(self) -> Edges:
-        """The same as edges of the chain: the first point's frame is parallel to the flange."""
-        return Edges(self.base_from_instrument, compose(np.eye(3), self.on_flange[0]), np.zeros(0))
+    def edges(self) -> FloatArray:
+        """(2, 4, 4) the same as edges: the first point's frame is parallel to the flange."""
+        return np.stack([self.base_from_instrument, compose(np.eye(3), self.on_flange[0])])
 
     @property
     def from_first(self) -> FloatArray:
@@ -129,13 +127,6 @@ def point_columns(points: IntArray, count: int) -> FloatArray:
     for point in range(1, count):
         columns[np.ix_(points == point, range(3, 6), range(3 * point - 3, 3 * point))] = -np.eye(3)
     return columns
-
-
-def with_places(data: Closure, mounting: Mounting, columns: FloatArray) -> Closure:
-    """Tells a chain of supplied poses what they were supplied from."""
-    size = columns.shape[2]
-    nothing = Knowledge(np.zeros((size, size)), np.zeros(size))
-    return replace(data, guess=mounting.edges).with_more(Effect.free("points", nothing, columns))
 
 
 def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:

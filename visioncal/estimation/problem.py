@@ -21,6 +21,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from visioncal.estimation.linalg import covariance
 from visioncal.estimation.tree import Step, Tree
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
@@ -345,6 +346,74 @@ class Problem:
             self,
             observations=self.observations.take(rows),
             effects=tuple(it.take(rows) for it in self.effects),
+        )
+
+    def pruned(self) -> "Problem":
+        """Returns the problem without unknown frames that no observation has on its way."""
+        needed = {step.frame for group in self.groups for step in group.path}
+        lost = [it for it in self.tree.unknown if it not in needed]
+        priors = (it for it in self.priors if not {it.first, it.second} & set(lost))
+        return replace(
+            self,
+            tree=self.tree.without(lost),
+            priors=tuple(priors),
+            points=self.points.difference(lost),
+        )
+
+    @cached_property
+    def of_one_stop(self) -> IntArray:
+        """(n,) what is of the same frames at one stop, numbered in the order of appearance."""
+        seen, keys = self.observations, dict[tuple[int, str, str], int]()
+        every = zip(seen.stops.tolist(), seen.observers, seen.observed, strict=True)
+        return np.array([keys.setdefault(it, len(keys)) for it in every], dtype=np.int64)
+
+    def merged(self, units: IntArray) -> "Problem":
+        """Makes one observation of all of one unit.
+
+        Their poses are averaged with their information, and by how much they disagree they tell of
+        the effect on sensors: nothing is lost. Where nothing is known of their noise, they are
+        averaged evenly.
+
+        Args:
+            units: (n,) the unit of each observation, numbered from 0 in the order of first
+                appearance; those of one are of the same frames at one stop.
+        """
+        first = np.unique(units, return_index=True)[1]
+        if len(first) == len(units):
+            return self
+        seen, by_sensor = self.observations.take(first), self.by_sensor[first]
+        measured, spread = seen.measured.copy(), seen.covariance.copy()
+        information, pull = np.zeros((by_sensor.shape[2],) * 2), np.zeros(by_sensor.shape[2])
+        for unit in np.flatnonzero(np.bincount(units) > 1).tolist():
+            rows = np.flatnonzero(units == unit)
+            weights = np.tile(np.eye(6), (len(rows), 1, 1))
+            if not self.is_combined:
+                weights = covariance(self.observations.covariance[rows])
+            mean = covariance(weights.sum(axis=0))
+            shares = mean @ weights
+            away = log(invert(measured[unit]) @ self.observations.measured[rows])
+            shift = np.einsum("mij,mj->i", shares, away)
+            measured[unit] = measured[unit] @ exp(shift)
+            by_sensor[unit] = np.einsum("mij,mjk->ik", shares, self.by_sensor[rows])
+            if not self.is_combined:
+                spread[unit] = mean
+                slopes = self.by_sensor[rows] - by_sensor[unit]
+                weighted = np.swapaxes(slopes, 1, 2) @ weights
+                information += np.sum(weighted @ slopes, axis=0)
+                pull += np.einsum("mij,mj->i", weighted, away - shift)
+        effects, at = [], 0
+        for it in self.effects:
+            mine = slice(at, at + len(it))
+            at += len(it)
+            known = Knowledge(
+                it.known.information + information[mine, mine], it.known.pull + pull[mine]
+            )
+            moved = None if it.by_sensor is None else by_sensor[:, :, mine]
+            effects.append(replace(it.take(first), known=known, by_sensor=moved))
+        return replace(
+            self,
+            observations=replace(seen, measured=measured, covariance=spread),
+            effects=tuple(effects),
         )
 
     def with_effects(self, effects: Sequence[Effect]) -> "Problem":

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel, blocks_of
-from visioncal.estimation.closure import Edges, distances
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.closure import distances
+from visioncal.estimation.problem import ROBOT, State
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree
@@ -23,12 +23,12 @@ def with_views_back(stated: Known, calibrated: Known) -> Known | None:
     before, all_of = stated.agreed, stated.candidates
     if before is None:
         return None
-    boards, stops = calibrated.shown(all_of), calibrated.stops_of(all_of)
-    again = agree(calibrated.closure(all_of), all_of, stops, before, boards)
+    mount = stated.session.mount
+    again = agree(calibrated.problem(all_of), all_of, mount, calibrated.frames, before.mask)
     back = again.mask & (before.mask | _as_reported(stated, before.mask))
     if not (back & ~before.mask).any():
         return None
-    return without_lost_boards(stated.agreeing(replace(again, mask=back, edges=before.edges)))
+    return without_lost_boards(stated.agreeing(replace(again, mask=back, frames=before.frames)))
 
 
 def _as_reported(stated: Known, agrees: Mask) -> Mask:
@@ -67,10 +67,10 @@ def arm_told(known: Known) -> Known:
     told = (
         None if lost is None else lost.merged(known.stops).with_first(len(data.unchanged)).problem
     )
-    start = Edges(agreed.edges.x, agreed.edges.z, data.unchanged).state
+    start = State(known.edges[:2], data.unchanged)
     found = choose_level(data.problem, start, ROBOT, bases, known.level, told)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
-    known = replace(known, compared_from_first=known.from_first)
+    known = replace(known, compared_frames=known.frames)
     known = known.noting((), doubts(found))
     if not found.errors:
         return known

@@ -13,10 +13,10 @@ from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.boards import Boards
-from visioncal.estimation.chain import edge_names
-from visioncal.estimation.closure import Closure, Edges, Noise
+from visioncal.estimation.chain import chain, edge_names
+from visioncal.estimation.closure import Closure, Noise
 from visioncal.estimation.joint import Scene
-from visioncal.estimation.problem import ROBOT, FramePrior
+from visioncal.estimation.problem import ROBOT, FramePrior, Problem
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
@@ -58,8 +58,8 @@ class Known:
         robot: The nominal robot, where the session names a known one.
         base_from_flange: (4, 4) by view, as the robot reported it.
         boards: Which of the session's boards the chain holds: the one it ends at, and others.
-        from_first: (b, 4, 4) where they lie: `target_k_from_target_1`, in that order.
-        compared_from_first: The same when levels of the arm's errors were compared.
+        frames: (4, 4) where the camera and the boards are, by the frame; empty at first.
+        compared_frames: The same when levels of the arm's errors were compared.
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         matched: The joints beside the reported poses; None without a robot.
         lost_zero: A joint whose zero is far from where the model has it.
@@ -101,8 +101,8 @@ class Known:
     base_from_flange: Mapping[int, FloatArray] = field(default_factory=dict)
     joints_rad: Mapping[int, FloatArray] | None = None
     boards: tuple[int, ...] = (0,)
-    from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
-    compared_from_first: FloatArray = field(default_factory=lambda: np.eye(4)[None])
+    frames: Mapping[str, FloatArray] = field(default_factory=dict)
+    compared_frames: Mapping[str, FloatArray] = field(default_factory=dict)
     matched: Matched | None = None
     lost_zero: JointReading | None = None
     corners: Mapping[int, Corners] = field(default_factory=dict)
@@ -156,7 +156,7 @@ class Known:
         """Takes the candidates that agree into the fit; the others are rejected."""
         used = tuple(it for it, ok in zip(self.candidates, agreed.mask, strict=True) if ok)
         reasons = {it: why for it, why in self.reasons.items() if it not in self.candidates}
-        known = replace(self, used=used, agreed=agreed, reasons=reasons)
+        known = replace(self, used=used, agreed=agreed, reasons=reasons, frames=agreed.frames)
         return known.noting(agreed.rejections)
 
     def seeing(self, refined: Refined) -> Self:
@@ -287,20 +287,70 @@ class Known:
             data = data.with_more(errors.effect(ROBOT, values=self.arm_values))
         return data
 
+    def problem(self, views: Sequence[int]) -> Problem:
+        """What some views measured, each with its first or chosen pose."""
+        poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
+        covariance, effects = None, []
+        if self.readings is not None:
+            covariance = np.array([it.covariance[0] for it in poses])
+            effects = self.readings.effects(poses)
+        elif self.free is not None:
+            # Poses that others have measured do not move with lens and board.
+            shift = np.zeros((len(poses), 6, len(self.free.columns)))
+            if all(it.corners is not None for it in poses):
+                shift = np.array([it.by_shared[0] for it in poses]).reshape(shift.shape)
+            effects = [self.free.effect(shift)]
+        if self.readings is None and all(it.corners is not None for it in poses):
+            covariance = np.array([it.covariance[0] for it in poses]).reshape(-1, 6, 6)
+        if self.clock is not None and self.clock.speeds:
+            of_stops = np.isin(views, first)
+            effects += [it.of_stops(of_stops) for it in self.clock.effects(views)]
+        if self.thermal is not None and self.heated_by is not None:
+            effects.append(self.thermal.effect(self._thermal_stops(first), self.heated_by))
+        if self.arm is not None and self.arm.is_estimated:
+            errors = replace(self.arm, basis=self.arm_basis(first))
+            effects.append(errors.effect(ROBOT, values=self.arm_values))
+        return chain(
+            self.session.mount,
+            self.flange_poses(first),
+            np.array([it.cam_from_target[0] for it in poses]).reshape(-1, 4, 4),
+            covariance,
+            stops=self.stops_of(views),
+            targets=self.targets(views),
+            # What is shared counts from where it is.
+            effects=[replace(it, values=np.zeros(len(it))) for it in effects],
+            priors=self.priors,
+            turned_by_choice=self.readings is not None and not self.readings.are_poses,
+        )
+
     def targets(self, views: Sequence[int]) -> tuple[str, ...]:
         """(m,) the frame of the target that each view shows."""
-        return tuple(self._frame_of(self.poses[view].board) for view in views)
+        return tuple(self.frame_of(self.poses[view].board) for view in views)
 
-    def _frame_of(self, board: int) -> str:
-        if len(self.boards) < 2:
+    def frame_of(self, board: int) -> str:
+        """The frame of one of the session's boards."""
+        if len(self.session.boards) < 2:
             return edge_names(self.session.mount)[1].partition("_from_")[2]
         return frame_name("target", tuple(self.session.boards)[board])
 
-    def frames_at(self, edges: Edges) -> dict[str, FloatArray]:
-        """Where the camera and all targets are by both edges."""
-        placed = edges.z @ invert(self.from_first)
-        targets = zip(map(self._frame_of, self.boards), placed, strict=True)
-        return {edge_names(self.session.mount)[0].partition("_from_")[2]: edges.x, **dict(targets)}
+    def framed(self, edges: FloatArray) -> dict[str, FloatArray]:
+        """Where frames are, by (1 + b, 4, 4) edges of the camera and the chain's boards."""
+        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
+        return dict(zip([camera, *map(self.frame_of, self.boards)], edges, strict=True))
+
+    @property
+    def edges(self) -> FloatArray:
+        """(1 + b, 4, 4) of the camera and the chain's boards."""
+        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
+        return np.array([self.frames[it] for it in (camera, *map(self.frame_of, self.boards))])
+
+    @property
+    def from_first(self) -> FloatArray:
+        """(b, 4, 4) where the chain's boards lie: `target_k_from_target_1`."""
+        if len(self.boards) < 2 or not self.frames:
+            return np.eye(4)[None]
+        placed = self.edges[1:]
+        return np.asarray(invert(placed) @ placed[0])
 
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""

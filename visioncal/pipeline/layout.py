@@ -6,7 +6,6 @@ import numpy as np
 
 from visioncal.pipeline.known import Known
 from visioncal.targets import corner_positions, first_corners
-from visioncal.transforms import invert
 from visioncal.types import Corners, FloatArray, IntArray, Rejection
 
 
@@ -37,18 +36,8 @@ def _shifted(corners: Corners, by: int) -> Corners:
     return replace(corners, ids=corners.ids + by)
 
 
-def relaid(known: Known, shared: FloatArray) -> Known:
-    """Takes over where the boards were found to be, by (k,) of what the used views share."""
-    if len(known.boards) < 2:
-        return known
-    return replace(known, from_first=known.shown(known.used).moved(shared).from_first)
-
-
 def without_lost_boards(known: Known) -> Known:
-    """Leaves boards out of the chain of which no used view is left.
-
-    Where that is the one that the chain ends at, it ends at the next.
-    """
+    """Leaves boards out of which no used view is left."""
     agreed = known.agreed
     seen = {known.poses[view].board for view in known.used}
     kept = [at for at, board in enumerate(known.boards) if board in seen]
@@ -58,14 +47,11 @@ def without_lost_boards(known: Known) -> Known:
     lost = [it for it in known.boards if it not in seen]
     gone = [it for it in known.candidates if known.poses[it].board in lost]
     mask = np.array([known.poses[it].board in seen for it in known.candidates])
-    next_from_first = known.from_first[kept[0]]
-    edges = replace(agreed.edges, z=agreed.edges.z @ invert(next_from_first))
     why = {it: f"no view of target {names[known.poses[it].board]} is left" for it in gone}
     known = replace(
         known,
         boards=tuple(boards),
-        from_first=known.from_first[kept] @ invert(next_from_first),
-        agreed=replace(agreed, mask=agreed.mask[mask], edges=edges),
+        agreed=replace(agreed, mask=agreed.mask[mask]),
         candidates=tuple(it for it in known.candidates if it not in gone),
     )
     doubts = [f"No usable view shows target {names[it]}: it has no place." for it in lost]

@@ -12,13 +12,14 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.boards import place
 from visioncal.estimation.joint import Arm
 from visioncal.estimation.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.choosing import arm_told, with_views_back
 from visioncal.pipeline.elastic import check_loads, with_springs
 from visioncal.pipeline.known import Known, rms_of
-from visioncal.pipeline.layout import middles, numbered_through, relaid, without_lost_boards
+from visioncal.pipeline.layout import middles, numbered_through, without_lost_boards
 from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unseen import left_out
 from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
@@ -234,7 +235,9 @@ def _choose(known: Known) -> Known:
         known.session.boards,
     )
     choice = layout.choice
-    known = replace(known, boards=layout.boards, from_first=layout.from_first)
+    known = replace(known, boards=layout.boards)
+    if layout.edges is not None:
+        known = replace(known, frames=known.framed(layout.edges))
     poses = {**known.poses, **{view.view: view for view in choice.views}}
     used = tuple(view.view for view in choice.views)
     # A view whose image failed may still be used by the pose that the session gives.
@@ -259,8 +262,10 @@ def _look(known: Known) -> Known:
 def _agree(known: Known) -> Known:
     data = known.closure(known.used)
     refuse_too_few(data.merged(known.stops), len(data))
-    agreed = agree(data, known.used, known.stops, boards=known.shown(known.used))
-    known = relaid(known, agreed.edges.shared)
+    frames = known.frames or None
+    if known.readings is not None and known.readings.mounting is not None:
+        frames = known.framed(known.readings.mounting.edges)
+    agreed = agree(known.problem(known.used), known.used, known.session.mount, frames)
     known = without_lost_boards(replace(known, candidates=known.used).agreeing(agreed))
     return known.posed(_held_back_poses(known))
 
@@ -273,8 +278,8 @@ def _held_back_poses(known: Known) -> Iterator[ViewPoses]:
     for view in known.measurable_held_back:
         poses = known.poses[view]
         robot = robot_part(known.flange_poses([view]), mount)[0]
-        z = agreed.edges.z @ known.shown([view]).first_from_own[0]
-        predicted = invert(robot @ agreed.edges.x) @ z
+        z = known.frames[known.frame_of(poses.board)]
+        predicted = invert(robot @ known.edges[0]) @ z
         yield choose_by(poses, predicted, targets[poses.board] if targets else None)
 
 
@@ -285,17 +290,17 @@ def _refine(known: Known) -> Known:
         return known
     if scene is None or free is None or any(it is None for it in known.seen(known.used)):
         problem = known.closure(known.used).merged(known.stops).problem
-        frames = dict(zip(problem.unknown, agreed.edges.state.edges, strict=True))
+        frames = dict(zip(problem.unknown, known.edges[:2], strict=True))
         return replace(known, arm=arm_errors(_arm(known), problem, frames))
     notes = known.notes
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
-        result = refine(scene, views, _arm(known), known.frames_at(agreed.edges))
+        result = refine(scene, views, _arm(known), known.frames)
         known = replace(known.seeing(result), notes=(*notes, *result.notes))
         before, all_of = agreed.mask, known.candidates
-        boards = known.shown(all_of)
-        agreed = agree(known.closure(all_of), all_of, known.stops_of(all_of), agreed, boards)
-        known = without_lost_boards(relaid(known.agreeing(agreed), agreed.edges.shared))
+        problem = known.problem(all_of)
+        agreed = agree(problem, all_of, known.session.mount, known.frames, before)
+        known = without_lost_boards(known.agreeing(agreed))
         if np.array_equal(before, agreed.mask):
             break
         agreed = known.agreed or agreed
@@ -353,7 +358,8 @@ def _hand_eye(known: Known) -> Known:
         step = np.concatenate([shared[len(shared) - known.arm_size :], shared[boards.places]])
         if np.abs(step).max(initial=0.0) < _ARM_AT_REST_RAD and _is_aimed(known):
             break
-        known = relaid(known, shared)
+        placed = place(boards, result.edges)
+        known = replace(known, frames=known.framed(np.stack([result.edges.x, *placed.z])))
         if model is not None:
             known = replace(known, arm_model=model.moved(step[: known.arm_size]))
         if readings is not None:

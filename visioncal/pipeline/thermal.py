@@ -105,15 +105,15 @@ def _stamps(known: Known) -> FloatArray:
 
 def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
     """Fits the drift with the edges and, where they are off, the arm's links."""
-    robot, agreed = known.zeroed_robot, known.agreed
-    if robot is None or agreed is None:
+    robot = known.zeroed_robot
+    if robot is None or known.agreed is None:
         return None
     first = np.unique(known.stops, return_index=True)[1]
     q = known.joints(known.used)
     model = ArmModel.of(robot, q, known.flange_poses(known.used))
     known = replace(known, arm=None)
     data = known.closure(known.used).merged(known.stops)
-    edges, problem = Edges(agreed.edges.x, agreed.edges.z, data.unchanged), data.problem
+    edges, problem = Edges(known.edges[0], known.edges[1], data.unchanged), data.problem
     noise, basis = starting_noise(problem), model.columns("links", q[first])
     links = find_arm_errors(problem, edges.state, noise, ROBOT, basis, of_links=True)
     if links is not None:

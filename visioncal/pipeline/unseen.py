@@ -69,7 +69,7 @@ def _held_back(
     Returns:
         Twice (m, 2) rotation [rad] and distance [m].
     """
-    stated = replace(known, arm=None, arm_model=None, from_first=known.compared_from_first)
+    stated = replace(known, arm=None, arm_model=None, frames=known.compared_frames)
     lost = stated.stated_closure(views)
     data = (stated.closure(views) if lost is None else lost, known.closure(views))
     states = (found.fits[0].fit.state, known.solved.edges.state)

@@ -171,7 +171,7 @@ def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, 
     if known.hand_eye is not None:
         found, noise = known.hand_eye.edges.state, known.hand_eye.noise.sigmas
     elif known.agreed is not None:
-        fit = fit_problem(problem, State(known.agreed.edges.state.edges, still))
+        fit = fit_problem(problem, State(known.edges[:2], still))
         found, noise = fit.state, fit.noise.robots[0]
     elif guess is not None:
         return State(np.stack([guess.x, guess.z]), still), _TYPICAL

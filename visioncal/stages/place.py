@@ -27,12 +27,13 @@ class Layout:
         choice: The views, and those that stay ambiguous.
         boards: Places of the boards that were seen among the session's, the one with the most views
             first.
-        from_first: (b, 4, 4) `target_k_from_target_1` in that order, to begin with.
+        edges: (1 + b, 4, 4) the camera's and the boards' in that order, to begin with; None for one
+            board, whose views say it by themselves.
     """
 
     choice: Choice
     boards: tuple[int, ...]
-    from_first: FloatArray
+    edges: FloatArray | None = None
 
 
 def lay_out(
@@ -58,7 +59,7 @@ def lay_out(
     if len(boards) < 2:
         board = boards[0] if boards else 0
         choice = choose_poses(views, robot, stated[board])
-        return Layout(choice, (board,), np.eye(4)[None])
+        return Layout(choice, (board,))
     first = boards[0]
     if len(parts[first]) < FEWEST_VIEWS:
         raise _too_few(parts, tuple(targets))
@@ -67,7 +68,7 @@ def lay_out(
     rows = [views_of.index(it.view) for it in choice.views]
     _, found = trimmed(robot[shown == first][rows], Candidates.of(choice.views))
     typical = float(np.median(found.away.min(axis=1)))
-    chosen, rejections, from_first = [*choice.views], [*choice.rejections], [np.eye(4)]
+    chosen, rejections, placed = [*choice.views], [*choice.rejections], [found.z]
     for board in boards[1:]:
         part, mine = parts[board], robot[shown == board]
         z, clear = _place_of(part, mine, found.x, typical)
@@ -77,14 +78,14 @@ def lay_out(
             else:
                 why = "ambiguous: two poses of the target fit image and motion alike"
                 rejections.append(Rejection(view.view, why))
-        from_first.append(invert(z) @ found.z)
+        placed.append(z)
     order = {view.view: at for at, view in enumerate(views)}
     chosen.sort(key=lambda it: order[it.view])
     kept = [at for at, it in enumerate(boards) if any(view.board == it for view in chosen)]
     return Layout(
         Choice(tuple(chosen), tuple(rejections)),
         tuple(boards[at] for at in kept),
-        np.array(from_first)[kept],
+        np.array([found.x, *(placed[at] for at in kept)]),
     )
 
 

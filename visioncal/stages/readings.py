@@ -16,8 +16,9 @@ from visioncal.estimation.positions import (
     point_columns,
     residuals,
     supplied_poses,
-    with_places,
 )
+from visioncal.estimation.problem import Effect
+from visioncal.estimation.variance import Knowledge
 from visioncal.figures import figure
 from visioncal.files import did_you_mean, some_of
 from visioncal.instruments import Instrument, instrument_names, stated_instrument
@@ -106,13 +107,25 @@ class Readings:
             self.instrument.sigmas_m(read),
         )
 
+    def effects(self, poses: Sequence[ViewPoses]) -> list[Effect]:
+        """What of the mounting is unknown beside the frames, with the poses that it moves."""
+        if self.mounting is None:
+            return []
+        columns = np.array([it.by_shared[0] for it in poses])
+        size = columns.shape[2]
+        nothing = Knowledge(np.zeros((size, size)), np.zeros(size))
+        return [Effect.free("points", nothing, columns)]
+
     def told_to(self, data: Closure, poses: Sequence[ViewPoses]) -> Closure:
         """Adds to a chain what is known of the poses, which are those of `poses`."""
-        data = replace(data, camera_covariance=np.array([it.covariance[0] for it in poses]))
-        if self.mounting is None:
-            return data
-        columns = np.array([it.by_shared[0] for it in poses])
-        return with_places(data, self.mounting, columns)
+        spread = np.array([it.covariance[0] for it in poses])
+        guess = None
+        if self.mounting is not None:
+            x, z = self.mounting.edges
+            guess = Edges(x, z, np.zeros(0))
+        return replace(
+            data, camera_covariance=spread, guess=guess, effects=tuple(self.effects(poses))
+        )
 
     def moved(self, edges: Edges) -> "Readings":
         """Returns the readings with what a fit found of the mounting."""

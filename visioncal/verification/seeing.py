@@ -158,13 +158,8 @@ def _posed(known: Known, footing: Footing) -> Known:
             "robot.",
             culprits=known.lost_views,
         )
-    known = replace(
-        known,
-        used=tuple(views),
-        boards=footing.boards,
-        from_first=footing.from_first,
-        free=footing.free,
-    ).posed(chosen)
+    known = replace(known, used=tuple(views), boards=footing.boards, free=footing.free)
+    known = replace(known, frames=known.framed(np.concatenate([x[None], placed]))).posed(chosen)
     if known.free is not None and all(it.corners is not None for it in chosen):
         known = replace(known, pixel_px=_noise_px(known)).posed(chosen)
     return _with_errors(known, footing)
