@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
-from visioncal.estimation.joint import CornerProblem, Scene, chance_limit
+from visioncal.estimation.joint import CornerProblem, Scene, chance_limit, repeat_shares
 from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import (
@@ -41,9 +41,16 @@ def with_looks(
 
 
 def _shares(cell: Cell, agreed: Agreed) -> dict[int, float]:
-    """As how much of a view those count for lenses that see a still board from a still camera."""
-    repeats = replace(agreed.problem, with_repeats=True).repeats
-    return {cell.rows[at].view: 1.0 / len(rows) for rows in repeats for at in rows.tolist()}
+    """As how much of a view each row counts for lenses and boards; see `repeat_shares`."""
+    observations, tree = agreed.problem.observations, agreed.problem.tree
+    pairs = list(zip(observations.observers, observations.observed, strict=True))
+    parted = {it: any(step.robot for step in tree.path(*it)) for it in set(pairs)}
+    return repeat_shares(
+        {
+            row.view: (pair, row.station if parted[pair] else None)
+            for row, pair in zip(cell.rows, pairs, strict=True)
+        }
+    )
 
 
 def _looks(
@@ -69,9 +76,9 @@ def _looks(
         corners: dict[int, Corners] = {
             view.view: view.corners for view in mine if view.corners is not None
         }
-        problems[name] = CornerProblem.of(scene, corners)
+        problems[name] = CornerProblem.of(scene, corners, shares)
         poses[name] = np.array([view.cam_from_target[0] for view in mine])
-    return Looks.of(problems, poses, shares)
+    return Looks.of(problems, poses)
 
 
 def settled_looks(

@@ -5,7 +5,8 @@ of frames is closed over all stops with what is left open of these. Linearising 
 until it stays, is Gauss-Newton's method on the whole problem.
 """
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -101,6 +102,18 @@ class Arm:
     priors: tuple[FramePrior, ...] = ()
 
 
+def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
+    """As how much of a view those count that show the same: one image in all.
+
+    What a lens, a print or a detector does to one of them it does to all.
+
+    Args:
+        shown: What each view shows from where, by its number; alike where that is the same.
+    """
+    counts = Counter(shown.values())
+    return {view: 1.0 / counts[it] for view, it in shown.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class CornerProblem:
     """The corners of m views with what is known of the scene beforehand.
@@ -111,6 +124,7 @@ class CornerProblem:
         positions: (c, 3) corners of the flat boards, each in its own frame [m].
         basis: (c, 3, s) of `boards_basis`.
         prior_sigma: (k + s,) what lens and boards are known to; inf where nothing is known.
+        shares: (m,) as how much of a view each counts for lens and board; see `repeat_shares`.
         contested: Whether given intrinsics are held although the corners speak against them.
     """
 
@@ -119,11 +133,17 @@ class CornerProblem:
     positions: FloatArray
     basis: FloatArray
     prior_sigma: FloatArray
+    shares: FloatArray
     contested: bool = False
 
     @classmethod
-    def of(cls, scene: Scene, corners: Mapping[int, Corners]) -> "CornerProblem":
-        """Puts the problem together from the corners by view."""
+    def of(
+        cls, scene: Scene, corners: Mapping[int, Corners], shares: Mapping[int, float]
+    ) -> "CornerProblem":
+        """Puts the problem together from the corners by view, and the shares of those that repeat.
+
+        Where a view has no share, it counts as one.
+        """
         positions = numbered_positions(scene.targets)
         priors = [board_prior(it) for it in scene.targets]
         return cls(
@@ -132,6 +152,7 @@ class CornerProblem:
             positions,
             boards_basis(scene.targets),
             np.concatenate([_lens_prior(scene), *priors]),
+            np.array([shares.get(it, 1.0) for it in corners]),
         )
 
     def without_prior(self, columns: IntArray) -> "CornerProblem":
@@ -367,7 +388,9 @@ def seen_at(
         appearance: Lens and board to linearise at.
         poses: (m, 4, 4) `cam_from_target` to start from.
     """
-    compressed = compress(problem.stack, problem.basis, appearance, poses, problem.scale)
+    compressed = compress(
+        problem.stack, problem.basis, appearance, poses, problem.scale, problem.shares
+    )
     sigma_px = problem.sigma_px(compressed, moving)
     free = _known_beforehand(problem, moving, appearance, compressed, sigma_px)
     return Seen(compressed, free, sigma_px)

@@ -256,7 +256,7 @@ def _look(known: Known) -> Known:
         return known
     if any(view.corners is None for view in views):
         return replace(known, free=held(scene))
-    return known.seeing(look(scene, views, closed_form=known.solver != "joint"))
+    return known.seeing(look(scene, views, known.stops, closed_form=known.solver != "joint"))
 
 
 def _agree(known: Known) -> Known:

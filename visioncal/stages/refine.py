@@ -26,6 +26,7 @@ from visioncal.estimation.joint import (
     contradicted_lens,
     gain,
     measured_scale,
+    repeat_shares,
     seen_at,
     settle,
 )
@@ -61,19 +62,22 @@ class Refined:
     notes: tuple[str, ...] = ()
 
 
-def look(scene: Scene, views: Sequence[ViewPoses], *, closed_form: bool = False) -> Refined:
+def look(
+    scene: Scene, views: Sequence[ViewPoses], stops: IntArray, *, closed_form: bool = False
+) -> Refined:
     """Lens and board as they are given or were estimated, with what is open about them.
 
     Args:
         scene: What is looked at, and with what.
         views: The views, each with its one pose and its corners.
+        stops: (m,) the stop of each.
         closed_form: Whether nothing will move, because the edges will come from a closed form.
 
     Returns:
         The views with how they move when lens and board do.
     """
     with one_blas_thread():
-        problem = CornerProblem.of(scene, _corners(views))
+        problem = _problem(scene, views, stops)
         moving = problem.lens[:0] if closed_form else problem.first
         poses = np.array([view.cam_from_target[0] for view in views])
         seen = seen_at(problem, moving, problem.stated, poses)
@@ -97,7 +101,7 @@ def refine(
         frames: Where the unknown frames are thought to be.
     """
     with one_blas_thread():
-        problem = CornerProblem.of(scene, _corners(views))
+        problem = _problem(scene, views, arm.stops)
         poses = np.array([view.cam_from_target[0] for view in views])
         start = Start(problem.stated, poses, frames)
         answer = _chosen(problem, arm, settle(problem, arm, problem.first, start))
@@ -298,6 +302,12 @@ def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
     ]
     more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
     return bool(np.all(more > less))
+
+
+def _problem(scene: Scene, views: Sequence[ViewPoses], stops: IntArray) -> CornerProblem:
+    """The corners, of which those of one stop and one board count as one view."""
+    shown = {it.view: (stop, it.board) for it, stop in zip(views, stops.tolist(), strict=True)}
+    return CornerProblem.of(scene, _corners(views), repeat_shares(shown))
 
 
 def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:

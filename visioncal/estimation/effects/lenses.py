@@ -31,36 +31,26 @@ class Looks:
         problems: Each camera's corners, by the camera.
         values: (k,) all lenses' intrinsics, camera by camera, and then all boards' shapes.
         poses: (v, 4, 4) of the views, camera by camera.
-        shares: (v,) as how much of a view each counts for lenses and boards; see `compress`.
     """
 
     problems: Mapping[str, CornerProblem]
     values: FloatArray
     poses: FloatArray
-    shares: FloatArray
 
     @classmethod
-    def of(
-        cls,
-        problems: Mapping[str, CornerProblem],
-        poses: Mapping[str, FloatArray],
-        shares: Mapping[int, float],
-    ) -> "Looks":
+    def of(cls, problems: Mapping[str, CornerProblem], poses: Mapping[str, FloatArray]) -> "Looks":
         """Lenses and boards as they are stated or were estimated before.
 
         Args:
             problems: Each camera's corners, of the same boards.
             poses: (v, 4, 4) the poses of each camera's views, in the order of its corners.
-            shares: As how much of a view those count that repeat others, by view.
         """
-        views = [view for it in problems.values() for view in it.stack.views]
         lenses = [intrinsics(it.scene.camera) for it in problems.values()]
         boards = next(iter(problems.values())).basis.shape[2]
         return cls(
             problems,
             np.concatenate([*lenses, np.zeros(boards)]),
             np.concatenate([poses[name] for name in problems]),
-            np.array([shares.get(it, 1.0) for it in views]),
         )
 
     @cached_property
@@ -120,8 +110,7 @@ class Looks:
     @cached_property
     def stated(self) -> FloatArray:
         """(k,) the values as they are stated, or were estimated before."""
-        nowhere = {name: np.zeros((0, 4, 4)) for name in self.problems}
-        return Looks.of(self.problems, nowhere, {}).values
+        return Looks.of(self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}).values
 
     @property
     def first(self) -> IntArray:
@@ -162,7 +151,7 @@ class Looks:
                 appearance,
                 self.poses[begin:end],
                 problem.scale,
-                self.shares[begin:end],
+                problem.shares,
             )
             places = self.places(name)
             sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, free)))
