@@ -19,7 +19,9 @@ from mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
 from mutators import KINDS
 from results import write_section
 
-MUTANTS, QUICK = 2000, 30
+MUTANTS = 2000
+# With --quick one reading of so many is broken once: nineteen of the 21 commands.
+QUICK = 3
 # Reasons that are given less often than once in so many mutants share a row.
 RARE = 250
 _COLUMNS = (*KINDS, "file system")
@@ -70,15 +72,14 @@ def reasons(ended: Sequence[Ended]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} mutants, nothing kept.")
+    parser.add_argument("--quick", action="store_true", help="Few mutants, nothing kept.")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args()
-    count = QUICK if asked.quick else MUTANTS
-    sound = 0 if asked.quick else len(READINGS)
+    quick, whole = range(0, len(READINGS), QUICK), range(-len(READINGS), MUTANTS)
     ended: list[Ended] = []
     with tempfile.TemporaryDirectory() as folder:
-        numbers = range(-sound, count)
+        numbers = quick if asked.quick else whole
         for it in walk(numbers, Path(folder), seed=asked.seed, processes=asked.processes):
             ended.append(it)
             if it.faults or (it.number < 0 and it.status != it.reading.sound):
