@@ -4,11 +4,12 @@ import numpy as np
 
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.problem import ROBOT
+from visioncal.robot import Loads
 from visioncal.stages.handeye import robot_part
-from visioncal.stages.tell import ArmData
 from visioncal.transforms import exp, invert
 
 ERROR_RAD = 1e-3
@@ -54,6 +55,7 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
         ERROR_RAD,
         np.arange(len(q)),
         q,
+        Loads.none(len(q)),
         np.zeros(3),
         np.arange(12),
     )

@@ -12,6 +12,7 @@ from visioncal.alignment import align
 from visioncal.calibration import Alignment, Calibration
 from visioncal.errors import DataError, DegenerateError
 from visioncal.exports import Selection, document
+from visioncal.pipeline import calibrate
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, charuco_target, simulate
@@ -27,7 +28,8 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import pose_row
+from visioncal.simulation.records import pairs_session, pose_row
+from visioncal.simulation.sag import Payload
 from visioncal.transforms import exp, invert, log
 from visioncal.types import Target
 
@@ -388,3 +390,27 @@ def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path
         "cell_from_cam_right",
         "flange_a_from_target_plate_a",
     }
+
+
+def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
+    springs = (1e-4, 1e-4, 8e-5, 2e-5, 2e-5, 1e-5)
+    loads = (Payload(0.0, (0.0, 0.0, 0.0)), Payload(8.0, (0.0, 0.0, 0.08)))
+    bending = CellOptions(compliance_rad_per_nm=springs, payloads=loads, branches=True, views=30)
+    pairs_session(simulate(bending), "pairs").save(tmp_path / "pairs")
+    session = Session.load(tmp_path / "pairs")
+    alone, cell = calibrate(session), Calibration.whole(align(session)).of()
+    assert cell.stages["kinematics"]["level"] == "elastic"
+    assert alone.stages["kinematics"]["level"] == "elastic"
+    rows = zip(*(it.stages["elastic"]["joints"] for it in (alone, cell)), springs, strict=True)
+    for one, other, true in rows:
+        sigma = other["sigma_rad_per_nm"]
+        # Of the same views, but for what a frame beside the arm takes up: within a sigma or so.
+        assert other["compliance_rad_per_nm"] == pytest.approx(
+            one["compliance_rad_per_nm"], abs=1.5 * sigma
+        )
+        if other["told"]:
+            assert other["compliance_rad_per_nm"] == pytest.approx(true, abs=4.5 * sigma)
+    assert sum(other["told"] for other in cell.stages["elastic"]["joints"]) >= 2
+    np.testing.assert_allclose(
+        cell.compliance, [it["compliance_rad_per_nm"] for it in cell.stages["elastic"]["joints"]]
+    )

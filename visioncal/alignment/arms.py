@@ -13,12 +13,11 @@ from visioncal.estimation.solve import Solution
 from visioncal.robot import Robot
 from visioncal.session import View
 from visioncal.session.loads import loads_of
-from visioncal.stages.arms import RobotArm
+from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.diagnose import FEWEST_STOPS, misfit_words
 from visioncal.stages.joints import Matched, match_joints
 from visioncal.stages.kinematics import ASKED, doubts, findings
 from visioncal.stages.loads import check_elastic, check_poses
-from visioncal.stages.tell import Telling
 from visioncal.types import FloatArray
 
 # How far the arms of a whole cell may be calibrated.
@@ -124,13 +123,12 @@ def doubts_of_arms(
             yield _of_robot(robot, words)
 
 
-def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, Telling]) -> Iterator[str]:
+def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
     """Words what was found of the arms and is no reason for doubt."""
     for robot, arm in arms.items():
         notes = () if arm.matched is None else arm.matched.notes
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        advice = [told[robot].advice] if robot in told and told[robot].advice else []
-        for words in (*notes, *chosen, *advice):
+        for words in (*notes, *chosen, *told[robot].notes()):
             yield _of_robot(robot, words)
 
 

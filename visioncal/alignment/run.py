@@ -46,11 +46,11 @@ from visioncal.estimation.arm import stops_of
 from visioncal.estimation.solve import covariance_of
 from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
+from visioncal.stages.arms import ArmFound
 from visioncal.stages.delays import FoundDelay
 from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.offset import Clock
-from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
 from visioncal.targets import corner_positions, target_document
 from visioncal.threads import one_blas_thread
@@ -137,7 +137,7 @@ def alignment_of(
         for name, it in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
-    told = tellings(solved, spread, convention)
+    told = _found_of_arms(solved, spread, convention)
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
     moved, noise, faults = movements(solved), _noise(solved), pose_faults(solved)
     held_out = left_out(solved)
@@ -154,6 +154,7 @@ def alignment_of(
         warnings=[
             *clocks.warnings,
             *_warnings(solved, looked, spread, found),
+            *(f"Robot {name}: {words}" for name, it in told.items() for words in it.doubts()),
             *(moved_words(it) for it in moved),
             *(f"{it.frame} is tied to nothing. {it.remedy}" for it in untied),
         ],
@@ -181,7 +182,7 @@ def alignment_of(
         weakest=weakest_link(solved.cell, last),
         verdict=judge(findings),
         details=_details(clocks, solved, spread),
-        arms=_arms(session, solved, spread, told),
+        arms=_arms(session, solved, told),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
         stages={
             **fit_sections(session, solved, spread, len(edges)),
@@ -192,25 +193,22 @@ def alignment_of(
     )
 
 
-def tellings(
+def _found_of_arms(
     solved: Solved, spread: FloatArray, convention: Convention | None
-) -> dict[str, Telling]:
-    """What the stops tell of the calibrated arms, by robot."""
+) -> dict[str, ArmFound]:
+    """What the stops tell of the arms, by robot."""
     agreed, plates = solved.agreed, solved.cell.session.plates
     middles = {
         frame_name("target", name): corner_positions(it).mean(axis=0) for name, it in plates.items()
     }
     part = agreed.problem.subset(agreed.used)
-    found = {
-        name: arm.tell(part, agreed.fit, spread, middles, convention)
+    return {
+        name: arm.found(arm.seen(part, agreed.fit, spread, middles), convention)
         for name, arm in solved.arms.items()
     }
-    return {name: it for name, it in found.items() if it is not None}
 
 
-def _arms(
-    session: Session, solved: Solved, spread: FloatArray, told: Mapping[str, Telling]
-) -> dict[str, RobotResult]:
+def _arms(session: Session, solved: Solved, told: Mapping[str, ArmFound]) -> dict[str, RobotResult]:
     models = session.robot_documents
     found = {
         robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
@@ -222,7 +220,7 @@ def _arms(
     part = solved.agreed.problem.subset(solved.agreed.used)
     for name, arm in solved.arms.items():
         stops = stops_of(part, name).tolist()
-        stages = arm.documents(part, spread, told.get(name), [first[it] for it in stops])
+        stages = arm.documents(told[name], [first[it] for it in stops])
         found[name] = replace(found[name], stages=stages)
     return found
 

@@ -1,10 +1,12 @@
-"""One pair of frames with a robot's arm between them, as it is at any posture of the arm."""
+"""What was observed of a robot's arm: its stops, and a pair of frames that it parts."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.problem import Linear, Noise, Observations, Problem, State
+from visioncal.robot import Loads
 from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -130,3 +132,62 @@ class ArmPair:
         root = np.linalg.cholesky(np.linalg.inv(spread).mean(axis=0))
         found[np.ix_(measured, measured)] = root.T
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class ArmData:
+    """What was seen of a robot's arm whose errors are estimated.
+
+    Attributes:
+        problem: The observations.
+        state: The unknowns.
+        noise: The noise's levels.
+        covariance: (u, u) of the unknowns.
+        robot: The robot.
+        model: The arm.
+        columns: (p,) which of the unknowns are its errors.
+        error_rad: Their size.
+        stops: (m,) the stops at which it was observed.
+        q: (m, n) joint angles there [rad].
+        loads: What it carried there.
+        at: (3,) the point of a target that counts, in its frame [m].
+        frames: (f,) which of the unknowns are frames of which nothing is known.
+        measured: (6,) which components of the poses are seen (rotation, translation).
+        apart: (p, p) projection of its errors on those that are not the frames'; None for all.
+    """
+
+    problem: Problem
+    state: State
+    noise: Noise
+    covariance: FloatArray
+    robot: str
+    model: ArmModel
+    columns: IntArray
+    error_rad: float
+    stops: IntArray
+    q: FloatArray
+    loads: Loads
+    at: FloatArray
+    frames: IntArray
+    measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
+    apart: FloatArray | None = None
+
+    @property
+    def spread(self) -> FloatArray:
+        """(p, p) covariance of its errors."""
+        return self.covariance[np.ix_(self.columns, self.columns)]
+
+    @property
+    def chain(self) -> IntArray:
+        """(f + p,) which of the unknowns are frames and the arm's errors."""
+        return np.concatenate([self.frames, self.columns])
+
+    @property
+    def pair(self) -> ArmPair:
+        """The frames that the arm is seen by."""
+        return ArmPair.of(self.problem, self.state, self.robot)
+
+    def basis(self, q: FloatArray) -> FloatArray:
+        """(k, 6, p) how the flange moves with the arm's errors."""
+        found = self.model.basis(q)
+        return found if self.apart is None else found @ self.apart

@@ -1,19 +1,14 @@
 """What each stop says of the joints' springs, beside what the fit of all of them says."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    normal_equations,
-    residual_blocks,
-)
-from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.armpair import ArmData
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.problem import Effect, State
+from visioncal.estimation.solve import normal_equations, whitened
 from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Loads
 from visioncal.types import FloatArray
@@ -41,29 +36,25 @@ def compliance_unit(model: ArmModel) -> float:
     return model.weights[COMPLIANCE] / model.torque_nm
 
 
-def bends_seen(
-    data: Closure, edges: Edges, noise: Noise, model: ArmModel, torques: FloatArray
-) -> FloatArray:
+def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
     """How far each stop sees each joint bend, if all that is left of it were that joint's.
 
     Partial residuals of a regression (Larsen and McCleary 1972): the fitted bend and what the
     residual, weighted by its covariance, adds along the joint.
 
     Args:
-        data: The views, one a stop; the arm's errors are the last of what they share.
-        edges: The answer.
-        noise: Its noise.
-        model: The arm.
+        arm: What was seen of it.
         torques: (m, n) on the joints [N m].
 
     Returns:
         (m, n) [rad]; NaN where the torque is too small to tell.
     """
-    residuals, jacobian, spread = residual_blocks(data, edges, noise)
-    arm = jacobian[:, :, -len(model.values) :][:, :, model.place_of(COMPLIANCE)]
-    weighted = np.linalg.solve(spread, arm)
-    pulled = np.einsum("mij,mi->mj", weighted, residuals)
-    square = np.einsum("mij,mij->mj", weighted, arm)
+    model, problem = arm.model, arm.problem
+    residuals, slopes = whitened(problem, arm.state, arm.noise, ideal=False)
+    springs = slopes[:, :, arm.columns[model.place_of(COMPLIANCE)]]
+    of = [problem.observations.stops == stop for stop in arm.stops.tolist()]
+    pulled = np.array([np.einsum("mij,mi->j", springs[it], residuals[it]) for it in of])
+    square = np.array([np.einsum("mij,mij->j", springs[it], springs[it]) for it in of])
     least = np.maximum(_LEAST_NM, _LEAST_SHARE * np.abs(torques).max(axis=0))
     told = (np.abs(torques) > least) & (square > 0.0)
     more = np.full(torques.shape, np.nan)
@@ -71,37 +62,32 @@ def bends_seen(
     return torques * (model.compliance + compliance_unit(model) * more)
 
 
-def payload_factor(
-    data: Closure, edges: Edges, noise: Noise, model: ArmModel, q: FloatArray, loads: Loads
-) -> Factor | None:
+def payload_factor(arm: ArmData) -> Factor | None:
     """By which factor payload and force bend the arm beyond what is stated of them.
 
     One more unknown beside all others, tried at the answer (Rao's score test). The springs are told
     by the arm's own weight, and by the loads' differences between postures.
 
     Args:
-        data: The views, one a stop.
-        edges: The answer.
-        noise: Its noise.
-        model: The arm.
-        q: (m, n) joint angles [rad].
-        loads: What the flange carried.
+        arm: What was seen of it.
 
     Returns:
         The factor; None where there were no loads or they bend nothing.
     """
+    model, problem, loads = arm.model, arm.problem, arm.loads
     if not loads.any or not model.compliance.any():
         return None
-    bent = model.bent(q, loads)
-    robot = model.robot
+    bent, robot = model.bent(arm.q, loads), model.robot
     more = robot.load_torques(bent, loads) - robot.load_torques(bent)
-    moved = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * more)
+    moved = np.zeros((len(problem.poses[arm.robot]), 6, 1))
+    bends = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * more)
+    moved[arm.stops] = bends[:, :, None]
     nothing = Knowledge(np.zeros((1, 1)), np.zeros(1))
-    one = Effect.free("loads", nothing, by_flange={ROBOT: moved[:, :, None]})
-    widened = data.with_more(one)
-    at = replace(edges, shared=np.append(edges.shared, 0.0))
-    information, gradient = normal_equations(widened, at, noise)
-    spread = covariance(information)
+    one = Effect.free("payload", nothing, by_flange={arm.robot: moved})
+    widened = problem.with_effects([*problem.effects, one])
+    there = State(arm.state.edges, np.append(arm.state.values, 0.0))
+    information, gradient = normal_equations(widened, there, arm.noise)
+    spread = covariance_among(information, widened.moving)
     sigma = float(np.sqrt(spread[-1, -1]))
     return Factor(1.0 - float(spread[-1] @ gradient), sigma)
 

@@ -141,7 +141,7 @@ def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
 
     Args:
         arm: The observations, and what of the arm they may show.
-        blocks: Those to free; behind the first, those that explain no more than chance stay out.
+        blocks: Those to free; those that explain no more than chance stay out.
 
     Returns:
         The fit; None where nothing beyond chance makes it this level.
@@ -149,15 +149,15 @@ def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
     if blocks.own and not arm.bases.keys() & set(blocks.own):
         return None
     errors: dict[str, ArmErrors] = {}
-    gain = 0.0
-    for name in (it for it in blocks.names if it in arm.bases):
-        found = arm.found(errors, arm.bases[name])
-        if found is None or not found.is_significant:
-            if not errors:
-                return None
-            continue
-        gain += found.gain
-        errors = _without_springs(arm, errors | {name: found})
+    gain, count = 0.0, -1
+    # What large errors of another block hid shows once these are free.
+    while len(errors) > count:
+        count = len(errors)
+        for name in (it for it in blocks.names if it in arm.bases and it not in errors):
+            found = arm.found(errors, arm.bases[name])
+            if found is not None and found.is_significant:
+                gain += found.gain
+                errors = _without_springs(arm, errors | {name: found})
     if blocks.own and not errors.keys() & set(blocks.own):
         return None
     return arm.level(errors, gain)

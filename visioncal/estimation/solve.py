@@ -470,12 +470,17 @@ def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArr
     return np.asarray(found)
 
 
-def whitened_slopes(
-    problem: Problem, state: State, noise: Noise, measured: Mask | None = None
-) -> FloatArray:
-    """Derivatives (n, d, p) of residuals of unit covariance, where all chains close exactly.
+def whitened(
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    measured: Mask | None = None,
+    *,
+    ideal: bool = True,
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n, d) of unit covariance, and their derivatives (n, d, p).
 
-    Their squares, summed, are all of `fisher_information` but what is known beside the
+    The squares of the derivatives, summed, are all of the information but what is known beside the
     observations. Rows of one unit are made independent of those before them.
 
     Args:
@@ -483,20 +488,22 @@ def whitened_slopes(
         state: Where.
         noise: Its levels.
         measured: (6,) the d components of the poses that count; None for all.
+        ideal: See `Problem.linear`.
     """
-    linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
+    linear, own = problem.linear(state, ideal=ideal), problem.covariance(noise)
     kept = np.flatnonzero(np.ones(6, dtype=bool) if measured is None else measured)
-    jacobian, by_errors = linear.jacobian[:, kept], linear.by_errors[:, kept]
+    rows = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    rows, by_errors = rows[:, kept], linear.by_errors[:, kept]
     own = own[:, kept][:, :, kept]
     total = problem.total_covariance(linear, noise)[:, kept][:, :, kept]
-    found = np.asarray(np.linalg.solve(np.linalg.cholesky(total), jacobian))
+    found = np.asarray(np.linalg.solve(np.linalg.cholesky(total), rows))
     errors = problem.error_covariance(noise)
-    for unit, rows in problem.shared_units:
-        slopes = by_errors[rows].reshape(len(rows) * len(kept), -1)
-        among = block_diag(*own[rows]) + slopes @ errors[unit] @ slopes.T
-        flat = jacobian[rows].reshape(len(slopes), -1)
-        found[rows] = np.linalg.solve(np.linalg.cholesky(among), flat).reshape(jacobian[rows].shape)
-    return found
+    for unit, of in problem.shared_units:
+        slopes = by_errors[of].reshape(len(of) * len(kept), -1)
+        among = block_diag(*own[of]) + slopes @ errors[unit] @ slopes.T
+        flat = rows[of].reshape(len(slopes), -1)
+        found[of] = np.linalg.solve(np.linalg.cholesky(among), flat).reshape(rows[of].shape)
+    return found[:, :, -1], found[:, :, :-1]
 
 
 def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:

@@ -4,7 +4,7 @@ import numpy as np
 
 from visioncal.estimation.linalg import covariance, covariance_among, gram
 from visioncal.estimation.problem import Noise, Problem, State
-from visioncal.estimation.solve import fisher_information, whitened_slopes
+from visioncal.estimation.solve import fisher_information, whitened
 from visioncal.types import FloatArray, IntArray
 
 
@@ -38,7 +38,7 @@ def stop_worth(
     moving = np.isin(np.arange(problem.size), free) & problem.counted
     fitted = covariance_among(fisher_information(problem, state, noise), moving)
     fitted = fitted[np.ix_(free, free)]
-    slopes = whitened_slopes(problem, state, noise)[:, :, free]
+    slopes = whitened(problem, state, noise)[1][:, :, free]
     mean = gram(place, place) / len(place)
     growth = np.zeros(len(stops))
     for at, stop in enumerate(stops.tolist()):

@@ -4,20 +4,29 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.armmodel import BACKLASH
+from visioncal.estimation.armmodel import RIGID
+from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.problem import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.unseen import unseen_views
 from visioncal.stages.backlash import plays_of
-from visioncal.stages.tell import ArmData, Telling, tell
+from visioncal.stages.tell import Telling, tell
 from visioncal.targets import corner_positions
 
 
 def telling_of(known: Known) -> Telling | None:
     """What the stops tell of a calibrated arm; None for one that stands as stated."""
+    seen = arm_data(known)
+    # With nothing but play and springs its numbers are as stated.
+    if seen is None or not seen.model.weights.keys() & set(RIGID):
+        return None
+    return tell(seen, known.convention)
+
+
+def arm_data(known: Known) -> ArmData | None:
+    """What was seen of a calibrated arm; None for one that stands as stated."""
     found, model = known.kinematics, known.arm_model
-    # In the middle of its play an arm that has nothing but play stands as stated.
-    if found is None or model is None or not found.errors.keys() - {BACKLASH}:
+    if found is None or model is None:
         return None
     targets, boards = tuple(known.session.boards.values()), known.shown(known.used)
     first = np.unique(known.stops, return_index=True)[1]
@@ -26,7 +35,7 @@ def telling_of(known: Known) -> Telling | None:
     # Readings of one point show its place and no rotation; several points make a frame.
     shows_pose = bool((data.told > 3).any())
     size, result = data.problem.size, known.solved
-    seen = ArmData(
+    return ArmData(
         data.problem,
         result.edges.state,
         result.noise.levels,
@@ -37,11 +46,11 @@ def telling_of(known: Known) -> Telling | None:
         next(iter(found.errors.values())).sigma,
         np.arange(len(data)),
         known.joints(known.used)[first],
+        known.loads(known.used).chosen(first),
         corner_positions(targets[known.boards[0]]).mean(axis=0) if targets else np.zeros(3),
         np.concatenate([np.arange(12), 12 + further]),
         measured=np.repeat([shows_pose, True], 3),
     )
-    return tell(seen, known.convention)
 
 
 def kinematics_document(known: Known) -> dict[str, Any] | None:
@@ -59,12 +68,12 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
     if telling is None:
         return document
     return document | {
-        **telling.document(model.nominal, _views(known), known.lost_zero),
+        **telling.document(model.nominal, first_views(known), known.lost_zero),
         **unseen_views(known, found),
     }
 
 
-def _views(known: Known) -> list[int]:
+def first_views(known: Known) -> list[int]:
     """The first view of each stop."""
     first = np.unique(known.stops, return_index=True)[1]
     return [known.used[at] for at in first.tolist()]

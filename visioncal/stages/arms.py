@@ -14,20 +14,49 @@ from visioncal.estimation.arm import (
     pose_basis,
     stops_of,
 )
-from visioncal.estimation.armmodel import BACKLASH, RIGID, ArmModel, blocks_of
-from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
+from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.told import frames_apart
 from visioncal.estimation.workspace import postures
-from visioncal.guess.joints import JointReading
 from visioncal.robot import Convention, Loads
-from visioncal.stages.backlash import plays_of
+from visioncal.stages import backlash, elastic
+from visioncal.stages.backlash import Play, plays_of
+from visioncal.stages.elastic import Elastic, springs_of
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import Kinematics, choose_level
-from visioncal.stages.tell import ArmData, Telling, tell
+from visioncal.stages.tell import Telling, tell
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray, Mask
+
+
+@dataclass(frozen=True, eq=False)
+class ArmFound:
+    """What the stops tell of an arm.
+
+    Attributes:
+        telling: Of its numbers; None where it stands as stated.
+        springs: Of its joints as springs; None for a rigid one.
+        plays: Of the play in its joints; empty where stops did not come from both sides.
+    """
+
+    telling: Telling | None = None
+    springs: Elastic | None = None
+    plays: tuple[Play, ...] = ()
+
+    def notes(self) -> Iterator[str]:
+        """Words what is no reason for doubt."""
+        if self.telling is not None and self.telling.advice:
+            yield self.telling.advice
+        yield from backlash.remarks(self.plays)
+        if self.springs is not None:
+            yield from elastic.remarks(self.springs)
+
+    def doubts(self) -> Iterator[str]:
+        """Words what speaks against it."""
+        if self.springs is not None:
+            yield from elastic.doubts(self.springs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,74 +125,82 @@ class RobotArm:
         )
         return replace(self, errors=found)
 
-    def tell(
-        self,
-        problem: Problem,
-        fit: Solution,
-        spread: FloatArray,
-        middles: Mapping[str, FloatArray],
-        convention: Convention | None = None,
-    ) -> Telling | None:
-        """What the stops tell of it; None where it stands as stated, but for play in its joints.
+    def seen(
+        self, problem: Problem, fit: Solution, spread: FloatArray, middles: Mapping[str, FloatArray]
+    ) -> ArmData | None:
+        """What was seen of it; None where it stands as stated.
 
         Args:
             problem: The observations that agree, with its errors among the unknowns.
             fit: Their fit.
             spread: (p, p) its covariance.
             middles: (3,) the middle of each printed target by its frame, in that [m].
-            convention: Of the table that is wanted; see `stages.tell`.
         """
-        model, errors = self.model, self.errors
-        if model is None or errors is None or not model.weights.keys() - {BACKLASH}:
-            return None
-        if self.joints_rad is None:
+        if self.model is None or self.errors is None or self.joints_rad is None:
             return None
         (effect,) = self.effects()
         stops, every = stops_of(problem, self.robot), np.arange(problem.size)
+        rows = np.searchsorted(np.flatnonzero(self.stood), stops)
         observed = ArmPair.of(problem, fit.state, self.robot).observed
         edges = every[: 6 * len(problem.unknown)]
-        seen = ArmData(
+        return ArmData(
             problem,
             fit.state,
             fit.noise,
             spread,
             self.robot,
-            model,
+            self.model,
             every[problem.effect_columns[effect.name]],
-            errors.sigma,
+            self.errors.sigma,
             stops,
-            self.joints_rad[np.searchsorted(np.flatnonzero(self.stood), stops)],
+            self.joints_rad[rows],
+            self.loads.chosen(rows),
             middles.get(observed, np.zeros(3)),
             edges[problem.counted[edges]],
-            apart=block_diag(*(self._apart(model, name) for name in model.weights)),
+            apart=block_diag(*(self._apart(self.model, name) for name in self.model.weights)),
         )
-        return tell(seen, convention)
 
-    def documents(
-        self, problem: Problem, spread: FloatArray, telling: Telling | None, views: Sequence[int]
-    ) -> dict[str, Any]:
+    def found(self, seen: ArmData | None, convention: Convention | None = None) -> ArmFound:
+        """What the stops tell of it.
+
+        Args:
+            seen: What was seen of it; None where it stands as stated.
+            convention: Of the table that is wanted; see `stages.tell`.
+        """
+        if seen is None or self.kinematics is None:
+            return ArmFound()
+        # With nothing but play and springs its numbers are as stated.
+        erring = seen.model.weights.keys() & set(RIGID)
+        return ArmFound(
+            tell(seen, convention) if erring else None,
+            springs_of(seen, self.kinematics.errors),
+            plays_of(seen.model, seen.spread),
+        )
+
+    def documents(self, found: ArmFound, views: Sequence[int]) -> dict[str, Any]:
         """What was found of it, as calibration.json has it: one section a stage.
 
         Args:
-            problem: The problem that has its errors.
-            spread: (p, p) covariance of its unknowns.
-            telling: What the stops tell of it.
-            views: By which views the stops of that go.
+            found: What the stops tell of it.
+            views: By which views these stops go.
         """
-        found: dict[str, Any] = {}
+        stages: dict[str, Any] = {}
         if self.errors is not None:
-            found["arm_errors"] = self.errors.document()
-        if self.kinematics is not None:
-            found["kinematics"] = self.kinematics.document()
-            if self.model is not None:
-                (effect,) = self.effects()
-                mine = problem.effect_columns[effect.name]
-                plays = [it.document() for it in plays_of(self.model, spread[mine, mine])]
-                found["kinematics"] |= {"backlash": plays} if plays else {}
-                found["kinematics"]["robot"] = dict(self.model.robot.document)
-                if telling is not None:
-                    found["kinematics"] |= telling.document(self.model.nominal, views, self._zero)
-        return found
+            stages["arm_errors"] = self.errors.document()
+        if self.kinematics is None:
+            return stages
+        stages["kinematics"] = self.kinematics.document()
+        if self.model is None:
+            return stages
+        stages["kinematics"]["robot"] = dict(self.model.robot.document)
+        if found.plays:
+            stages["kinematics"]["backlash"] = [it.document() for it in found.plays]
+        if found.telling is not None:
+            zero = None if self.matched is None else self.matched.zero
+            stages["kinematics"] |= found.telling.document(self.model.nominal, views, zero)
+        if found.springs is not None:
+            stages["elastic"] = found.springs.document(views)
+        return stages
 
     def _any_errors(self) -> FloatArray:
         """(s, 6, p) how small errors move its flange: of its links, where these are known."""
@@ -201,10 +238,6 @@ class RobotArm:
 
     def _apart(self, model: ArmModel, name: str) -> FloatArray:
         return self.apart[name] if name in self.apart else np.eye(model.size_of(name))
-
-    @property
-    def _zero(self) -> JointReading | None:
-        return None if self.matched is None else self.matched.zero
 
     def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
         """Linearises the calibrated arm anew where a fit has it.

@@ -1,11 +1,14 @@
 """What the stops say of the joints' springs: stiffnesses, and whether loads and bends fit."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
+from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.bending import (
     Factor,
     bends_seen,
@@ -13,11 +16,9 @@ from visioncal.estimation.bending import (
     flange_bends,
     payload_factor,
 )
-from visioncal.estimation.closure import Closure
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.robot import Loads, Robot
-from visioncal.stages.handeye import HandEyeResult
 from visioncal.types import FloatArray, Mask
 
 # A joint is told where the stops leave less than this share of what was open about it.
@@ -60,6 +61,20 @@ class Spring:
             return ""
         return f"{1e-3 * stiffness:.4g} +- {figure(1e-3 * sigma)} kN m/rad"
 
+    def document(self) -> dict[str, Any]:
+        """It as calibration.json has it."""
+        row: dict[str, Any] = {
+            "joint": self.joint,
+            "compliance_rad_per_nm": self.compliance,
+            "sigma_rad_per_nm": self.sigma,
+            "told": self.is_told,
+            "torque_nm": list(self.torque_nm),
+        }
+        if self.stiffness is not None:
+            row["stiffness_nm_per_rad"] = self.stiffness
+            row["stiffness_sigma_nm_per_rad"] = self.stiffness_sigma
+        return row
+
     @property
     def stiffness_sigma(self) -> float | None:
         """Standard deviation of the stiffness, to first order [N m/rad]."""
@@ -97,29 +112,63 @@ class Elastic:
         """The joints that the loads do not tell."""
         return tuple(it.joint for it in self.springs if not it.is_told)
 
+    def document(self, views: Sequence[int]) -> dict[str, Any]:
+        """It as calibration.json has it.
 
-def springs_of(
-    data: Closure, result: HandEyeResult, model: ArmModel, q: FloatArray, loads: Loads, prior: float
-) -> Elastic:
-    """Tells what was found of the springs.
+        Args:
+            views: (m,) by which views the stops go.
+        """
+        document: dict[str, Any] = {
+            "joints": [it.document() for it in self.springs],
+            "not_told": list(self.untold),
+            "weight": "of the model's masses" if self.weighs else "unknown",
+            "payload_kg": [float(self.payload_kg.min()), float(self.payload_kg.max())],
+            "sag_mm": {
+                "median": float(np.median(self.sag_mm)),
+                "most": float(self.sag_mm.max()),
+            },
+            "stops": [self._stop(at, view) for at, view in enumerate(views)],
+        }
+        if self.weight_moments is not None:
+            document["weight_moments"] = self.weight_moments.tolist()
+        if self.payload is not None:
+            document["payload_factor"] = {
+                "value": self.payload.value,
+                "sigma": self.payload.sigma,
+            }
+        return document
+
+    def _stop(self, at: int, view: int) -> dict[str, Any]:
+        """Torques and bends of a stop; a bend that is not told is left out."""
+        joints = (it.joint for it in self.springs)
+        bends = zip(joints, self.bends_rad[at].tolist(), strict=True)
+        return {
+            "view": view,
+            "payload_kg": float(self.payload_kg[at]),
+            "sag_mm": float(self.sag_mm[at]),
+            "torque_nm": self.torques_nm[at].tolist(),
+            "bend_mrad": {name: 1e3 * bend for name, bend in bends if np.isfinite(bend)},
+        }
+
+
+def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
+    """Tells what was found of the springs; None for a rigid arm.
 
     Args:
-        data: The views, one a stop; the arm's errors are the last of what they share.
-        result: The answer, with its covariance.
-        model: The arm.
-        q: (m, n) joint angles of the stops [rad].
-        loads: What the flange carried.
-        prior: Standard deviation of a compliance before the stops were asked [rad/(N m)].
+        arm: What was seen of it.
+        errors: Its errors by block, with their sizes before the stops were asked.
     """
+    if not errors.keys() & {COMPLIANCE, WEIGHT}:
+        return None
+    model, q, loads = arm.model, arm.q, arm.loads
+    prior = errors[COMPLIANCE].sigma / model.torque_nm if COMPLIANCE in errors else 0.0
     torques = model.robot.load_torques(model.bent(q, loads), loads)
-    size = len(model.values)
-    springs = model.place_of(COMPLIANCE)
-    spread = result.covariance[-size:, -size:][springs, springs]
     sigmas = np.full(model.nominal.joint_count, prior)
     bends_rad = np.full(torques.shape, np.nan)
     if COMPLIANCE in model.weights:
-        sigmas = compliance_unit(model) * np.sqrt(np.diag(spread))
-        bends_rad = bends_seen(data, result.edges, result.noise, model, torques)
+        variances = np.diag(arm.spread)[model.place_of(COMPLIANCE)]
+        sigmas = compliance_unit(model) * np.sqrt(variances)
+        bends_rad = bends_seen(arm, torques)
     told = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _TOLD * prior)
     return Elastic(
         tuple(_springs(model, np.minimum(sigmas, prior), told, torques)),
@@ -127,7 +176,7 @@ def springs_of(
         bends_rad,
         1e3 * flange_bends(model, q, loads),
         loads.payload_kg,
-        payload_factor(data, result.edges, result.noise, model, q, loads),
+        payload_factor(arm),
         model.nominal.masses is not None,
         model.moments,
     )

@@ -1,13 +1,13 @@
 """Stage 7: what the stops tell of a calibrated arm, and what it is worth all over its workspace."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.lacking import Move, joints_to_move
 from visioncal.estimation.parameters import (
@@ -16,8 +16,7 @@ from visioncal.estimation.parameters import (
     parameter_moves,
     parameter_slopes,
 )
-from visioncal.estimation.problem import Noise, Problem, State
-from visioncal.estimation.solve import whitened_slopes
+from visioncal.estimation.solve import whitened
 from visioncal.estimation.told import Slopes, Told, count_told, what_is_told
 from visioncal.estimation.untold import (
     dominant_words,
@@ -41,7 +40,7 @@ from visioncal.robot import (
     table_of,
 )
 from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import FloatArray
 
 # So many places are enough for a map.
 _PLACES = 200
@@ -155,58 +154,6 @@ def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> dict
     }
 
 
-@dataclass(frozen=True, eq=False)
-class ArmData:
-    """What was seen of a robot's arm whose errors are estimated.
-
-    Attributes:
-        problem: The observations.
-        state: The unknowns.
-        noise: The noise's levels.
-        covariance: (u, u) of the unknowns.
-        robot: The robot.
-        model: The arm.
-        columns: (p,) which of the unknowns are its errors.
-        error_rad: Their size.
-        stops: (m,) the stops at which it was observed.
-        q: (m, n) joint angles there [rad].
-        at: (3,) the point of a target that counts, in its frame [m].
-        frames: (f,) which of the unknowns are frames of which nothing is known.
-        measured: (6,) which components of the poses are seen (rotation, translation).
-        apart: (p, p) projection of its errors on those that are not the frames'; None for all.
-    """
-
-    problem: Problem
-    state: State
-    noise: Noise
-    covariance: FloatArray
-    robot: str
-    model: ArmModel
-    columns: IntArray
-    error_rad: float
-    stops: IntArray
-    q: FloatArray
-    at: FloatArray
-    frames: IntArray
-    measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
-    apart: FloatArray | None = None
-
-    @property
-    def chain(self) -> IntArray:
-        """(f + p,) which of the unknowns are frames and the arm's errors."""
-        return np.concatenate([self.frames, self.columns])
-
-    @property
-    def pair(self) -> ArmPair:
-        """The frames that the arm is seen by."""
-        return ArmPair.of(self.problem, self.state, self.robot)
-
-    def basis(self, q: FloatArray) -> FloatArray:
-        """(k, 6, p) how the flange moves with the arm's errors."""
-        found = self.model.basis(q)
-        return found if self.apart is None else found @ self.apart
-
-
 def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
     """Says what the stops tell of an arm, and what it is worth.
 
@@ -284,7 +231,7 @@ def _stated_table(robot: Robot) -> DHTable:
 
 def _at_stops(arm: ArmData) -> Slopes:
     """The stops' slopes, in units of their noise."""
-    slopes = whitened_slopes(arm.problem, arm.state, arm.noise, arm.measured)
+    _, slopes = whitened(arm.problem, arm.state, arm.noise, arm.measured)
     flat = slopes.reshape(-1, arm.problem.size)
     return Slopes(flat[:, arm.frames], flat[:, arm.columns] * arm.error_rad)
 
@@ -331,8 +278,7 @@ def _place_slopes(arm: ArmData, q: FloatArray) -> FloatArray:
 
 def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
     links = arm.error_rad * arm.model.weights.get("links", 1.0)
-    spread = arm.covariance[np.ix_(arm.columns, arm.columns)]
-    sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, spread, numbers.moves))
+    sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, arm.spread, numbers.moves))
     for parameter, sigma, moves in zip(numbers.parameters, sigmas, numbers.moves, strict=True):
         # Where the base or the flange takes a number's place it is as open as it was beforehand.
         known = 0.0 if moves.any() else links * parameter.unit
