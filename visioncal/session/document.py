@@ -24,7 +24,7 @@ KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 # Names become parts of the names of frames: base_from_target_NAME.
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _EDGES = ("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target")
 
 
@@ -202,7 +202,7 @@ def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tu
     if several and getattr(declaration, kind) is not None:
         yield plural, f"is there beside {kind}: give {one} for one, [{plural}.NAME] for several"
     for name in several:
-        if not _NAME.fullmatch(name):
+        if not NAME.fullmatch(name):
             yield f"{plural}.{name}", "is a name of other than letters, digits and _ after a letter"
 
 

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
 from visioncal.errors import DataError
 from visioncal.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.session.document import NAME
 from visioncal.simulation.arms import ARMS
 from visioncal.simulation.layout import (
     CELL,
@@ -38,6 +39,8 @@ _KINDS: Mapping[str, tuple[type[Thing], str]] = {
     "points": (PointAt, "points"),
 }
 _TABLES = (*_KINDS, "moved")
+# A board that is bent by more than this is none [m].
+_MOST_BOW_M = 0.05
 # Whole numbers go up to this.
 _MOST = 1_000_000
 
@@ -76,6 +79,12 @@ def read_cell(name_or_path: str) -> NetworkOptions:
         )
         for key, (kind, target) in _KINDS.items()
     }
+    if things["points"] and not things["instruments"]:
+        raise DataError(
+            f"{path.name}: there are points and no instrument that reads them.",
+            culprits=[f"{path.name}: points"],
+            next_step="Add a table [instruments.NAME], or leave the points out.",
+        )
     pushed = document.get("moved", [])
     if not isinstance(pushed, list):
         raise Table(document, path.name).refuse("moved", pushed, "a table [[moved]] for each push")
@@ -91,6 +100,13 @@ def _table(document: Mapping[str, Any], key: str, label: str) -> Mapping[str, An
     content = document.get(key, {})
     if not isinstance(content, dict):
         raise Table(document, label).refuse(key, content, f"a table [{key}.NAME] for each")
+    for name in content:
+        if not NAME.fullmatch(name) or name == CELL:
+            raise DataError(
+                f"{label}: {key}.{name[:40]} is no name: letters, digits and _ after a letter are "
+                f"needed, and not {CELL!r}.",
+                culprits=[f"{label}: {key}.{name[:40]}"],
+            )
     return content
 
 
@@ -159,6 +175,10 @@ class _Reader:
 def _number(table: Table, key: str) -> float:
     """A number, which is no standard deviation below zero and no share above one."""
     value = table.number(key, positive=key == "scale")
+    if key == "scale" and not 0.5 <= value <= 2.0:
+        raise table.refuse(key, value, "a number from 0.5 to 2")
+    if key == "bow_m" and abs(value) > _MOST_BOW_M:
+        raise table.refuse(key, value, f"a number from -{_MOST_BOW_M} to {_MOST_BOW_M}")
     if key == "share_seen" and not 0.0 < value <= 1.0:
         raise table.refuse(key, value, "a share above 0, up to 1,")
     if "sigma" in key and value < 0.0:
