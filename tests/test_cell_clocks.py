@@ -7,6 +7,7 @@ import pytest
 from swept_cells import AHEAD_S, cell_of, swept_session
 
 from visioncal.alignment import align
+from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.simulation.layout import NetworkOptions
 from visioncal.transforms import invert, log
@@ -35,6 +36,12 @@ def test_the_offset_of_one_camera_is_found_by_the_motion(found):
     ahead_ms = 1e3 * clock["camera_minus_robot_s"]
     said = f"{CLOCK}: the fit of the whole cell has the camera's clock {ahead_ms:+.2f} ms ahead"
     assert any(it.startswith(said) for it in found.verdict.reasons)
+
+
+def test_the_clock_of_one_camera_and_robot_goes_with_them(found):
+    whole = Calibration.whole(found)
+    assert whole.of("side", "b").stages["clock"] == found.details["clocks"][CLOCK]
+    assert "clock" not in whole.of("left", "b").stages
 
 
 def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, found):

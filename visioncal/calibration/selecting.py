@@ -76,7 +76,12 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "camera": _camera(cell.cameras.get(chosen.camera), slopes),
         "robot": arm.model,
         "frames": _placed(cell, chosen),
-        "stages": {**arm.stages, **_shapes(cell, chosen), **_joint_fit(cell, chosen, slopes)},
+        "stages": {
+            **arm.stages,
+            **_clock(cell, chosen),
+            **_shapes(cell, chosen),
+            **_joint_fit(cell, chosen, slopes),
+        },
         "cell": None,
     }
 
@@ -189,6 +194,13 @@ def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
             edge = Edge(way.matrix @ placed.matrix, spread)
             found[f"base_from_{child}"] = replace(frame, edge=edge)
     return found
+
+
+def _clock(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+    """How far the camera's clock is ahead of the robot's."""
+    found = cell.details.get("clocks", {})
+    pair = f"{chosen.camera} and robot {chosen.robot or 'robot'}"
+    return {"clock": found[pair]} if pair in found else {}
 
 
 def _shapes(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
