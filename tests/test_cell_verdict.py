@@ -1,5 +1,6 @@
 """The verdict on a whole cell names what is wrong: a camera, a pose, a board, the motion."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,13 @@ from whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 from visioncal.alignment import align
 from visioncal.errors import DegenerateError
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation import BoardAt, CameraAt, fine_camera, simulate_network
+from visioncal.simulation import (
+    BoardAt,
+    CameraAt,
+    checkerboard_target,
+    fine_camera,
+    simulate_network,
+)
 from visioncal.simulation.records import POSE, pose_row
 
 # Three cameras, so that two or more see by way of a robot at most stops.
@@ -130,6 +137,32 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
     (reason,) = [it for it in verdict.reasons if "corners deviate" in it]
     assert reason.startswith("cam_right: corners deviate by 1.5 px")
     assert not any(it.startswith(("cam_left: ", "cam_hand: ")) for it in verdict.reasons)
+
+
+def test_a_board_of_another_size_is_named():
+    boards = (*CELL.boards[:2], replace(CELL.boards[2], target=checkerboard_target(), scale=1.004))
+    verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
+    assert verdict.status == "check"
+    (reason,) = [it for it in verdict.reasons if "larger than stated" in it]
+    assert reason.startswith("By the robot's motion the board plate_b is 0.4 % larger than stated")
+    assert "squares of 25.1 mm, not of 25 mm" in reason
+
+
+def test_a_board_that_is_bent_is_named():
+    boards = (*CELL.boards[:2], replace(CELL.boards[2], bow_m=1e-3))
+    verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
+    assert any(it.startswith("The board plate_b is not flat") for it in verdict.reasons)
+    assert sum("not flat" in it for it in verdict.reasons) == 1
+
+
+def test_a_lens_that_is_not_as_stated_is_named(session):
+    document = deepcopy(dict(session.document))
+    matrix = document["cameras"]["right"]["matrix"]
+    document["cameras"]["right"]["matrix"] = [1.005 * matrix[0], 1.005 * matrix[1], *matrix[2:]]
+    verdict = align(rewritten(session, lambda *_: None, document)).verdict
+    words = "cam_right: the given intrinsics do not fit these images and were refined: fx, fy"
+    assert any(it.startswith(words) for it in verdict.reasons)
+    assert sum("given intrinsics" in it for it in verdict.reasons) == 1
 
 
 def test_few_stops_are_told_by_robot(session):

@@ -22,12 +22,9 @@ from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
-from visioncal.stages.found import noise_words
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
-from visioncal.types import FloatArray, Rejection
+from visioncal.types import Rejection
 
-# A board whose size is off by more of its own sigmas than this is another than was stated.
-_SIZE_SIGMAS = 3.0
 _HELD_BACK = "held back"
 
 
@@ -39,6 +36,7 @@ def findings_of(
     budget_mm: Mapping[str, Mapping[str, float]],
     noise: Mapping[str, Mapping[str, float]],
     *,
+    workspace_mm: Mapping[str, float],
     spared: Collection[int],
     warnings: Sequence[str],
     notes: Sequence[str],
@@ -52,6 +50,7 @@ def findings_of(
         edges: The transforms by the frames that they place.
         budget_mm: What these are uncertain by, by source.
         noise: Estimated standard deviations, by frame or robot.
+        workspace_mm: Of each calibrated arm, the predicted sigma of a tool's place, in the median.
         spared: Views that are not needed.
         warnings: Reasons for doubt that were found before.
         notes: What is good to know.
@@ -65,7 +64,7 @@ def findings_of(
     return Findings(
         _pairs(tied, explained),
         _sensors(tied, noise, spared),
-        _arms(solved, noise),
+        _arms(solved, noise, workspace_mm),
         sorted(directions, key=lambda it: (it.is_rotation, -it.sigma)),
         [
             Place(frame, budget_mm[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
@@ -128,7 +127,11 @@ def _sensors(
     return found
 
 
-def _arms(solved: Solved, noise: Mapping[str, Mapping[str, float]]) -> list[Arm]:
+def _arms(
+    solved: Solved,
+    noise: Mapping[str, Mapping[str, float]],
+    workspace_mm: Mapping[str, float],
+) -> list[Arm]:
     part = solved.agreed.problem.subset(solved.agreed.used)
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     return [
@@ -137,6 +140,7 @@ def _arms(solved: Solved, noise: Mapping[str, Mapping[str, float]]) -> list[Arm]
             noise[robot]["translation_mm"],
             noise[robot]["rotation_deg"],
             errs=robot in solved.arms and solved.arms[robot].errors is not None,
+            workspace_mm=workspace_mm.get(robot),
             modelled=robot in modelled,
             name=robot if len(part.robots) > 1 else "",
         )
@@ -239,37 +243,3 @@ def _resting(cell: Cell, frame: str) -> str:
         pairs[key] = pairs.get(key, 0) + 1
     least = sorted(pairs.items(), key=lambda it: it[1])
     return f"It rests on {some_of([f'{count} views by {key}' for key, count in least], 4)}."
-
-
-def noise_warnings(solved: Solved) -> list[str]:
-    """Words cameras whose corners scatter more than corners.csv states."""
-    if (seen := solved.seen) is None:
-        return []
-    found = []
-    for (name, problem), it in zip(seen.looks.problems.items(), seen.compressed, strict=True):
-        free = np.flatnonzero(np.isin(seen.looks.places(name), seen.free))
-        words, is_doubt = noise_words(problem.stack, it.residuals, problem.unknowns(it, free))
-        if is_doubt:
-            found.append(f"{name}: {words}")
-    return found
-
-
-def size_warnings(solved: Solved, spread: FloatArray) -> list[str]:
-    """Words boards whose size is another than was stated, by more than noise says."""
-    looks, names = solved.looks, list(solved.cell.session.boards)
-    if looks is None:
-        return []
-    found = []
-    for board in looks.printed:
-        (place,) = looks.scale_of(board)
-        (at,) = solved.columns_of(np.array([place]))
-        scale, prior = float(looks.values[place]), float(looks.prior_sigma[place])
-        sigma = float(np.hypot(np.sqrt(spread[at, at]), prior))
-        if abs(scale) > _SIZE_SIGMAS * sigma:
-            name = f"target_{names[board]}" if names[board] else "target"
-            larger = "larger" if scale > 0 else "smaller"
-            found.append(
-                f"{name} is {figure(100 * abs(scale))} % {larger} than is stated, by the robots' "
-                f"motion; it was stated to {figure(100 * prior)} %. Measure its squares again."
-            )
-    return found

@@ -28,11 +28,10 @@ from visioncal.alignment.faults import (
     residuals,
     versions,
 )
+from visioncal.alignment.found import found_of_looks
 from visioncal.alignment.judging import (
     check_cell,
     findings_of,
-    noise_warnings,
-    size_warnings,
     weakest_link,
 )
 from visioncal.alignment.looking import Looked, look_around, stated_camera
@@ -143,6 +142,7 @@ def alignment_of(
     held_out = left_out(solved)
     sights = _sights(cell, solved, held_out, faults)
     budget = {named[key].name: mm for key, mm in budget_mm(solved, parts).items()}
+    of_looks = [*found_of_looks(solved, spread)]
     findings = findings_of(
         solved,
         sights,
@@ -150,11 +150,17 @@ def alignment_of(
         last,
         budget,
         noise,
+        workspace_mm={
+            robot: 1e3 * float(np.median(it.telling.sigmas_m))
+            for robot, it in told.items()
+            if it.telling is not None
+        },
         spared={view for it in clocks.found.values() for view in it.spared},
         warnings=[
             *clocks.warnings,
             *_warnings(solved, looked, spread, found),
             *(f"Robot {name}: {words}" for name, it in told.items() for words in it.doubts()),
+            *(words for words, is_doubt in of_looks if is_doubt),
             *(moved_words(it) for it in moved),
             *(f"{it.frame} is tied to nothing. {it.remedy}" for it in untied),
         ],
@@ -162,6 +168,7 @@ def alignment_of(
             *clocks.notes,
             *_clock_words(clocks, solved, spread),
             *notes_on_arms(solved.arms, told),
+            *(words for words, is_doubt in of_looks if not is_doubt),
         ),
     )
     return Alignment(
@@ -236,8 +243,6 @@ def _warnings(
         *doubts_of_arms(solved.arms, found, solved.asked),
         *solved.cell.session.warnings,
         *looked.warnings,
-        *noise_warnings(solved),
-        *size_warnings(solved, spread),
         *(it.doubt for it in measured if it.is_contradicted),
     ]
 

@@ -501,7 +501,12 @@ def moved_surprise(problem: CornerProblem, fitted: Fitted, places: IntArray) -> 
 def contradicted_lens(problem: CornerProblem, fitted: Fitted) -> bool:
     """Whether given intrinsics are farther off than what they are known to explains."""
     away = fitted.appearance.values - problem.stated.values
-    return bool(np.any(np.abs(away)[problem.lens] > _CONTRADICTION * _lens_prior(problem.scene)))
+    return contradicts(away[problem.lens], _lens_prior(problem.scene))
+
+
+def contradicts(away: FloatArray, prior_sigma: FloatArray) -> bool:
+    """Whether (k,) values are farther from the stated ones than what is known of them explains."""
+    return bool(np.any(np.abs(away) > _CONTRADICTION * prior_sigma))
 
 
 def chance_limit(freedom: int) -> float:

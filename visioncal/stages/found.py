@@ -19,7 +19,7 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.solve import held_shift
 from visioncal.figures import figure
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import FloatArray, IntArray, Target
 
 # A rig that is as stated seems not to be in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -37,10 +37,15 @@ def findings(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[str]:
     if is_doubt:
         yield words
     for board in problem.printed:
-        yield from _scale_finding(problem, arm, fitted, board)
-        yield from _bend_finding(problem, fitted, board)
-    for rig in range(len(problem.scene.targets)):
-        yield from _points_finding(problem, fitted, rig)
+        words, is_doubt = _scale_finding(problem, arm, fitted, board)
+        if is_doubt:
+            yield words
+        if _moved(problem, fitted, problem.shape_of(board)):
+            shift = fitted.seen.free.corners_after(fitted.fit.state.values) - problem.positions
+            bend_m = float(np.ptp(shift[problem.corners_of(board), 2]))
+            yield bend_words(_board(problem, board), 1e3 * bend_m)
+    for rig, target in enumerate(problem.scene.targets):
+        yield from points_words(target, fitted.appearance.values[problem.points_of(rig)])
     yield from _lens_finding(problem, fitted)
 
 
@@ -50,17 +55,12 @@ def remarks(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[str]:
     if words and not is_doubt:
         yield words
     for board in problem.printed:
-        measured = _measured(problem, arm, fitted, board)
-        if measured is not None and not measured.contradicts:
-            yield (
-                f"{_sized(problem, measured)}, which what is stated allows (to within "
-                f"{100 * measured.stated_sigma:.1g} %). The result goes by both."
-            )
-    if _lens_moved(problem, fitted) and not _is_doubtful(problem, fitted):
-        yield (
-            "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
-            f"{_lens_steps(problem, fitted)} px."
-        )
+        words, is_doubt = _scale_finding(problem, arm, fitted, board)
+        if words and not is_doubt:
+            yield words
+    words, is_doubt = _moved_lens(problem, fitted)
+    if words and not is_doubt:
+        yield words
 
 
 def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tuple[str, bool]:
@@ -82,7 +82,7 @@ def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tup
         "by the scatter. Look for errors of the detector, the lens or the target that sigma_px "
         "leaves out."
         if more
-        else "by what is stated. Fitted what the detector errs by, or leave sigma_px out."
+        else "by what is stated. State what the detector errs by, or leave sigma_px out."
     )
     return (
         f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
@@ -96,22 +96,41 @@ def _noise_words(problem: CornerProblem, fitted: Fitted) -> tuple[str, bool]:
     return noise_words(problem.stack, seen.residuals, problem.unknowns(seen, fitted.moving))
 
 
-def _scale_finding(problem: CornerProblem, arm: Arm, fitted: Fitted, board: int) -> Iterator[str]:
-    """Whether the robot measures another size of the squares than the file states."""
-    measured = _measured(problem, arm, fitted, board)
-    if measured is not None and measured.contradicts:
-        yield (
-            f"{_sized(problem, measured)}, which is not what is stated (to within "
-            f"{100 * measured.stated_sigma:.1g} %). The result goes by the robot. Measure over "
-            "many squares and mend square_m and square_sigma_m; if the board is right, the arm's "
-            "model is off by as much."
-        )
+def _scale_finding(
+    problem: CornerProblem, arm: Arm, fitted: Fitted, board: int
+) -> tuple[str, bool]:
+    """What the robot measures of a board's size, where the fit has taken it up."""
+    if not _moves(fitted, problem.scale_of(board)):
+        return "", False
+    measured = measured_scale(problem, arm, fitted, board)
+    return scale_words(_board(problem, board), problem.scene.targets[board].square_m, measured)
 
 
-def _measured(problem: CornerProblem, arm: Arm, fitted: Fitted, board: int) -> MeasuredScale | None:
-    """What the robot measures, where the fit has taken it up."""
-    taken = _moves(fitted, problem.scale_of(board))
-    return measured_scale(problem, arm, fitted, board) if taken else None
+def scale_words(board: str, square_m: float, measured: MeasuredScale) -> tuple[str, bool]:
+    """Words another size than the file states, and whether it is a reason for doubt.
+
+    Args:
+        board: What the board is called.
+        square_m: The stated side of its squares [m].
+        measured: What the robot's motion says.
+    """
+    side, share = 1e3 * square_m, f"{100 * measured.stated_sigma:.1g} %"
+    sized = (
+        f"By the robot's motion the {board} is "
+        f"{100 * abs(measured.scale):.2g} % "
+        f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
+        f"{100 * measured.sigma:.1g} %): squares of {side * (1 + measured.scale):.4g} mm, not of "
+        f"{side:.4g} mm"
+    )
+    if not measured.contradicts:
+        allowed = f"{sized}, which what is stated allows (to within {share})."
+        return f"{allowed} The result goes by both.", False
+    return (
+        f"{sized}, which is not what is stated (to within {share}). The result goes by the robot. "
+        "Measure over many squares and mend square_m and square_sigma_m; if the board is right, "
+        "the arm's model is off by as much.",
+        True,
+    )
 
 
 def _board(problem: CornerProblem, board: int) -> str:
@@ -119,43 +138,32 @@ def _board(problem: CornerProblem, board: int) -> str:
     return f"board {problem.scene.names[board]}".strip()
 
 
-def _sized(problem: CornerProblem, measured: MeasuredScale) -> str:
-    side = 1e3 * problem.scene.targets[measured.board].square_m
+def bend_words(board: str, bend_mm: float) -> str:
+    """Words a board that is not flat; `bend_mm` is the depth of its corners [mm]."""
     return (
-        f"By the robot's motion the {_board(problem, measured.board)} is "
-        f"{100 * abs(measured.scale):.2g} % "
-        f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
-        f"{100 * measured.sigma:.1g} %): squares of {side * (1 + measured.scale):.4g} mm, not of "
-        f"{side:.4g} mm"
-    )
-
-
-def _bend_finding(problem: CornerProblem, fitted: Fitted, board: int) -> Iterator[str]:
-    if not _moved(problem, fitted, problem.shape_of(board)):
-        return
-    shift = fitted.seen.free.corners_after(fitted.fit.state.values) - problem.positions
-    bend_mm = 1e3 * float(np.ptp(shift[problem.corners_of(board), 2]))
-    yield (
-        f"The {_board(problem, board)} is not flat: its corners lie within {bend_mm:.2g} mm of "
+        f"The {board} is not flat: its corners lie within {bend_mm:.2g} mm of "
         "depth. Its shape was estimated with the rest; a board on a stiff, flat plate makes a "
         "better result."
     )
 
 
-def _points_finding(problem: CornerProblem, fitted: Fitted, rig: int) -> Iterator[str]:
-    """Whether a rig's points lie farther from where its table has them than it says."""
-    target, places = problem.scene.targets[rig], problem.points_of(rig)
+def points_words(target: Target, moved_m: FloatArray) -> Iterator[str]:
+    """Whether a rig's points lie farther from where its table has them than it says.
+
+    Args:
+        target: The rig.
+        moved_m: (3 n,) how far its points were moved [m]; empty where they were not.
+    """
     if not target.point_sigmas_m:
         return
-    if not len(places):
+    if not len(moved_m):
         yield (
             f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
             f"their sigma_m counts for up to {MOST_LOOSE}."
         )
         return
-    moved = fitted.appearance.values[places].reshape(-1, 3)
     sigmas = np.array(target.point_sigmas_m)
-    away = np.linalg.norm(moved, axis=1)
+    away = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
     worst = int(np.argmax(away / sigmas))
     if (away[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
         yield (
@@ -173,27 +181,40 @@ def _lens_finding(problem: CornerProblem, fitted: Fitted) -> Iterator[str]:
             f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
             "more corners, or more views."
         )
-    if _lens_moved(problem, fitted) and _is_doubtful(problem, fitted):
-        yield (
-            "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved "
-            f"by {_lens_steps(problem, fitted)} px. Calibrate the camera anew, or hold them with "
-            'intrinsics = "hold".'
-        )
+    words, is_doubt = _moved_lens(problem, fitted)
+    if is_doubt:
+        yield words
     if problem.contested:
         yield _contest(problem, fitted)
 
 
-def _lens_moved(problem: CornerProblem, fitted: Fitted) -> bool:
-    return not problem.scene.estimated and _moved(problem, fitted, problem.lens)
+def _moved_lens(problem: CornerProblem, fitted: Fitted) -> tuple[str, bool]:
+    if problem.scene.estimated or not _moved(problem, fitted, problem.lens):
+        return "", False
+    steps = (fitted.appearance.values - problem.stated.values)[problem.lens]
+    is_exact = problem.scene.matrix_sigma_px is None
+    return lens_words(steps[:4], is_doubtful=is_exact or contradicted_lens(problem, fitted))
 
 
-def _is_doubtful(problem: CornerProblem, fitted: Fitted) -> bool:
-    """Whether moved intrinsics were taken for exact, or for better than they are."""
-    return problem.scene.matrix_sigma_px is None or contradicted_lens(problem, fitted)
+def lens_words(steps_px: FloatArray, *, is_doubtful: bool) -> tuple[str, bool]:
+    """Words given intrinsics that were refined, and whether it is a reason for doubt.
 
-
-def _lens_steps(problem: CornerProblem, fitted: Fitted) -> str:
-    return _px((fitted.appearance.values - problem.stated.values)[:4])
+    Args:
+        steps_px: (4,) by how much fx, fy, cx, cy moved [px].
+        is_doubtful: Whether they were taken for exact, or for better than they are.
+    """
+    if is_doubtful:
+        return (
+            "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved "
+            f"by {_px(steps_px)} px. Calibrate the camera anew, or hold them with "
+            'intrinsics = "hold".',
+            True,
+        )
+    return (
+        "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
+        f"{_px(steps_px)} px.",
+        False,
+    )
 
 
 def _contest(problem: CornerProblem, fitted: Fitted) -> str:

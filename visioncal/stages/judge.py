@@ -410,7 +410,7 @@ def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
     the first and the last link, which its poses make up for.
     """
-    if all(it.workspace_mm is None for it in findings.arms):
+    if any(it.workspace_mm is None for it in findings.arms):
         yield from _sigma_doubts(findings, limits)
         yield from _budget_doubts(findings, limits)
     for it in findings.arms:

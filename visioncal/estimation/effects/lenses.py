@@ -85,6 +85,10 @@ class Looks:
         """Places (8,) of one printed board's aspect and bend."""
         return self._here(self._one.shape_of(board))
 
+    def moved_points(self, rig: int) -> FloatArray:
+        """(3 n,) how far the points of a rig are from its table's [m]; empty for exact ones."""
+        return self.values[self._here(self._one.points_of(rig))]
+
     @property
     def corners(self) -> tuple[FloatArray, ...]:
         """The corners (c, 3) of every board, as it is taken to be, in its frame [m]."""
