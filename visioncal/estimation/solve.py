@@ -231,9 +231,16 @@ def normal_equations(
         noise: Its levels.
         ideal: See `Problem.linear`.
     """
+    return equations_and_cost(problem, state, noise, ideal=ideal)[:2]
+
+
+def equations_and_cost(
+    problem: Problem, state: State, noise: Noise, *, ideal: bool = False
+) -> tuple[FloatArray, FloatArray, float]:
+    """What `normal_equations` gives, and the whitened squared error."""
     linear = problem.linear(state, ideal=ideal)
     reduced = reduce(problem, state, linear, problem.covariance(noise))
-    return _whole(reduced, problem.error_covariance(noise))[:2]
+    return _whole(reduced, problem.error_covariance(noise))
 
 
 def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:

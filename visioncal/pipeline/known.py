@@ -386,7 +386,8 @@ class Known:
 
     def _thermal_stops(self, views: Sequence[int]) -> Stops:
         stamps = {view.number: view.stamp_s or 0.0 for view in self.session.views}
-        return Stops(self.joints(views), np.array([stamps[it] for it in views]))
+        at_s = np.array([stamps[it] for it in views])
+        return Stops(ROBOT, np.arange(len(views)), self.joints(views), at_s)
 
     @property
     def drift_size(self) -> int:

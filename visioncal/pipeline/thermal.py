@@ -7,8 +7,7 @@ import numpy as np
 
 from visioncal.estimation.arm import find_arm_errors
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import Edges, flange_to_residual, residual_blocks
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.problem import ROBOT, State
 from visioncal.estimation.solve import starting_noise
 from visioncal.pipeline.known import Known
 from visioncal.robot import Robot
@@ -112,15 +111,15 @@ def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
     q = known.joints(known.used)
     model = ArmModel.of(robot, q, known.flange_poses(known.used))
     known = replace(known, arm=None)
-    data = known.closure(known.used).merged(known.stops)
-    edges, problem = Edges(known.edges[0], known.edges[1], data.unchanged), data.problem
+    problem = known.closure(known.used).merged(known.stops).problem
+    state = State(known.edges[:2], problem.start_values)
     noise, basis = starting_noise(problem), model.columns("links", q[first])
-    links = find_arm_errors(problem, edges.state, noise, ROBOT, basis, of_links=True)
+    links = find_arm_errors(problem, state, noise, ROBOT, basis, of_links=True)
     if links is not None:
-        data = data.with_more(links.effect(ROBOT))
-        edges = replace(edges, shared=data.unchanged)
-    stops = Stops(q[first], _stamps(known))
-    return fit_thermal(data, edges, model.robot, stops, inputs, robot)
+        problem = problem.with_effects([*problem.effects, links.effect(ROBOT)])
+        state = State(state.edges, problem.start_values)
+    stops = Stops(ROBOT, np.arange(len(first)), q[first], _stamps(known))
+    return fit_thermal(problem, state, model.robot, stops, inputs, robot)
 
 
 def _course(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float]]:
@@ -153,10 +152,9 @@ def _seen(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float
     robot = known.zeroed_robot
     there = np.abs(q - _typical(known, model.robot if robot is None else robot)).max(axis=1)
     chosen = np.flatnonzero(there < _SAME_RAD)
-    data, result = known.closure(known.used).merged(known.stops), known.solved
-    residuals = residual_blocks(data, result.edges, result.noise)[0]
-    by_flange = flange_to_residual(data.under(result.edges.shared), result.edges)
-    left = -np.linalg.solve(by_flange, residuals[:, :, None])[chosen, 3:, 0]
+    problem = known.closure(known.used).merged(known.stops).problem
+    linear = replace(problem, is_combined=False).linear(known.solved.edges.state)
+    left = -np.linalg.solve(linear.by_errors, linear.residuals[:, :, None])[chosen, 3:, 0]
     moved = model.motion(q[chosen], model.heating.links_c(inputs, stamps_s[chosen]))[:, :3, 3]
     # Where it has hardly moved it has no direction: that of the farthest stop serves them all.
     lengths = np.linalg.norm(moved, axis=1)

@@ -11,27 +11,23 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    closure_information,
-    estimate_noise,
-    fit_closure,
-    noise_likelihood,
-    normal_equations,
-    residual_blocks,
-)
+from visioncal.estimation.arm import rows_of
 from visioncal.estimation.descend import Linearised, descend
-from visioncal.estimation.linalg import covariance, damped_step
-from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.linalg import covariance_among, damped_step
+from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.solve import (
+    equations_and_cost,
+    estimate_noise,
+    fisher_information,
+    fit_problem,
+    robot_levels,
+)
 from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Robot
 from visioncal.thermal.heating import Heating, Inputs, Kind
 from visioncal.thermal.model import ThermalModel
 from visioncal.threads import one_blas_thread
-from visioncal.transforms import invert
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, IntArray
 
 # Steel grows by 12e-6 of its length for a kelvin, aluminium by 23e-6.
 _GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
@@ -51,13 +47,17 @@ _ROUNDS, _SETTLED = 5, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Stops:
-    """The stops whose views are fitted.
+    """A robot's stops.
 
     Attributes:
+        robot: The robot, as the problem has it.
+        places: (m,) the stops, as the problem has them.
         q: (m, n) joint angles [rad].
         stamps_s: (m,) when they were looked at [s].
     """
 
+    robot: str
+    places: IntArray
     q: FloatArray
     stamps_s: FloatArray
 
@@ -71,7 +71,6 @@ class ThermalFit:
         values: (p,) how far its parameters are from what was known beforehand, in units of (p,)
             `sigmas`.
         sigmas: To what they were known beforehand.
-        edges: The edges, and what else was fitted with them.
         told: (p,) sigma of each parameter as a share of its prior's.
         gain: Twice the gain in log-likelihood over an arm that does not drift.
         before_m: Residual of the views without drift, as a root mean square [m].
@@ -82,7 +81,6 @@ class ThermalFit:
     model: ThermalModel
     values: FloatArray
     sigmas: FloatArray
-    edges: Edges
     told: FloatArray
     gain: float
     before_m: float
@@ -101,8 +99,10 @@ class ThermalFit:
         They stay where they were found, and count in the covariance with what was known of them
         beforehand: what the stops tell of them the chain says itself.
         """
-        free = _effect(self.model, self.values, self.sigmas, stops, inputs)
-        return replace(free, held=np.ones(len(self.values), dtype=bool))
+        count = len(stops.places)
+        free = _effect(self.model, self.values, self.sigmas, stops, inputs, count)
+        nothing = np.zeros(len(self.values))
+        return replace(free, values=nothing, held=nothing == 0.0)
 
 
 def parameter_names(model: ThermalModel) -> tuple[str, ...]:
@@ -131,32 +131,33 @@ def uninformative(inputs: Inputs, stamps_s: FloatArray) -> str:
 
 
 def fit_thermal(
-    data: Closure, edges: Edges, robot: Robot, stops: Stops, inputs: Inputs, nominal: Robot
+    problem: Problem, state: State, robot: Robot, stops: Stops, inputs: Inputs, nominal: Robot
 ) -> ThermalFit:
-    """Estimates how an arm drifts, with edges and arm free.
+    """Estimates how an arm drifts, with all unknowns free.
 
     Args:
-        data: The stops' chain, with the arm as it is without drift.
-        edges: Where to start.
+        problem: The observations, with the arm as it is without drift.
+        state: Where to start.
         robot: That arm, up to the frame of its poses.
-        stops: Joint angles and times.
+        stops: Where it stood, and when.
         inputs: What heats the arm.
         nominal: The arm without what is mounted on its flange: its lengths are what grows.
     """
-    problem = _Problem(data, stops, inputs, _start(robot, nominal, inputs))
+    warming = _Warming(problem, stops, inputs, _start(robot, nominal, inputs))
     with one_blas_thread():
-        cold = fit_closure(data, edges)
-        state, noise = _descended(problem, _State(cold.edges, np.zeros(problem.size)), cold.noise)
-        seen, at = problem.seen(state.values), problem.at(state)
-        gain = noise_likelihood(data, cold.edges)[1] - noise_likelihood(seen, at)[1]
-        spread = covariance(closure_information(seen, at, noise))[-problem.size :, -problem.size :]
-        before_m, after_m = _rms_m(data, cold.edges, noise), _rms_m(seen, at, noise)
-    model, sigmas = problem.model(state.values), problem.sigmas
+        cold = fit_problem(problem, state)
+        found, noise = _descended(warming, _Warm(cold.state, np.zeros(warming.size)), cold.noise)
+        warm, at = warming.problem(found.values), warming.at(found)
+        gain = _unlikeliness(problem, cold.state, noise) - _unlikeliness(warm, at, noise)
+        information = fisher_information(warm, at, noise)
+        spread = covariance_among(information, warm.counted)[-warming.size :, -warming.size :]
+        before_m = _rms_m(problem, cold.state, stops.robot)
+        after_m = _rms_m(warm, at, stops.robot)
+    model, sigmas = warming.model(found.values), warming.sigmas
     return ThermalFit(
         replace(model, covariance=spread * np.outer(sigmas, sigmas)),
-        state.values,
+        found.values,
         sigmas,
-        state.edges,
         np.sqrt(np.diag(spread)),
         2.0 * gain,
         before_m,
@@ -165,35 +166,40 @@ def fit_thermal(
     )
 
 
-def _descended(problem: "_Problem", state: "_State", noise: Noise) -> tuple["_State", Noise]:
+def _descended(warming: "_Warming", state: "_Warm", noise: Noise) -> tuple["_Warm", Noise]:
     """Minimises under the noise that the residuals show, until that stays the same."""
     for _ in range(_ROUNDS):
-        state, _ = descend(state, partial(problem.linearised, noise=noise), _SETTLED)
-        last, noise = noise, estimate_noise(problem.seen(state.values), problem.at(state))
-        if np.allclose(last.sigmas, noise.sigmas, rtol=1e-3):
+        state, _ = descend(state, partial(warming.linearised, noise=noise), _SETTLED)
+        problem, at, last = warming.problem(state.values), warming.at(state), noise
+        noise = estimate_noise(problem, at, noise, from_above=True)
+        if np.allclose(last.robots, noise.robots, rtol=1e-3):
             break
     return state, noise
 
 
-def _rms_m(data: Closure, edges: Edges, noise: Noise) -> float:
-    """How far the stops place what they see from one another, as a root mean square [m]."""
-    residuals = residual_blocks(data, edges, noise)[0]
+def _unlikeliness(problem: Problem, state: State, noise: Noise) -> float:
+    return robot_levels(problem, state, noise, from_above=True)[1]
+
+
+def _rms_m(problem: Problem, state: State, robot: str) -> float:
+    """How far a robot's stops place what they see from one another, as a root mean square [m]."""
+    residuals = problem.linear(state).residuals[rows_of(problem, robot)]
     return float(np.sqrt(np.mean(np.sum(residuals[:, 3:] ** 2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    """Edges with what the chain shares, and the (p,) values of the drift."""
+class _Warm:
+    """The unknowns of the cold arm's problem, and the (p,) values of the drift."""
 
-    edges: Edges
+    state: State
     values: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """The fit's unknowns beside those of the chain, in units of their priors' sigmas."""
+class _Warming:
+    """The fit's unknowns beside those of the cold arm's problem, in units of their sigmas."""
 
-    data: Closure
+    cold: Problem
     stops: Stops
     inputs: Inputs
     start: ThermalModel
@@ -219,52 +225,52 @@ class _Problem:
             heating=self.start.heating.changed(steps[2 * count :]),
         )
 
-    def at(self, state: _State) -> Edges:
+    def at(self, warm: _Warm) -> State:
         """The unknowns where the drift is linearised."""
-        shared = np.concatenate([state.edges.shared, np.zeros(self.size)])
-        return replace(state.edges, shared=shared)
+        return State(warm.state.edges, np.concatenate([warm.state.values, warm.values]))
 
-    def linearised(self, state: _State, noise: Noise) -> Linearised[_State]:
+    def linearised(self, warm: _Warm, noise: Noise) -> Linearised[_Warm]:
         """The whitened squared error with that of the priors, and the way on."""
-        seen, at = self.seen(state.values), self.at(state)
-        residuals, _, spread = residual_blocks(seen, at, noise)
-        information, gradient = normal_equations(seen, at, noise)
-        whitened = np.linalg.solve(spread, residuals[:, :, None])[:, :, 0]
-        cost = float(np.sum(residuals * whitened) + state.values @ state.values)
-        cost += seen.problem.cost_of_knowledge(at.state)
+        problem = self.problem(warm.values)
+        information, gradient, cost = equations_and_cost(problem, self.at(warm), noise)
+        moving = problem.moving
+        free, slope = information[np.ix_(moving, moving)], gradient[moving]
 
-        def step(damping: float) -> _State:
-            by = damped_step(information, gradient, damping)
-            edges = state.edges.moved(by[: -self.size])
-            return _State(edges, state.values + by[-self.size :])
+        def step(damping: float) -> _Warm:
+            by = np.zeros(problem.size)
+            by[moving] = damped_step(free, slope, damping)
+            return _Warm(warm.state.moved(by[: -self.size]), warm.values + by[-self.size :])
 
-        return Linearised(state, cost, step)
+        return Linearised(warm, cost + float(warm.values @ warm.values), step)
 
-    def seen(self, values: FloatArray) -> Closure:
-        """The chain with the arm as warm as it was, and how it moves with the unknowns."""
-        model, stops = self.model(values), self.stops
+    def problem(self, values: FloatArray) -> Problem:
+        """The observations with the arm as warm as it was, and how it moves with the unknowns."""
+        model, stops, poses = self.model(values), self.stops, dict(self.cold.poses)
         links = model.heating.links_c(self.inputs, stops.stamps_s)
-        moved = moved_robot(self.data, model.motion(stops.q, links))
-        more = _effect(model, values, self.sigmas, stops, self.inputs)
-        return replace(self.data, robot=moved).with_more(more)
+        moved = poses[stops.robot].copy()
+        moved[stops.places] = moved[stops.places] @ model.motion(stops.q, links)
+        count = len(moved)
+        effect = _effect(model, values, self.sigmas, stops, self.inputs, count)
+        warm = replace(self.cold, poses=poses | {stops.robot: moved})
+        return warm.with_effects([*warm.effects, effect])
 
 
 def _effect(
-    model: ThermalModel, values: FloatArray, sigmas: FloatArray, stops: Stops, inputs: Inputs
+    model: ThermalModel,
+    values: FloatArray,
+    sigmas: FloatArray,
+    stops: Stops,
+    inputs: Inputs,
+    count: int,
 ) -> Effect:
-    """The parameters as unknowns of a chain, in units of (p,) sigmas, at their (p,) values."""
+    """The parameters as unknowns at all of so many stops, in units of (p,) sigmas."""
     links = model.heating.links_c(inputs, stops.stamps_s)
     heated = model.heating.slopes(inputs, stops.stamps_s)
-    basis = model.basis(stops.q, links, heated) * sigmas
+    basis = np.zeros((count, 6, len(values)))
+    basis[stops.places] = model.basis(stops.q, links, heated) * sigmas
     known = Knowledge(np.eye(len(values)), values)
-    return Effect.free("temperature", known, by_flange={ROBOT: basis})
-
-
-def moved_robot(data: Closure, motion: FloatArray) -> FloatArray:
-    """The robot's part (m, 4, 4) of a chain after (m, 4, 4) motions of its flange."""
-    if data.mount == "eye-in-hand":
-        return data.robot @ motion
-    return invert(invert(data.robot) @ motion)
+    nothing = np.zeros(len(values), dtype=bool)
+    return Effect("temperature", values, known, nothing, by_flange={stops.robot: basis})
 
 
 def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:
