@@ -200,6 +200,31 @@ def test_lenses_come_from_images_of_their_own():
     assert len(found.sights) == len(cell.sights) - 24
 
 
+@pytest.mark.parametrize("mode", ["auto", "hold"])
+def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
+    cell, right = clean
+    session = network_session(cell, "cell", seen="names")
+    stated = session.document["cameras"]["left"]
+    wrong = np.add(stated["matrix"], [8.0, 8.0, -3.0, 4.0])
+    left = {**stated, "matrix": wrong.tolist(), "intrinsics": mode}
+    document = {**session.document, "cameras": {**session.document["cameras"], "left": left}}
+    found = align(replace(session, document=document), corners={it.view: it for it in cell.corners})
+    got = found.cameras["cam_left"]
+    (said,) = [it for it in found.verdict.reasons if "the given intrinsics do not fit" in it]
+    assert said.startswith("cam_left: ")
+    if mode == "auto":
+        sigma = np.sqrt(np.diag(got.covariance))[:4]
+        assert np.all(np.abs(got.camera.matrix - LEFT.camera.matrix) < 5 * sigma)
+        assert off(cell, found, "base_a", "base_b")[1] < 22.0
+        assert "were refined" in said
+        return
+    np.testing.assert_array_equal(got.camera.matrix, wrong)
+    assert 'intrinsics = "hold" keeps them' in said
+    # What is open about it counts where that camera is.
+    edges = found.edges["cell_from_cam_left"], right.edges["cell_from_cam_left"]
+    assert edges[0].sigma_mm > 2.0 * edges[1].sigma_mm
+
+
 def test_cameras_in_the_hand_and_poses_that_are_given():
     cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
     cell = simulate_network(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))

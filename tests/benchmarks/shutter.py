@@ -33,18 +33,15 @@ class World:
 
 GOOD = CellOptions(pixel_sigma_px=0.1)
 HAND = replace(GOOD, mount="eye-to-hand")
-LENS = replace(GOOD, lens_mismatch_px=0.3)
-ARM = replace(GOOD, dh_sigma_m=3e-4, dh_sigma_rad=3e-4)
+# An arm that is not as its model has it, and a lens that is stated half a pixel off.
+OFF = replace(GOOD, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, lens_mismatch_px=0.5)
 WORLDS = (
     World("12.4 ms, in hand", GOOD, 0.0124),
     World("12.4 ms, to hand", HAND, 0.0124),
     World("30 ms, in hand", GOOD, 0.030),
-    World("12.4 ms, lens stated 0.3 px off", LENS, 0.0124),
-    World("12.4 ms, real arm (0.3 mm, 0.3 mrad)", ARM, 0.0124),
+    World("12.4 ms, real arm, lens 0.5 px off", OFF, 0.0124),
     World("global, in hand", GOOD, 0.0),
-    World("global, to hand", HAND, 0.0),
-    World("global, lens stated 0.3 px off", LENS, 0.0),
-    World("global, real arm (0.3 mm, 0.3 mrad)", ARM, 0.0),
+    World("global, real arm, lens 0.5 px off", OFF, 0.0),
 )
 
 
@@ -73,9 +70,11 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
     known = calibrated_sweep(moved)
     (found,) = known.clock.delays
     error, spread = x_error(moved, known), known.solved.covariance[:6, :6]
-    look, clock.find_delays = clock.find_delays, lambda *_: (None, ())
-    ignoring = x_error(moved, calibrated_sweep(moved))
-    clock.find_delays = look
+    ignoring = error
+    if world.readout_s:
+        look, clock.find_delays = clock.find_delays, lambda *_: (None, ())
+        ignoring = x_error(moved, calibrated_sweep(moved))
+        clock.find_delays = look
     return Outcome(
         found.time_s - world.readout_s,
         found.sigma_s,

@@ -7,7 +7,16 @@ import numpy as np
 from visioncal.alignment.solving import Solved
 from visioncal.estimation.effects.lenses import Looks
 from visioncal.estimation.joint import MeasuredScale, chance_limit, contradicts
-from visioncal.stages.found import bend_words, lens_words, noise_words, points_words, scale_words
+from visioncal.estimation.scene import lens_prior
+from visioncal.estimation.solve import held_shift
+from visioncal.stages.found import (
+    bend_words,
+    contest_words,
+    lens_words,
+    noise_words,
+    points_words,
+    scale_words,
+)
 from visioncal.types import FloatArray, IntArray
 
 
@@ -22,7 +31,7 @@ def found_of_looks(solved: Solved, spread: FloatArray) -> Iterator[tuple[str, bo
     if seen is None or looks is None:
         return
     for (camera, problem), it in zip(looks.problems.items(), seen.compressed, strict=True):
-        free = np.flatnonzero(np.isin(looks.places(camera), seen.free))
+        free = np.flatnonzero(np.isin(looks.places(camera), seen.moving))
         words, is_doubt = noise_words(problem.stack, it.residuals, problem.unknowns(it, free))
         if words:
             yield _of(camera, words), is_doubt
@@ -48,11 +57,15 @@ def _of(camera: str, words: str) -> str:
 def _lens(
     solved: Solved, looks: Looks, spread: FloatArray, camera: str
 ) -> Iterator[tuple[str, bool]]:
-    scene, lens = looks.problems[camera].scene, np.arange(len(looks.values))[looks.lenses[camera]]
-    free = lens[np.isin(lens, solved.seen.free)] if solved.seen is not None else lens[:0]
+    scene, lens = looks.problems[camera].scene, looks.lens_of(camera)
+    if looks.problems[camera].contested:
+        agreed = solved.agreed
+        shift = held_shift(agreed.problem.subset(agreed.used), agreed.fit)
+        yield _of(camera, contest_words(scene, shift[solved.columns_of(lens[:4])])), True
+    free = lens[np.isin(lens, solved.seen.moving)] if solved.seen is not None else lens[:0]
     if scene.estimated or len(free) < 4 or not _moved(solved, looks, spread, free):
         return
-    away, prior = (looks.values - looks.stated)[free], looks.prior_sigma[free]
+    away, prior = (looks.values - looks.stated)[free], lens_prior(scene)[: len(free)]
     is_doubtful = scene.matrix_sigma_px is None or contradicts(away, prior)
     words, is_doubt = lens_words(away[:4], is_doubtful=is_doubtful)
     yield _of(camera, words), is_doubt
@@ -72,7 +85,7 @@ def _measured(solved: Solved, looks: Looks, spread: FloatArray, board: int) -> M
 
 def _moved(solved: Solved, looks: Looks, spread: FloatArray, places: IntArray) -> bool:
     """Whether values were moved from what is stated by more than chance."""
-    if solved.seen is None or not np.isin(places, solved.seen.free).all():
+    if solved.seen is None or not np.isin(places, solved.seen.moving).all():
         return False
     at, away = solved.columns_of(places), (looks.values - looks.stated)[places]
     surprise = float(away @ np.linalg.solve(spread[np.ix_(at, at)], away))

@@ -1,27 +1,71 @@
 """Lenses and boards of a whole cell, fitted with its frames: what is free of them, and how far."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.looking import CameraLook
-from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
-from visioncal.estimation.joint import CornerProblem, Scene, chance_limit, repeat_shares
+from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.joint import Fitted, settle
 from visioncal.estimation.outliers import Agreed
-from visioncal.estimation.problem import Effect, Problem, State
-from visioncal.estimation.solve import (
-    fit_problem,
-    fitted_covariance,
-    normal_equations,
-    score_gain,
-)
+from visioncal.estimation.problem import Effect, Noise, Problem
+from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
 from visioncal.stages.pnp import ViewPoses
-from visioncal.types import Corners, IntArray, Mask
+from visioncal.stages.refine import chosen
+from visioncal.types import Corners, FloatArray, IntArray
 
-# Values that move by less than this share of their sigma have settled.
-_SETTLED, _ROUNDS = 0.02, 6
+
+@dataclass(frozen=True, eq=False)
+class CellSide:
+    """The frames' side of the fit of a whole cell; see `joint.Side`.
+
+    Attributes:
+        cell: The cell.
+        agreed: What its fit uses, and where it stands.
+        effects: All effects but lenses and boards.
+    """
+
+    cell: Cell
+    agreed: Agreed
+    effects: Sequence[Effect]
+
+    # Boards' scales are free from the start: arms' errors are no reason to hold them.
+    has_errors = has_links = False
+
+    @property
+    def noise(self) -> Noise:
+        """The levels of the fit so far."""
+        return self.agreed.fit.noise
+
+    @property
+    def frames(self) -> Mapping[str, FloatArray]:
+        """Where the unknown frames are."""
+        agreed = self.agreed
+        return dict(zip(agreed.problem.unknown, agreed.fit.state.edges, strict=True))
+
+    def problem(self, seen: Seen) -> Problem:
+        """The problem of the observations that agree, repeated ones sharing an error."""
+        return replace(self.whole(seen), with_repeats=True).subset(self.agreed.used)
+
+    def whole(self, seen: Seen) -> Problem:
+        """The problem of all observations, with poses as lenses and boards make them."""
+        places = {view: at for at, view in enumerate(seen.views)}
+        rows = np.array([places.get(it.view, -1) for it in self.cell.rows], dtype=np.int64)
+        mine, problem = rows >= 0, self.agreed.problem
+        measured, spread = (
+            it.copy() for it in (problem.observations.measured, problem.observations.covariance)
+        )
+        measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
+        observed = replace(problem.observations, measured=measured, covariance=spread)
+        effects = [seen.effect(rows), *self.effects]
+        return replace(problem, observations=observed).with_effects(effects)
+
+    def settled(self, fitted: Fitted) -> tuple[Agreed, Seen]:
+        """Takes over a fit."""
+        agreed = replace(self.agreed, problem=self.whole(fitted.seen), fit=fitted.fit)
+        return agreed, fitted.seen
 
 
 def with_looks(
@@ -32,12 +76,9 @@ def with_looks(
     others: Sequence[Effect],
 ) -> tuple[Agreed, Seen]:
     """Fits lenses and boards with the rest, and with other effects."""
+    side = CellSide(cell, agreed, others)
     looks = _looks(cell, cameras, views, _shares(cell, agreed))
-    agreed, seen = settled_looks(cell, looks, looks.first, agreed, others)
-    wider = _wider(cell, seen, agreed, others)
-    if len(wider) > len(seen.free):
-        agreed, seen = settled_looks(cell, seen.looks, wider, agreed, others)
-    return agreed, seen
+    return side.settled(chosen(side, settle(looks, side, looks.first, side.frames)))
 
 
 def _shares(cell: Cell, agreed: Agreed) -> dict[int, float]:
@@ -64,7 +105,6 @@ def _looks(
     problems, poses = {}, {}
     for name, it in cameras.items():
         scene = Scene(
-            "eye-to-hand",
             targets,
             it.camera,
             it.estimated,
@@ -82,70 +122,8 @@ def _looks(
 
 
 def settled_looks(
-    cell: Cell, looks: Looks, free: IntArray, agreed: Agreed, others: Sequence[Effect]
+    cell: Cell, looks: Looks, moving: IntArray, agreed: Agreed, others: Sequence[Effect]
 ) -> tuple[Agreed, Seen]:
     """Linearises corners and fits the cell in turn, until lenses and boards stay."""
-    bent = np.concatenate([np.zeros(0), *(it.values for it in others)])
-    for _ in range(_ROUNDS):
-        seen = looks.seen(free)
-        problem = with_seen(cell, agreed.problem, seen, others)
-        part = problem.subset(agreed.used)
-        values = seen.looks.values[free]
-        start = State(agreed.fit.state.edges, np.concatenate([values, bent]))
-        fit = fit_problem(part, start, agreed.fit.noise)
-        found, bent = np.split(fit.state.values, [len(free)])
-        agreed = replace(agreed, problem=problem, fit=fit)
-        spread = fitted_covariance(part, fit.state, fit.noise)
-        sigma = np.sqrt(np.diag(spread))[problem.effect_columns[LENSES]] if len(free) else values
-        if np.all(np.abs(found - values) <= _SETTLED * sigma):
-            break
-        looks = seen.looks.with_values(free, found)
-    return agreed, seen
-
-
-def with_seen(cell: Cell, problem: Problem, seen: Seen, others: Sequence[Effect]) -> Problem:
-    """The problem with poses as its lenses and boards make them, and with other effects."""
-    places = {view: at for at, view in enumerate(seen.views)}
-    rows = np.array([places.get(it.view, -1) for it in cell.rows], dtype=np.int64)
-    mine, before = rows >= 0, problem.observations
-    measured, spread = before.measured.copy(), before.covariance.copy()
-    measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
-    wider = replace(problem, observations=replace(before, measured=measured, covariance=spread))
-    return wider.with_effects([seen.effect(rows), *others])
-
-
-def _wider(cell: Cell, seen: Seen, agreed: Agreed, others: Sequence[Effect]) -> IntArray:
-    """What more the corners ask to set free: boards' bends, and lenses that were stated."""
-    looks = seen.looks
-    groups: list[IntArray] = [looks.shape_of(it) for it in looks.printed]
-    for name, corners in looks.problems.items():
-        lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
-        if corners.scene.mode == "auto" and not np.isin(lens, seen.free).all():
-            groups.append(lens)
-    if not all(it.has_spare_corners for it in looks.problems.values()):
-        return seen.free
-    every = np.unique(np.concatenate([seen.free, *groups]))
-    repeated = replace(agreed.problem, with_repeats=True)
-    problem = with_seen(cell, repeated, looks.seen(every), others)
-    bent = agreed.fit.state.values[len(seen.free) :]
-    state = State(agreed.fit.state.edges, np.concatenate([looks.values[every], bent]))
-    scores = normal_equations(problem.subset(agreed.used), state, agreed.fit.noise)
-
-    def among(free: IntArray) -> Mask:
-        columns = problem.moving.copy()
-        columns[problem.effect_columns[LENSES]] = np.isin(every, free)
-        return columns
-
-    def gain(group: IntArray) -> float:
-        """By how much more than chance the squared error falls with a group free (Rao)."""
-        more = np.setdiff1d(group, free)
-        wider, now = among(np.union1d(free, more)), among(free)
-        return score_gain(*scores, wider, now) - chance_limit(len(more))
-
-    free = seen.free
-    while groups:
-        most, at = max((gain(it), at) for at, it in enumerate(groups))
-        if most <= 0.0:
-            break
-        free = np.union1d(free, groups.pop(at))
-    return free
+    side = CellSide(cell, agreed, others)
+    return side.settled(settle(looks, side, moving, side.frames))

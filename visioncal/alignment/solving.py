@@ -140,7 +140,7 @@ def _at_rest(
         if seen is None:
             agreed = _with_effects(agreed, effects)
         else:
-            agreed, seen = settled_looks(cell, seen.looks, seen.free, agreed, effects)
+            agreed, seen = settled_looks(cell, seen.looks, seen.moving, agreed, effects)
         moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
         arms = {name: arm for name, (arm, _) in moved.items()}
         if max(step for _, step in moved.values()) < _AT_REST_RAD:

@@ -1,33 +1,25 @@
-"""The joint fit of corners, lens, board and both edges: its unknowns, and its linearisation.
+"""The joint fit of corners, lenses, boards and frames: its unknowns, and its linearisation.
 
-Each view's corners are compressed to its pose and to how that moves with lens and board; the chain
-of frames is closed over all stops with what is left open of these. Linearising anew at the answer,
-until it stays, is Gauss-Newton's method on the whole problem.
+Each view's corners are compressed to its pose and to how that moves with its lens and its board;
+the chains of frames are closed over all stops with what is left open of these. Linearising anew at
+the answer, until it stays, is Gauss-Newton's method on the whole problem.
 """
 
-from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.errors import ConvergenceError
-from visioncal.estimation.appearance import (
-    BOARD_NAMES,
-    Appearance,
-    Compressed,
-    Free,
-    board_prior,
-    boards_basis,
-    compress,
-    shape_slices,
-)
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import chain
-from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.linalg import covariance, covariance_among
-from visioncal.estimation.problem import ROBOT, FramePrior, Problem, State
+from visioncal.estimation.corners import floored_sigma_px
+from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.problem import ROBOT, FramePrior, Noise, Problem, State
+from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
@@ -35,13 +27,10 @@ from visioncal.estimation.solve import (
     normal_equations,
     score_gain,
 )
-from visioncal.targets import first_corners, numbered_positions
-from visioncal.types import Camera, Corners, FloatArray, IntArray, Mount, Target
+from visioncal.types import FloatArray, IntArray, Mask, Mount
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
 _FALSE_ALARM = 1e-4
-# Corners must be left over to judge by: so many residuals for each unknown.
-_SPARE = 10
 # Values that move by less than this share of their sigma have settled.
 _SETTLED, _ROUNDS = 0.02, 8
 # A step after which corners fit worse by this factor is too long; so often is it halved.
@@ -51,39 +40,33 @@ _CONTRADICTION = 3.0
 # Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
 # may well be so much larger.
 _UNEVEN = 2.0
-# Given intrinsics that are set free are known to so much without the session: the focal length and
-# the centre as shares of the focal length, and the distortion's coefficients.
-_FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What is looked at, and with what.
+class Side(Protocol):
+    """The frames' side of the fit: all that is no corner."""
 
-    Attributes:
-        mount: Where the camera is.
-        targets: What was printed, as stated; the corners of several are numbered through.
-        camera: The intrinsics.
-        estimated: Whether they were estimated from these corners.
-        mode: What to do with given ones: `hold`, `refine` or `auto`.
-        matrix_sigma_px: What given fx, fy, cx, cy are known to; None where that is not said.
-        names: What several targets are called.
-    """
+    @property
+    def noise(self) -> Noise | None:
+        """Levels to start from; None for those from above."""
 
-    mount: Mount
-    targets: tuple[Target, ...]
-    camera: Camera
-    estimated: bool
-    mode: str = "auto"
-    matrix_sigma_px: float | None = None
-    names: tuple[str, ...] = ("",)
+    @property
+    def has_links(self) -> bool:
+        """Whether errors of an arm's links are free, which a board's scale may look like."""
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether errors of an arm are free at all."""
+
+    def problem(self, seen: Seen) -> Problem:
+        """The problem of what the fit uses, with lenses and boards as its first effect."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """The robot's side of the chain.
+    """The frames' side of one robot and one camera.
 
     Attributes:
+        mount: Where the camera is.
         poses: (s, 4, 4) `base_from_flange` at each stop.
         stops: (m,) the stop of each view, numbered from 0.
         targets: (m,) the frame of the target that each view shows.
@@ -93,6 +76,7 @@ class Arm:
         priors: What was measured of frames by hand.
     """
 
+    mount: Mount
     poses: FloatArray
     stops: IntArray
     targets: tuple[str, ...]
@@ -101,186 +85,35 @@ class Arm:
     errors: ArmErrors | None = None
     priors: tuple[FramePrior, ...] = ()
 
+    @property
+    def noise(self) -> None:
+        """Levels are sought from above."""
 
-def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
-    """As how much of a view those count that show the same: one image in all.
+    @property
+    def has_errors(self) -> bool:
+        """Whether its errors are free."""
+        return self.errors is not None
 
-    What a lens, a print or a detector does to one of them it does to all.
+    @property
+    def has_links(self) -> bool:
+        """Whether those of its own links are."""
+        return self.has_errors and self.of_links
 
-    Args:
-        shown: What each view shows from where, by its number; alike where that is the same.
-    """
-    counts = Counter(shown.values())
-    return {view: 1.0 / counts[it] for view, it in shown.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class CornerProblem:
-    """The corners of m views with what is known of the scene beforehand.
-
-    Attributes:
-        scene: The scene.
-        stack: The corners.
-        positions: (c, 3) corners of the flat boards, each in its own frame [m].
-        basis: (c, 3, s) of `boards_basis`.
-        prior_sigma: (k + s,) what lens and boards are known to; inf where nothing is known.
-        shares: (m,) as how much of a view each counts for lens and board; see `repeat_shares`.
-        contested: Whether given intrinsics are held although the corners speak against them.
-    """
-
-    scene: Scene
-    stack: CornerStack
-    positions: FloatArray
-    basis: FloatArray
-    prior_sigma: FloatArray
-    shares: FloatArray
-    contested: bool = False
-
-    @classmethod
-    def of(
-        cls, scene: Scene, corners: Mapping[int, Corners], shares: Mapping[int, float]
-    ) -> "CornerProblem":
-        """Puts the problem together from the corners by view, and the shares of those that repeat.
-
-        Where a view has no share, it counts as one.
-        """
-        positions = numbered_positions(scene.targets)
-        priors = [board_prior(it) for it in scene.targets]
-        return cls(
-            scene,
-            CornerStack.of(corners, positions),
-            positions,
-            boards_basis(scene.targets),
-            np.concatenate([_lens_prior(scene), *priors]),
-            np.array([shares.get(it, 1.0) for it in corners]),
+    def problem(self, seen: Seen) -> Problem:
+        """The chain of frames at its stops; see `Side`."""
+        effects = [seen.effect(np.arange(len(self.stops)))]
+        if self.errors is not None:
+            effects.append(self.errors.effect(ROBOT))
+        return chain(
+            self.mount,
+            self.poses,
+            seen.looks.poses,
+            seen.spread,
+            stops=self.stops,
+            targets=self.targets,
+            effects=effects,
+            priors=self.priors,
         )
-
-    def without_prior(self, columns: IntArray) -> "CornerProblem":
-        """The same problem, some values of which nobody has stated."""
-        sigma = self.prior_sigma.copy()
-        sigma[columns] = np.inf
-        return replace(self, prior_sigma=sigma)
-
-    @property
-    def stated(self) -> Appearance:
-        """Lens and board as they are given or were estimated before."""
-        return Appearance(self.scene.camera, np.zeros(self.basis.shape[2]))
-
-    @property
-    def lens(self) -> IntArray:
-        """Places of the intrinsics among the values; they come first."""
-        return np.arange(len(self.prior_sigma) - self.basis.shape[2])
-
-    @property
-    def printed(self) -> list[int]:
-        """Which targets are printed: those that have a scale, and may be bent."""
-        return [at for at, it in enumerate(self.scene.targets) if it.kind != "points"]
-
-    @property
-    def scale(self) -> IntArray:
-        """Places of the printed boards' scales."""
-        return self._joined(self.scale_of(board) for board in self.printed)
-
-    @property
-    def shape(self) -> IntArray:
-        """Places of the printed boards' aspects and bends."""
-        return self._joined(self.shape_of(board) for board in self.printed)
-
-    @property
-    def points(self) -> IntArray:
-        """Places of the rigs' points, as far as these are not exact."""
-        rigs = set(range(len(self.scene.targets))) - set(self.printed)
-        return self._joined(self.points_of(rig) for rig in sorted(rigs))
-
-    def scale_of(self, board: int) -> IntArray:
-        """Place (1,) of one printed board's scale."""
-        return self.points_of(board)[:1]
-
-    def shape_of(self, board: int) -> IntArray:
-        """Places (8,) of one printed board's aspect and bend."""
-        return self.points_of(board)[1:]
-
-    def points_of(self, target: int) -> IntArray:
-        """Places of all that is unknown of where one target's corners lie on it."""
-        mine = shape_slices(self.scene.targets, len(self.lens))[target]
-        return np.arange(mine.start, mine.stop)
-
-    def _joined(self, places: Iterable[IntArray]) -> IntArray:
-        return np.concatenate([self.lens[:0], *places])
-
-    def corners_of(self, board: int) -> slice:
-        """The rows of one board's corners in `positions`."""
-        starts = [*first_corners(self.scene.targets).tolist(), len(self.positions)]
-        return slice(starts[board], starts[board + 1])
-
-    @property
-    def has_spare_corners(self) -> bool:
-        """Whether the views show more corners than it takes to free lens and board."""
-        residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
-        return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
-
-    def unknowns(self, compressed: Compressed, moving: IntArray) -> int:
-        """How many unknowns the corners have told, the poses among them.
-
-        Where a rig's points are known well beforehand, corners tell little of them, and residuals
-        are no smaller for their sake.
-        """
-        rigs = np.intersect1d(self.points, moving)
-        sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
-        told = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
-        share = told / (told + floored_sigma_px(sigma_px) ** 2)
-        exact = len(moving) - len(rigs)
-        return 6 * len(compressed.information) + exact + round(float(share.sum()))
-
-    def sigma_px(self, compressed: Compressed, moving: IntArray) -> float:
-        """Noise of a corner's coordinate [px]; see `CornerStack.sigma_px`."""
-        return self.stack.sigma_px(compressed.residuals, self.unknowns(compressed, moving))
-
-    @property
-    def first(self) -> IntArray:
-        """What is free from the start."""
-        if self.scene.estimated:
-            return np.union1d(self.lens, self.points)
-        if self.scene.mode == "refine" and self.has_spare_corners:
-            return np.concatenate([self.lens, np.union1d(self.shape, self.points)])
-        return self.points
-
-    @property
-    def counted(self) -> IntArray:
-        """What is open and counts in the covariance, whether it is free or not."""
-        if self.scene.estimated or self.contested:
-            return np.concatenate([self.lens, np.union1d(self.scale, self.points)])
-        stated = self.scene.matrix_sigma_px is not None
-        lens = self.lens[:4] if stated else self.lens[:0]
-        return np.concatenate([lens, np.union1d(self.scale, self.points)])
-
-
-def _lens_prior(scene: Scene) -> FloatArray:
-    camera = scene.camera
-    if scene.estimated:
-        return np.full(4 + len(camera.distortion), np.inf)
-    matrix = np.full(4, _FOCAL_SHARE * float(camera.matrix[:2].max()))
-    if scene.matrix_sigma_px is not None:
-        matrix = np.full(4, scene.matrix_sigma_px)
-    return np.concatenate([matrix, np.full(len(camera.distortion), _DISTORTION_SIGMA)])
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Where a fit begins: lens and board, (m, 4, 4) poses of the target, and where frames are."""
-
-    appearance: Appearance
-    poses: FloatArray
-    frames: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """The corners' word on poses and appearance, where it was linearised."""
-
-    compressed: Compressed
-    free: Free
-    sigma_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,10 +125,10 @@ class Fitted:
     fit: Solution
 
     @property
-    def looks(self) -> slice:
-        """The columns of lens and board: the first effect's."""
+    def columns(self) -> slice:
+        """The columns of lenses and boards: the first effect's."""
         first = 6 * len(self.problem.unknown)
-        return slice(first, first + len(self.seen.free.columns))
+        return slice(first, first + len(self.seen.free))
 
     @property
     def frames(self) -> Mapping[str, FloatArray]:
@@ -303,13 +136,21 @@ class Fitted:
         return dict(zip(self.problem.unknown, self.fit.state.edges, strict=True))
 
     @property
-    def appearance(self) -> Appearance:
-        """Lens and board as they came out."""
-        return self.seen.free.after(self.fit.state.values)
+    def others(self) -> FloatArray:
+        """(k,) the values of all other effects."""
+        return self.fit.state.values[len(self.seen.free) :]
 
-    def again(self) -> Start:
-        """The answer as the start of the next fit."""
-        return Start(self.appearance, self.seen.compressed.cam_from_target, self.frames)
+    @property
+    def change(self) -> FloatArray:
+        """(f,) by how much the free values moved from where they were linearised."""
+        free = self.seen.free
+        return np.asarray(self.fit.state.values[: len(free)] - self.seen.looks.values[free])
+
+    @property
+    def looks(self) -> Looks:
+        """Lenses and boards as they came out; what was held is where it was."""
+        free = self.seen.free
+        return self.seen.looks.with_values(free, self.fit.state.values[: len(free)])
 
     def spread(self) -> FloatArray:
         """(p, p) covariance of what the fit moves, where it was measured."""
@@ -318,11 +159,24 @@ class Fitted:
     @property
     def moving(self) -> IntArray:
         """Places of the values that the fit moves."""
-        return self.seen.free.columns[~self.seen.free.anchored]
+        return self.seen.moving
 
 
-def settle(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> Fitted:
+def settle(
+    looks: Looks,
+    side: Side,
+    moving: IntArray,
+    frames: Mapping[str, FloatArray],
+    others: FloatArray | None = None,
+) -> Fitted:
     """Linearises and fits in turn, until the values stay where they are.
+
+    Args:
+        looks: Corners, lenses and boards to start from.
+        side: What is known of the frames.
+        moving: Places of the values that the fit moves.
+        frames: Where to start.
+        others: The values of all other effects to start from; where they were linearised if None.
 
     Raises:
         ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
@@ -330,7 +184,7 @@ def settle(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> 
     try:
         # Numbers that run away overflow before they fail.
         with np.errstate(over="ignore", invalid="ignore"):
-            return _settled(problem, arm, moving, start)
+            return _settled(side, _fitted(side, looks.seen(moving), frames, others))
     except np.linalg.LinAlgError as error:
         raise ConvergenceError(
             "hand-eye: no frames explain both the robot's poses and what the camera saw: the fit "
@@ -341,100 +195,44 @@ def settle(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> 
         ) from error
 
 
-def _settled(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> Fitted:
-    fitted = _fitted(problem, arm, moving, start)
+def again(fitted: Fitted, side: Side, moving: IntArray, looks: Looks | None = None) -> Fitted:
+    """Settles once more from an answer, with other values free, or by other priors."""
+    return settle(looks or fitted.looks, side, moving, fitted.frames, fitted.others)
+
+
+def _settled(side: Side, fitted: Fitted) -> Fitted:
     for _ in range(_ROUNDS):
-        sigma = np.sqrt(np.diag(fitted.spread())[fitted.looks])
-        if np.all(np.abs(fitted.fit.state.values[: len(sigma)]) <= _SETTLED * sigma):
+        sigma = np.sqrt(np.diag(fitted.spread())[fitted.columns])
+        if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
             break
-        fitted = _fit(problem, arm, _stepped(problem, moving, fitted), fitted.frames)
+        fitted = _fitted(side, _stepped(fitted), fitted.frames, fitted.others)
     return fitted
 
 
-def _fitted(problem: CornerProblem, arm: Arm, moving: IntArray, start: Start) -> Fitted:
-    seen = seen_at(problem, moving, start.appearance, start.poses)
-    return _fit(problem, arm, seen, start.frames)
-
-
-def _stepped(problem: CornerProblem, moving: IntArray, fitted: Fitted) -> Seen:
+def _stepped(fitted: Fitted) -> Seen:
     """Linearises where the fit came to rest, or on the way there as far as the corners follow.
 
     Far from the answer, as where a lens was stated for images of another size, the whole step
     leads to lenses that see nothing.
     """
-    limit = _FOLLOWS * floored_sigma_px(fitted.seen.sigma_px)
-    change, poses = fitted.fit.state.values, fitted.seen.compressed.cam_from_target
+    limits = [_FOLLOWS * floored_sigma_px(it) for it in fitted.seen.sigmas_px]
+    looks, free, change = fitted.seen.looks, fitted.seen.free, fitted.change
     for _ in range(_HALVINGS):
-        seen = seen_at(problem, moving, fitted.seen.free.after(change), poses)
-        if seen.sigma_px <= limit:
+        seen = looks.with_values(free, looks.values[free] + change).seen(fitted.moving)
+        if all(it <= limit for it, limit in zip(seen.sigmas_px, limits, strict=True)):
             return seen
         change = change / 2
     return fitted.seen
 
 
-def _fit(problem: CornerProblem, arm: Arm, seen: Seen, frames: Mapping[str, FloatArray]) -> Fitted:
-    whole = _chain(problem, arm, seen, seen.free)
-    return Fitted(seen, whole, fit_problem(whole, whole.start(frames)))
-
-
-def seen_at(
-    problem: CornerProblem, moving: IntArray, appearance: Appearance, poses: FloatArray
-) -> Seen:
-    """Linearises the corners.
-
-    Args:
-        problem: The corners.
-        moving: Places of the values that a fit will move.
-        appearance: Lens and board to linearise at.
-        poses: (m, 4, 4) `cam_from_target` to start from.
-    """
-    compressed = compress(
-        problem.stack, problem.basis, appearance, poses, problem.scale, problem.shares
-    )
-    sigma_px = problem.sigma_px(compressed, moving)
-    free = _known_beforehand(problem, moving, appearance, compressed, sigma_px)
-    return Seen(compressed, free, sigma_px)
-
-
-def _known_beforehand(
-    problem: CornerProblem,
-    moving: IntArray,
-    appearance: Appearance,
-    compressed: Compressed,
-    sigma_px: float,
-) -> Free:
-    """What the corners and the priors say of the free values."""
-    columns = np.union1d(moving, problem.counted)
-    weight = 1.0 / floored_sigma_px(sigma_px) ** 2
-    prior = 1.0 / problem.prior_sigma[columns] ** 2
-    away = (appearance.values - problem.stated.values)[columns]
-    information = weight * compressed.shared_information[np.ix_(columns, columns)] + np.diag(prior)
-    pull = weight * compressed.shared_pull[columns] + prior * away
-    return Free(
-        appearance,
-        problem.basis,
-        problem.positions,
-        columns,
-        ~np.isin(columns, moving),
-        information,
-        pull,
-    )
-
-
-def _chain(problem: CornerProblem, arm: Arm, seen: Seen, free: Free) -> Problem:
-    effects = [free.effect(seen.compressed.by_shared[:, :, free.columns])]
-    if arm.errors is not None:
-        effects.append(arm.errors.effect(ROBOT))
-    return chain(
-        problem.scene.mount,
-        arm.poses,
-        seen.compressed.cam_from_target,
-        floored_sigma_px(seen.sigma_px) ** 2 * covariance(seen.compressed.information),
-        stops=arm.stops,
-        targets=arm.targets,
-        effects=effects,
-        priors=arm.priors,
-    )
+def _fitted(
+    side: Side, seen: Seen, frames: Mapping[str, FloatArray], others: FloatArray | None
+) -> Fitted:
+    problem = side.problem(seen)
+    start = problem.start(frames)
+    if others is not None:
+        start = State(start.edges, np.concatenate([start.values[: len(seen.free)], others]))
+    return Fitted(seen, problem, fit_problem(problem, start, side.noise))
 
 
 @dataclass(frozen=True)
@@ -464,44 +262,41 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(
-    problem: CornerProblem, arm: Arm, fitted: Fitted, board: int = 0
-) -> MeasuredScale:
+def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
     """Measures a board's size by the robot's motion."""
-    place = problem.scale_of(board)
-    whole, at_change = _with_free(
-        problem, arm, fitted, np.union1d(fitted.moving, place), ignored=place
-    )
-    information, gradient = normal_equations(whole, at_change, fitted.fit.noise)
-    spread = covariance_among(information, whole.moving)
-    at = fitted.looks.start + int(np.searchsorted(fitted.seen.free.columns, place[0]))
-    now = float(fitted.appearance.values[place[0]])
-    uneven = _UNEVEN if arm.errors is not None and arm.of_links else 1.0
+    looks = fitted.seen.looks
+    (place,) = looks.scale_of(board)
+    seen = fitted.seen.freed(np.union1d(fitted.moving, place), looks.without_prior([place]))
+    problem, there = _at(side, fitted, seen)
+    information, gradient = normal_equations(problem, there, fitted.fit.noise)
+    spread = covariance_among(information, problem.moving)
+    at = fitted.columns.start + int(np.searchsorted(seen.free, place))
+    now = float(fitted.looks.values[place])
     return MeasuredScale(
         board,
         now - float(spread[at] @ gradient),
-        uneven * float(np.sqrt(spread[at, at])),
-        problem.scene.targets[board].square_sigma_m / problem.scene.targets[board].square_m,
+        (_UNEVEN if side.has_links else 1.0) * float(np.sqrt(spread[at, at])),
+        looks.stated_scale_sigma(board),
     )
 
 
-def moved_surprise(problem: CornerProblem, fitted: Fitted, places: IntArray) -> float:
+def moved_surprise(fitted: Fitted, places: IntArray) -> float:
     """Squared distance of some values from the stated ones, in units of their covariance.
 
     Args:
-        problem: The corners.
         fitted: A fit that moves these values among others.
         places: (k,) where they stand among the values.
     """
-    at = fitted.looks.start + np.searchsorted(fitted.seen.free.columns, places)
-    away = (fitted.appearance.values - problem.stated.values)[places]
+    at = fitted.columns.start + np.searchsorted(fitted.seen.free, places)
+    away = (fitted.looks.values - fitted.looks.stated)[places]
     return float(away @ np.linalg.solve(fitted.spread()[np.ix_(at, at)], away))
 
 
-def contradicted_lens(problem: CornerProblem, fitted: Fitted) -> bool:
+def contradicted_lens(fitted: Fitted, camera: str) -> bool:
     """Whether given intrinsics are farther off than what they are known to explains."""
-    away = fitted.appearance.values - problem.stated.values
-    return contradicts(away[problem.lens], _lens_prior(problem.scene))
+    looks = fitted.looks
+    away = (looks.values - looks.stated)[looks.lenses[camera]]
+    return contradicts(away, lens_prior(looks.problems[camera].scene))
 
 
 def contradicts(away: FloatArray, prior_sigma: FloatArray) -> bool:
@@ -514,25 +309,43 @@ def chance_limit(freedom: int) -> float:
     return float(chi2_limit(_FALSE_ALARM, freedom))
 
 
-def gain(problem: CornerProblem, arm: Arm, fitted: Fitted, moving: IntArray) -> float:
-    """How much the whitened squared error falls when more values are free (Rao's score test)."""
-    whole, at = _with_free(problem, arm, fitted, moving)
-    return score_gain(*normal_equations(whole, at, fitted.fit.noise), whole.moving)
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """What the data ask of values that a fit holds (Rao's score test).
+
+    Attributes:
+        information: (p, p) with all the values free that may be asked for.
+        gradient: (p,) of half the squared error, at the fit.
+        moving: (p,) which columns a fit moves.
+        columns: Those of lenses and boards.
+        places: Which values these are of.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    moving: Mask
+    columns: slice
+    places: IntArray
+
+    @classmethod
+    def of(cls, side: Side, fitted: Fitted, asked: IntArray) -> "Scores":
+        """The scores of some values, at a fit."""
+        seen = fitted.seen.freed(np.union1d(fitted.moving, asked))
+        problem, there = _at(side, fitted, seen)
+        scores = normal_equations(problem, there, fitted.fit.noise)
+        first = fitted.columns.start
+        columns = slice(first, first + len(seen.free))
+        return cls(*scores, problem.moving, columns, seen.free)
+
+    def gain(self, moving: IntArray) -> float:
+        """How much the whitened squared error falls when these values are free."""
+        among = self.moving.copy()
+        among[self.columns] = np.isin(self.places, moving)
+        return score_gain(self.information, self.gradient, among)
 
 
-def _with_free(
-    problem: CornerProblem,
-    arm: Arm,
-    fitted: Fitted,
-    moving: IntArray,
-    ignored: IntArray | None = None,
-) -> tuple[Problem, State]:
-    """The problem at the same state with other values free, and without the prior of some."""
-    seen = fitted.seen
-    stated = problem if ignored is None else problem.without_prior(ignored)
-    free = _known_beforehand(stated, moving, seen.free.appearance, seen.compressed, seen.sigma_px)
-    looks, rest = np.split(fitted.fit.state.values, [len(seen.free.columns)])
-    change = np.zeros(len(free.columns))
-    change[np.searchsorted(free.columns, seen.free.columns)] = looks
-    there = State(fitted.fit.state.edges, np.concatenate([change, rest]))
-    return _chain(problem, arm, seen, free), there
+def _at(side: Side, fitted: Fitted, seen: Seen) -> tuple[Problem, State]:
+    """The problem with other values free, and a fit's state in it."""
+    values = fitted.looks.values[seen.free]
+    state = State(fitted.fit.state.edges, np.concatenate([values, fitted.others]))
+    return side.problem(seen), state

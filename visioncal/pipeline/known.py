@@ -15,8 +15,8 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.boards import Boards
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.closure import Closure, Noise
-from visioncal.estimation.joint import Scene
 from visioncal.estimation.problem import ROBOT, FramePrior, Problem
+from visioncal.estimation.scene import Scene
 from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
@@ -220,7 +220,6 @@ class Known:
         table = session.declaration.only_camera
         sigma_px = None if table is None else table.matrix_sigma_px
         return Scene(
-            session.mount,
             tuple(session.boards.values()),
             camera.camera,
             camera.estimated,

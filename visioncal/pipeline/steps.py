@@ -310,6 +310,7 @@ def _refine(known: Known) -> Known:
 def _arm(known: Known) -> Arm:
     first = known.first_of_stops(known.used)
     return Arm(
+        known.session.mount,
         known.flange_poses(first),
         known.stops,
         known.targets(known.used),

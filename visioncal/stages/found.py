@@ -9,7 +9,6 @@ from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (
     Arm,
-    CornerProblem,
     Fitted,
     MeasuredScale,
     chance_limit,
@@ -17,6 +16,7 @@ from visioncal.estimation.joint import (
     measured_scale,
     moved_surprise,
 )
+from visioncal.estimation.scene import CornerProblem, Scene
 from visioncal.estimation.solve import held_shift
 from visioncal.figures import figure
 from visioncal.types import FloatArray, IntArray, Target
@@ -25,40 +25,39 @@ from visioncal.types import FloatArray, IntArray, Target
 _FALSE_ALARM = 1e-4
 
 
-def findings(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[str]:
+def findings(arm: Arm, fitted: Fitted) -> Iterator[str]:
     """Says what was found that is a reason for doubt, and what the user can do about it.
 
     Args:
-        problem: The corners, and what is known of the scene.
         arm: The robot's side.
-        fitted: The answer.
+        fitted: The answer, of one camera.
     """
-    words, is_doubt = _noise_words(problem, fitted)
+    problem, looks = _problem(fitted), fitted.looks
+    words, is_doubt = _noise_words(fitted)
     if is_doubt:
         yield words
     for board in problem.printed:
-        words, is_doubt = _scale_finding(problem, arm, fitted, board)
+        words, is_doubt = _scale_finding(arm, fitted, board)
         if is_doubt:
             yield words
-        if _moved(problem, fitted, problem.shape_of(board)):
-            shift = fitted.seen.free.corners_after(fitted.fit.state.values) - problem.positions
-            bend_m = float(np.ptp(shift[problem.corners_of(board), 2]))
-            yield bend_words(_board(problem, board), 1e3 * bend_m)
+        if _moved(fitted, looks.shape_of(board)):
+            shift = looks.corners[board] - problem.positions[problem.corners_of(board)]
+            yield bend_words(_board(problem, board), 1e3 * float(np.ptp(shift[:, 2])))
     for rig, target in enumerate(problem.scene.targets):
-        yield from points_words(target, fitted.appearance.values[problem.points_of(rig)])
-    yield from _lens_finding(problem, fitted)
+        yield from points_words(target, looks.moved_points(rig))
+    yield from _lens_finding(fitted)
 
 
-def remarks(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[str]:
+def remarks(arm: Arm, fitted: Fitted) -> Iterator[str]:
     """Says what was found that is no reason for doubt; as `findings`."""
-    words, is_doubt = _noise_words(problem, fitted)
+    words, is_doubt = _noise_words(fitted)
     if words and not is_doubt:
         yield words
-    for board in problem.printed:
-        words, is_doubt = _scale_finding(problem, arm, fitted, board)
+    for board in fitted.looks.printed:
+        words, is_doubt = _scale_finding(arm, fitted, board)
         if words and not is_doubt:
             yield words
-    words, is_doubt = _moved_lens(problem, fitted)
+    words, is_doubt = _moved_lens(fitted)
     if words and not is_doubt:
         yield words
 
@@ -91,18 +90,22 @@ def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tup
     )
 
 
-def _noise_words(problem: CornerProblem, fitted: Fitted) -> tuple[str, bool]:
-    seen = fitted.seen.compressed
+def _noise_words(fitted: Fitted) -> tuple[str, bool]:
+    problem, (seen,) = _problem(fitted), fitted.seen.compressed
     return noise_words(problem.stack, seen.residuals, problem.unknowns(seen, fitted.moving))
 
 
-def _scale_finding(
-    problem: CornerProblem, arm: Arm, fitted: Fitted, board: int
-) -> tuple[str, bool]:
+def _problem(fitted: Fitted) -> CornerProblem:
+    """The only camera's corners."""
+    (problem,) = fitted.seen.looks.problems.values()
+    return problem
+
+
+def _scale_finding(arm: Arm, fitted: Fitted, board: int) -> tuple[str, bool]:
     """What the robot measures of a board's size, where the fit has taken it up."""
-    if not _moves(fitted, problem.scale_of(board)):
+    if not _moves(fitted, fitted.looks.scale_of(board)):
         return "", False
-    measured = measured_scale(problem, arm, fitted, board)
+    measured, problem = measured_scale(arm, fitted, board), _problem(fitted)
     return scale_words(_board(problem, board), problem.scene.targets[board].square_m, measured)
 
 
@@ -174,26 +177,30 @@ def points_words(target: Target, moved_m: FloatArray) -> Iterator[str]:
         )
 
 
-def _lens_finding(problem: CornerProblem, fitted: Fitted) -> Iterator[str]:
+def _lens_finding(fitted: Fitted) -> Iterator[str]:
+    problem = _problem(fitted)
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
         yield (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
             f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
             "more corners, or more views."
         )
-    words, is_doubt = _moved_lens(problem, fitted)
+    words, is_doubt = _moved_lens(fitted)
     if is_doubt:
         yield words
     if problem.contested:
-        yield _contest(problem, fitted)
+        shift = held_shift(fitted.problem, fitted.fit)[fitted.columns]
+        moves = shift[np.searchsorted(fitted.seen.free, problem.lens[:4])]
+        yield contest_words(problem.scene, moves)
 
 
-def _moved_lens(problem: CornerProblem, fitted: Fitted) -> tuple[str, bool]:
-    if problem.scene.estimated or not _moved(problem, fitted, problem.lens):
+def _moved_lens(fitted: Fitted) -> tuple[str, bool]:
+    looks, ((camera, problem),) = fitted.looks, fitted.seen.looks.problems.items()
+    if problem.scene.estimated or not _moved(fitted, problem.lens):
         return "", False
-    steps = (fitted.appearance.values - problem.stated.values)[problem.lens]
+    steps = (looks.values - looks.stated)[problem.lens]
     is_exact = problem.scene.matrix_sigma_px is None
-    return lens_words(steps[:4], is_doubtful=is_exact or contradicted_lens(problem, fitted))
+    return lens_words(steps[:4], is_doubtful=is_exact or contradicted_lens(fitted, camera))
 
 
 def lens_words(steps_px: FloatArray, *, is_doubtful: bool) -> tuple[str, bool]:
@@ -217,18 +224,21 @@ def lens_words(steps_px: FloatArray, *, is_doubtful: bool) -> tuple[str, bool]:
     )
 
 
-def _contest(problem: CornerProblem, fitted: Fitted) -> str:
-    """Words intrinsics that stay although the corners speak against them."""
-    shift = held_shift(fitted.problem, fitted.fit)[fitted.looks]
-    moves = shift[np.searchsorted(fitted.seen.free.columns, problem.lens[:4])]
+def contest_words(scene: Scene, moves_px: FloatArray) -> str:
+    """Words intrinsics that stay although the corners speak against them.
+
+    Args:
+        scene: What the camera looks at.
+        moves_px: (4,) how far fx, fy, cx, cy would move [px].
+    """
     why = (
         'intrinsics = "hold" keeps them'
-        if problem.scene.mode == "hold"
+        if scene.mode == "hold"
         else "they were kept, because views left out are predicted no better with others"
     )
     return (
         "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
-        f"{_px(moves)} px. But {why}; what this does to the result counts in its sigmas. "
+        f"{_px(moves_px)} px. But {why}; what this does to the result counts in its sigmas. "
         "Calibrate the camera anew."
     )
 
@@ -237,11 +247,9 @@ def _moves(fitted: Fitted, places: IntArray) -> bool:
     return bool(np.isin(places, fitted.moving).all())
 
 
-def _moved(problem: CornerProblem, fitted: Fitted, places: IntArray) -> bool:
+def _moved(fitted: Fitted, places: IntArray) -> bool:
     """Whether values were moved from what is stated by more than chance."""
-    return _moves(fitted, places) and moved_surprise(problem, fitted, places) > chance_limit(
-        len(places)
-    )
+    return _moves(fitted, places) and moved_surprise(fitted, places) > chance_limit(len(places))
 
 
 def _px(values: FloatArray) -> str:

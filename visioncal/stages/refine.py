@@ -14,31 +14,32 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.arm import ArmErrors, find_arm_errors
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import (
     Arm,
-    CornerProblem,
     Fitted,
     MeasuredScale,
-    Scene,
-    Seen,
-    Start,
+    Scores,
+    Side,
+    again,
     chance_limit,
     contradicted_lens,
-    gain,
     measured_scale,
-    repeat_shares,
-    seen_at,
     settle,
 )
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import ROBOT, Problem, State
+from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
 from visioncal.estimation.solve import covariance_of, fit_problem, left_out_residuals
 from visioncal.stages.found import findings, remarks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, IntArray
+
+# The only camera, where there is one.
+_ONLY = "cam"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +78,15 @@ def look(
         The views with how they move when lens and board do.
     """
     with one_blas_thread():
-        problem = _problem(scene, views, stops)
-        moving = problem.lens[:0] if closed_form else problem.first
-        poses = np.array([view.cam_from_target[0] for view in views])
-        seen = seen_at(problem, moving, problem.stated, poses)
+        problem, looks = _looks(scene, views, stops)
+        seen = looks.seen(problem.lens[:0] if closed_form else problem.first)
     return _told(seen, views, None)
 
 
 def refine(
     scene: Scene, views: Sequence[ViewPoses], arm: Arm, frames: Mapping[str, FloatArray]
 ) -> Refined:
-    """Fits lens, board and edges to all corners together.
-
-    Estimated intrinsics move with the edges. The board's bend, given intrinsics together with it,
-    and the board's scale are set free where corners and chain speak for it with more than noise can
-    say, and views that are left out do not speak against it. A scale that is held still counts, by
-    its prior, in the covariance.
+    """Fits lens, board and edges to all corners together; see `chosen`.
 
     Args:
         scene: What is looked at, and with what.
@@ -101,43 +95,42 @@ def refine(
         frames: Where the unknown frames are thought to be.
     """
     with one_blas_thread():
-        problem = _problem(scene, views, arm.stops)
-        poses = np.array([view.cam_from_target[0] for view in views])
-        start = Start(problem.stated, poses, frames)
-        answer = _chosen(problem, arm, settle(problem, arm, problem.first, start))
-        errors = arm_errors(arm, answer.fitted.problem, answer.fitted.frames)
+        problem, looks = _looks(scene, views, arm.stops)
+        answer = chosen(arm, settle(looks, arm, problem.first, frames))
+        errors = arm_errors(arm, answer.problem, answer.frames)
         if errors is not None and errors.is_significant:
-            answer, arm, errors = _with_arm(problem, arm, start, errors)
-        doubts = tuple(findings(answer.problem, arm, answer.fitted))
-        notes = tuple(remarks(answer.problem, arm, answer.fitted))
-    return replace(_told(answer.fitted.seen, views, errors), warnings=doubts, notes=notes)
+            stated = settle(looks, arm, problem.first, frames)
+            answer, arm, errors = _with_arm(arm, stated, errors)
+        doubts, notes = tuple(findings(arm, answer)), tuple(remarks(arm, answer))
+    return replace(_told(answer.seen, views, errors), warnings=doubts, notes=notes)
 
 
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """A fit, and the problem that it answers: priors that are contradicted have been dropped."""
+def _looks(
+    scene: Scene, views: Sequence[ViewPoses], stops: IntArray
+) -> tuple[CornerProblem, Looks]:
+    """The corners of one camera, and lens and board as they are stated.
 
-    problem: CornerProblem
-    fitted: Fitted
+    Corners of one stop and one board count as one view.
+    """
+    shown = {it.view: (stop, it.board) for it, stop in zip(views, stops.tolist(), strict=True)}
+    problem = CornerProblem.of(scene, _corners(views), repeat_shares(shown))
+    poses = np.array([view.cam_from_target[0] for view in views])
+    return problem, Looks.of({_ONLY: problem}, {_ONLY: poses})
 
 
-def _with_arm(
-    problem: CornerProblem, arm: Arm, start: Start, errors: ArmErrors
-) -> tuple[_Answer, Arm, ArmErrors | None]:
+def _with_arm(arm: Arm, stated: Fitted, errors: ArmErrors) -> tuple[Fitted, Arm, ArmErrors | None]:
     """Fits again with errors of the arm, which may have passed for another lens or board.
 
     Errors of any arm's shape tell which values are free, but are not estimated. Their size is that
     under the stated lens and board: a board that changes its size with the arm hides a part of it.
     """
-    stated = settle(problem, arm, problem.first, start)
     errors = arm_errors(arm, stated.problem, stated.frames) or errors
     erring = replace(arm, errors=errors)
-    answer = _chosen(problem, erring, settle(problem, erring, problem.first, start))
+    answer = chosen(erring, settle(stated.looks, erring, stated.moving, stated.frames))
     if arm.of_links:
         return answer, erring, errors
-    fitted = settle(answer.problem, arm, answer.fitted.moving, answer.fitted.again())
-    left = arm_errors(arm, fitted.problem, fitted.frames)
-    return replace(answer, fitted=fitted), arm, left
+    fitted = settle(answer.looks, arm, answer.moving, answer.frames)
+    return fitted, arm, arm_errors(arm, fitted.problem, fitted.frames)
 
 
 def arm_errors(arm: Arm, problem: Problem, frames: Mapping[str, FloatArray]) -> ArmErrors | None:
@@ -156,94 +149,132 @@ def arm_errors(arm: Arm, problem: Problem, frames: Mapping[str, FloatArray]) -> 
 
 
 def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
+    (compressed,), (sigma_px,) = seen.compressed, seen.sigmas_px
     return Refined(
-        seen.free,
-        tuple(
-            _remade(view, seen.compressed, seen.free.columns, seen.sigma_px, at)
-            for at, view in enumerate(views)
-        ),
-        seen.sigma_px,
+        _free(seen),
+        tuple(_remade(view, compressed, seen.free, sigma_px, at) for at, view in enumerate(views)),
+        sigma_px,
         errors,
     )
 
 
-def _chosen(problem: CornerProblem, arm: Arm, fitted: Fitted) -> _Answer:
-    """Sets free what the data speak for."""
-    answer = _Answer(problem, fitted)
-    for moving in _shapes(problem, arm, fitted):
-        wider = _freed(problem, arm, moving, fitted)
-        if _is_determined(wider.fitted) and not _predicts_worse(wider.fitted, fitted):
+def _free(seen: Seen) -> Free:
+    """Lens and board of the only camera, and what is open about them."""
+    looks, known = seen.looks, seen.known
+    ((name, problem),) = looks.problems.items()
+    appearance = Appearance(looks.camera(name), looks.values[looks.boards])
+    return Free(
+        appearance,
+        problem.basis,
+        problem.positions,
+        seen.free,
+        seen.held,
+        known.information,
+        known.pull,
+    )
+
+
+def chosen(side: Side, fitted: Fitted) -> Fitted:
+    """Sets free what the data speak for.
+
+    The boards' bends, given intrinsics together with them, and the boards' scales are set free
+    where corners and chains speak for it with more than noise can say, the frames stay determined,
+    and views that are left out do not speak against it. What is held although the corners speak
+    against it, and a scale that is held, count by their priors in the covariance.
+
+    Args:
+        side: The frames' side.
+        fitted: The fit with what is free from the start.
+    """
+    answer = fitted
+    for moving in _shapes(side, fitted):
+        wider = _freed(side, moving, fitted)
+        if _is_determined(wider, fitted) and not _predicts_worse(wider, fitted):
             answer = wider
             break
-    if not np.isin(problem.lens, answer.fitted.moving).all() and _speaks_against_lens(answer, arm):
-        contested = replace(answer.problem, contested=True)
-        again = settle(contested, arm, answer.fitted.moving, answer.fitted.again())
-        answer = _Answer(contested, again)
-    return _resized(answer, arm)
+    contested = _contested(side, answer)
+    if contested:
+        answer = again(answer, side, answer.moving, answer.looks.contesting(contested))
+    return _resized(side, answer)
 
 
-def _freed(problem: CornerProblem, arm: Arm, moving: IntArray, fitted: Fitted) -> _Answer:
+def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
     """Fits with more values free; a confident wrong prior is worse than none."""
-    wider = settle(problem, arm, moving, fitted.again())
-    if not np.isin(problem.lens, moving).all() or not contradicted_lens(problem, wider):
-        return _Answer(problem, wider)
-    unknown = problem.without_prior(problem.lens)
-    return _Answer(unknown, settle(unknown, arm, moving, wider.again()))
+    wider = again(fitted, side, moving)
+    looks = wider.looks
+    wrong = [
+        looks.lens_of(it)
+        for it in looks.problems
+        if np.isin(looks.lens_of(it), moving).all() and contradicted_lens(wider, it)
+    ]
+    if not wrong:
+        return wider
+    return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
-def _resized(answer: _Answer, arm: Arm) -> _Answer:
+def _resized(side: Side, answer: Fitted) -> Fitted:
     """Sets the boards' scales free where the robot measures others than are stated.
 
     One after the other: a board that is off misleads about the others, too.
     """
-    for _ in answer.problem.printed:
-        other = _wrongly_sized(answer, arm)
+    for _ in answer.looks.printed:
+        other = _wrongly_sized(side, answer)
         if other is None:
             return answer
-        problem, fitted = answer.problem, answer.fitted
-        place = problem.scale_of(other.board)
+        looks = answer.looks
+        place = looks.scale_of(other.board)
         if other.contradicts:
-            problem = problem.without_prior(place)
-        moving = np.union1d(fitted.moving, place)
-        resized = _Answer(problem, settle(problem, arm, moving, fitted.again()))
-        if not _is_determined(resized.fitted):
+            looks = looks.without_prior(place.tolist())
+        resized = again(answer, side, np.union1d(answer.moving, place), looks)
+        if not _is_determined(resized, answer):
             return answer
         answer = resized
     return answer
 
 
-def _wrongly_sized(answer: _Answer, arm: Arm) -> MeasuredScale | None:
+def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
-    problem, fitted = answer.problem, answer.fitted
-    held = [it for it in problem.printed if problem.scale_of(it)[0] not in fitted.moving]
-    measured = [measured_scale(problem, arm, fitted, board) for board in held]
+    looks = answer.looks
+    held = [it for it in looks.printed if looks.scale_of(it)[0] not in answer.moving]
+    measured = [measured_scale(side, answer, board) for board in held]
     # An arm whose links may all be too long is hard to tell from a board that is too large.
-    other = [it for it in measured if (it.is_another if arm.errors is None else it.contradicts)]
+    other = [it for it in measured if (it.contradicts if side.has_errors else it.is_another)]
     return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)
 
 
-def _is_determined(fitted: Fitted) -> bool:
-    """Whether the views still determine both edges to what is accepted, errors of the arm aside."""
+def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
+    """Whether the views still determine all frames to what is accepted, errors of arms aside."""
+    after, before = _worst(wider), _worst(fitted)
+    limits = np.tile([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], len(after) // 2)
+    # What was not determined before is no fault of lens and board.
+    return bool(np.all((after < limits) | (before >= limits)))
+
+
+def _worst(fitted: Fitted) -> FloatArray:
+    """(2 e,) the largest sigma of each unknown frame's rotation [rad] and place [m]."""
     looks, fit = fitted.problem.effects[:1], fitted.fit
     problem = fitted.problem.with_effects(looks)
     values = fit.state.values[: sum(map(len, looks))]
     spread = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
-    size = 6 * len(problem.unknown)
-    limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), len(problem.unknown))
-    blocks = np.split(spread[:size, :size], size // 3)
-    worst = [np.linalg.eigvalsh(it[:, 3 * at : 3 * at + 3])[-1] for at, it in enumerate(blocks)]
-    return bool(np.all(np.sqrt(worst) < limits[::3]))
+    places = np.arange(6 * len(problem.unknown)).reshape(-1, 3)
+    return np.sqrt([np.linalg.eigvalsh(spread[np.ix_(it, it)])[-1] for it in places])
 
 
-def _speaks_against_lens(answer: _Answer, arm: Arm) -> bool:
-    """Whether given intrinsics that are held explain the corners worse than chance does."""
-    problem, fitted = answer.problem, answer.fitted
-    if not problem.has_spare_corners:
-        return False
-    bent = np.union1d(fitted.moving, problem.shape)
-    everything = np.union1d(bent, problem.lens)
-    more = gain(problem, arm, fitted, everything) - gain(problem, arm, fitted, bent)
-    return more > chance_limit(len(problem.lens))
+def _contested(side: Side, answer: Fitted) -> list[str]:
+    """Cameras whose intrinsics are held, and explain the corners worse than chance does."""
+    looks, moving = answer.looks, answer.moving
+    held = [it for it in looks.problems if not np.isin(looks.lens_of(it), moving).all()]
+    if not held or not looks.has_spare_corners:
+        return []
+    bent = np.union1d(moving, looks.shape)
+    lenses = {it: looks.lens_of(it) for it in held}
+    scores = Scores.of(side, answer, np.concatenate([bent, *lenses.values()]))
+    least = scores.gain(bent)
+    return [
+        name
+        for name, lens in lenses.items()
+        if scores.gain(np.union1d(bent, lens)) - least > chance_limit(len(lens))
+    ]
 
 
 def held(scene: Scene) -> Free:
@@ -279,17 +310,29 @@ def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[Vie
     )
 
 
-def _shapes(problem: CornerProblem, arm: Arm, fitted: Fitted) -> Iterator[IntArray]:
-    """The bend, with given intrinsics or without, where it explains significantly more."""
-    now = fitted.moving
-    if not problem.has_spare_corners:
+def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
+    """The bends, with given intrinsics or without, where they explain significantly more."""
+    looks, now = fitted.looks, fitted.moving
+    if not looks.has_spare_corners:
         return
-    bent = np.union1d(now, problem.shape)
-    everything = np.union1d(bent, problem.lens)
-    gain_bent, gain_all = gain(problem, arm, fitted, bent), gain(problem, arm, fitted, everything)
-    may_refine = problem.scene.mode != "hold" and len(everything) > len(bent)
-    if may_refine and gain_all - gain_bent > chance_limit(len(everything) - len(bent)):
-        yield everything
+    bent = np.union1d(now, looks.shape)
+    stated = {
+        name: np.setdiff1d(looks.lens_of(name), bent)
+        for name, it in looks.problems.items()
+        if it.scene.mode != "hold"
+    }
+    scores = Scores.of(side, fitted, np.concatenate([bent, *stated.values()]))
+    gain_bent = scores.gain(bent)
+    gains = {
+        name: scores.gain(np.union1d(bent, lens)) - gain_bent - chance_limit(len(lens))
+        for name, lens in stated.items()
+        if len(lens)
+    }
+    # The one that is asked for least is done without first.
+    asked = sorted((name for name, it in gains.items() if it > 0.0), key=lambda it: -gains[it])
+    while asked:
+        yield np.unique(np.concatenate([bent, *(stated[it] for it in asked)]))
+        asked.pop()
     if len(bent) > len(now) and gain_bent > chance_limit(len(bent) - len(now)):
         yield bent
 
@@ -302,12 +345,6 @@ def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
     ]
     more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
     return bool(np.all(more > less))
-
-
-def _problem(scene: Scene, views: Sequence[ViewPoses], stops: IntArray) -> CornerProblem:
-    """The corners, of which those of one stop and one board count as one view."""
-    shown = {it.view: (stop, it.board) for it, stop in zip(views, stops.tolist(), strict=True)}
-    return CornerProblem.of(scene, _corners(views), repeat_shares(shown))
 
 
 def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:

@@ -4,7 +4,7 @@ Each camera's corners are compressed to poses with their covariance, to how thes
 boards, and to information on lens and boards; here the latter comes together, with the priors.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,11 +13,11 @@ import numpy as np
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.joint import CornerProblem
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.problem import Effect
+from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.variance import Knowledge
-from visioncal.types import Camera, FloatArray, IntArray
+from visioncal.types import Camera, FloatArray, IntArray, Mask
 
 # The effect's name in a problem.
 LENSES = "lenses and boards"
@@ -130,6 +130,48 @@ class Looks:
                 free.append(np.arange(lens.start, lens.start + 4))
         return np.unique(np.concatenate(free))
 
+    @property
+    def counted(self) -> IntArray:
+        """What is open and counts in the covariance, whether it is free or not."""
+        found = (self.places(name)[it.counted] for name, it in self.problems.items())
+        return np.unique(np.concatenate([*found]))
+
+    @property
+    def shape(self) -> IntArray:
+        """Places of the printed boards' aspects and bends."""
+        return self._here(self._one.shape)
+
+    def stated_scale_sigma(self, board: int) -> float:
+        """What the stated size of a printed board is known to, as a share of it."""
+        target = self._one.scene.targets[board]
+        return target.square_sigma_m / target.square_m
+
+    def lens_of(self, name: str) -> IntArray:
+        """Places of one camera's intrinsics."""
+        return np.arange(self.lenses[name].start, self.lenses[name].stop)
+
+    @property
+    def has_spare_corners(self) -> bool:
+        """Whether all cameras show more corners than it takes to free lens and board."""
+        return all(it.has_spare_corners for it in self.problems.values())
+
+    def without_prior(self, places: Iterable[int]) -> "Looks":
+        """The same, some values of which nobody has stated."""
+        gone = np.array([*places])
+        problems = {
+            name: it.without_prior(np.flatnonzero(np.isin(self.places(name), gone)))
+            for name, it in self.problems.items()
+        }
+        return replace(self, problems=problems)
+
+    def contesting(self, names: Collection[str]) -> "Looks":
+        """The same, the intrinsics of some cameras being held although corners contradict them."""
+        problems = {
+            name: replace(it, contested=it.contested or name in names)
+            for name, it in self.problems.items()
+        }
+        return replace(self, problems=problems)
+
     def camera(self, name: str) -> Camera:
         """A camera with its lens as it is taken to be."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
@@ -140,7 +182,7 @@ class Looks:
         values[free] = found
         return replace(self, values=values)
 
-    def seen(self, free: IntArray) -> "Seen":
+    def seen(self, moving: IntArray) -> "Seen":
         """Compresses all corners, (f,) values being free."""
         found, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
@@ -158,24 +200,17 @@ class Looks:
                 problem.shares,
             )
             places = self.places(name)
-            sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, free)))
+            sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, moving)))
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
             pull[places] += weight * compressed.shared_pull
             found.append(compressed)
             sigmas.append(sigma)
             begin = end
-        prior = 1.0 / self.prior_sigma**2
-        information += np.diag(prior)
-        pull += prior * (self.values - self.stated)
         poses = np.concatenate([it.cam_from_target for it in found])
-        return Seen(
-            replace(self, poses=poses),
-            free,
-            tuple(found),
-            tuple(sigmas),
-            Knowledge(information[np.ix_(free, free)], pull[free]),
-        )
+        corners = Knowledge(information, pull)
+        looks = replace(self, poses=poses)
+        return Seen(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
 
     def places(self, name: str) -> IntArray:
         """Places of what one camera's corners tell of: its lens and all boards."""
@@ -191,17 +226,41 @@ class Seen:
 
     Attributes:
         looks: Where that was.
-        free: (f,) places of the values that are free.
+        moving: Places of the values that a fit moves.
         compressed: What each camera's corners say.
         sigmas_px: Each camera's noise of a corner's coordinate [px].
-        known: What is known of the free values without any robot.
+        corners: What the corners say of all values, the poses being free.
     """
 
     looks: Looks
-    free: IntArray
+    moving: IntArray
     compressed: tuple[Compressed, ...]
     sigmas_px: tuple[float, ...]
-    known: Knowledge
+    corners: Knowledge
+
+    @cached_property
+    def free(self) -> IntArray:
+        """(f,) places of the values that are open: those that move, and others that count."""
+        return np.union1d(self.moving, self.looks.counted)
+
+    @property
+    def held(self) -> Mask:
+        """(f,) which of them stay where they are."""
+        return ~np.isin(self.free, self.moving)
+
+    @property
+    def known(self) -> Knowledge:
+        """What is known of the free values without any robot."""
+        looks, free = self.looks, self.free
+        prior = 1.0 / looks.prior_sigma[free] ** 2
+        return Knowledge(
+            self.corners.information[np.ix_(free, free)] + np.diag(prior),
+            self.corners.pull[free] + prior * (looks.values - looks.stated)[free],
+        )
+
+    def freed(self, moving: IntArray, looks: Looks | None = None) -> "Seen":
+        """The same with other values moving, or with other priors."""
+        return replace(self, moving=np.sort(moving), looks=looks or self.looks)
 
     @property
     def spread(self) -> FloatArray:
@@ -231,8 +290,7 @@ class Seen:
         """
         by_sensor = np.zeros((len(rows), 6, len(self.free)))
         by_sensor[rows >= 0] = self.by_free[rows[rows >= 0]]
-        held = np.zeros(len(self.free), dtype=bool)
-        return Effect(LENSES, self.looks.values[self.free], self.known, held, by_sensor)
+        return Effect(LENSES, self.looks.values[self.free], self.known, self.held, by_sensor)
 
     @property
     def views(self) -> tuple[int, ...]:
