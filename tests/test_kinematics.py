@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimation.workspace import pose_slopes, postures
+from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.workspace import postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows
 from visioncal.pipeline.result import result_of
@@ -168,7 +170,9 @@ def test_predictions_move_as_their_derivatives_say(mount):
     model, edges, q = known.arm_model, known.solved.edges, known.joints(known.used)[:3]
     size, step = 12 + len(model.values), 1e-6
     middle = target_in_camera(mount, edges.x, edges.z, model.robot.base_from_flange(q))
-    slopes = pose_slopes(model, edges, mount, q)
+    problem = known.closure(known.used).problem.with_effects([])
+    pair = ArmPair.of(problem, State(np.stack([edges.x, edges.z]), np.zeros(0)), ROBOT)
+    slopes = pair.slopes(model.base_from_flange(q), model.basis(q))[1]
     for at in range(size):
         change = np.zeros(size)
         change[at] = step

@@ -5,20 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import ERROR_RAD, NOISE, TOOL, X, Z, arm_data, closure_of, erring
+from arms import ERROR_RAD, NOISE, TOOL, arm_data, closure_of, erring
 from cells import calibrated
 from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Edges
 from visioncal.estimation.indices import Indices, singular_values
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parameters import free_parameters, parameter_moves
 from visioncal.estimation.problem import Effect, Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
-from visioncal.estimation.workspace import postures, tool_slopes
+from visioncal.estimation.workspace import postures
 from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.result import result_of
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
@@ -267,7 +266,9 @@ def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     arm = arm_data(robot, postures(robot)[:15], mount)
     telling = tell(arm)
     anywhere = postures(arm.model.robot)
-    place = tool_slopes(arm.model, Edges(X, Z, np.zeros(0)), mount, arm.at, anywhere)
+    flange = arm.model.base_from_flange(anywhere)
+    poses, slopes = arm.pair.slopes(flange, arm.basis(anywhere))
+    place = arm.pair.place_slopes(poses, slopes, arm.at)
 
     def variance(problem: Problem) -> float:
         fitted = covariance(fisher_information(problem, arm.state, arm.noise))

@@ -95,6 +95,22 @@ class ArmPair:
         errors = linear.by_errors[:, :, 6 * slot : 6 * slot + 6]
         return replace(linear, by_errors=errors), here.predicted(edges)
 
+    def slopes(
+        self, base_from_flange: FloatArray, moved: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """How the pose of the observed moves with all edges and with anything of the arm.
+
+        Args:
+            base_from_flange: (k, 4, 4) the flange.
+            moved: (k, 6, p) its right perturbations.
+
+        Returns:
+            (k, 4, 4) `observer_from_observed`, and its (k, 6, 6 e + p) right perturbations.
+        """
+        linear, poses = self.at(base_from_flange)
+        # Residuals fall as what is predicted moves on.
+        return poses, -np.concatenate([linear.jacobian, linear.by_errors @ moved], axis=2)
+
     def frame_slopes(self, base_from_flange: FloatArray) -> FloatArray:
         """(k, 6, 12) how the flange moves with the frames of its base and of what it carries."""
         branches = self.problem.tree.branches
@@ -104,14 +120,14 @@ class ArmPair:
         of_end = np.broadcast_to(adjoint(flange_from_end), (len(base_from_flange), 6, 6))
         return np.concatenate([adjoint(invert(base_from_flange)), of_end], axis=2)
 
-    def place_slopes(self, slopes: FloatArray, poses: FloatArray, at: FloatArray) -> FloatArray:
+    def place_slopes(self, poses: FloatArray, slopes: FloatArray, at: FloatArray) -> FloatArray:
         """How the place of what the arm carries moves, seen from what stands still.
 
         That is the observer's origin seen from what it observes, or a point of that seen from it.
 
         Args:
-            slopes: (k, 6, p) of the poses, on their right.
             poses: (k, 4, 4) `observer_from_observed`.
+            slopes: (k, 6, p) their right perturbations.
             at: (3,) the point of what is observed, in its frame [m].
 
         Returns:

@@ -22,14 +22,15 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
+from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
-from visioncal.estimation.closure import Edges, Noise
+from visioncal.estimation.closure import Noise
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.problem import ROBOT, Effect, Problem, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
-from visioncal.estimation.workspace import pose_slopes, postures, tool_slopes
+from visioncal.estimation.workspace import postures
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
@@ -366,17 +367,25 @@ def _of_workspace(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What counts of what the arm carries: its place seen from what stands still."""
     at = _inside(cell, workspace)
-    model, edges = _model(cell.robot, purpose), Edges(cell.x, cell.z, np.zeros(0))
     place = _mean_square(_workspace_slopes(cell, purpose, at))
-    turn = _mean_square(pose_slopes(model, edges, cell.mount, at)[:, :3])
+    turn = _mean_square(_arm_slopes(cell, purpose, at)[2][:, :3])
     return place, place, turn
 
 
 def _workspace_slopes(cell: PlanCell, purpose: Purpose, at: FloatArray) -> FloatArray:
     """(w, 3, 12 + a) how the places of what the arm carries move with edges and arm."""
-    model, edges = _model(cell.robot, purpose), Edges(cell.x, cell.z, np.zeros(0))
-    middle = corner_positions(cell.target).mean(axis=0)
-    return tool_slopes(model, edges, cell.mount, middle, at)
+    pair, poses, slopes = _arm_slopes(cell, purpose, at)
+    return pair.place_slopes(poses, slopes, corner_positions(cell.target).mean(axis=0))
+
+
+def _arm_slopes(
+    cell: PlanCell, purpose: Purpose, at: FloatArray
+) -> tuple[ArmPair, FloatArray, FloatArray]:
+    """The camera and the board, and their (w, 4, 4) poses with slopes (w, 6, 12 + a)."""
+    model, flange = _model(cell.robot, purpose), cell.robot.base_from_flange(at)
+    problem = chain(cell.mount, flange[:1], cell.cam_from_target(at[:1]))
+    pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), ROBOT)
+    return pair, *pair.slopes(flange, model.basis(at))
 
 
 def _inside(cell: PlanCell, workspace: Box | None) -> FloatArray:

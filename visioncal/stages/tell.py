@@ -268,12 +268,11 @@ def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
 
 def _place_slopes(arm: ArmData, q: FloatArray) -> FloatArray:
     """How the place of what the flange carries moves with the chain's unknowns, (k, 3, f + p)."""
-    pair = arm.pair
-    linear, poses = pair.at(arm.model.base_from_flange(q))
+    poses, moved = arm.pair.slopes(arm.model.base_from_flange(q), arm.basis(q))
+    edges = moved.shape[2] - len(arm.columns)
     slopes = np.zeros((len(q), 6, arm.problem.size))
-    slopes[:, :, : linear.size] = linear.jacobian
-    slopes[:, :, arm.columns] = linear.by_errors @ arm.basis(q)
-    return pair.place_slopes(slopes[:, :, arm.chain], poses, arm.at)
+    slopes[:, :, :edges], slopes[:, :, arm.columns] = moved[:, :, :edges], moved[:, :, edges:]
+    return arm.pair.place_slopes(poses, slopes[:, :, arm.chain], arm.at)
 
 
 def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
