@@ -9,7 +9,7 @@ from visioncal.errors import DegenerateError
 from visioncal.stages.pairwise import Candidates, parted, trimmed
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import rotations
-from visioncal.types import FloatArray, IntArray, Rejection, Target
+from visioncal.types import FloatArray, IntArray, Mask, Rejection, Target
 
 # A rival that closes the chain within this many times the chosen one's distance is as likely.
 CLEAR_RATIO = 3.0
@@ -46,14 +46,8 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
         return Choice(tuple(chosen(view, 0, target) for view in views), ())
     candidates, turns = Candidates.of(views), len(set(views[0].turns))
     picks = _as_the_first(_settled(robot, candidates), turns)
-    distance = parted(robot, candidates, np.arange(len(views)), picks).away
-    best = distance[np.arange(len(views)), picks]
-    others = distance.copy()
-    others[np.arange(len(views)), picks] = np.inf
-    typical = np.median(best)
-    unclear = others.min(axis=1) < CLEAR_RATIO * np.maximum(best, typical)
-    # A view far from all others with any of its poses is wrong, which is for the verdict to say.
-    unclear &= best < CLEAR_RATIO**2 * typical
+    away = parted(robot, candidates, np.arange(len(views)), picks).away
+    unclear = has_rival(away, float(np.median(away.min(axis=1))))
     if unclear.sum() > len(views) / 2:
         raise DegenerateError(
             f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
@@ -74,6 +68,21 @@ def choose_poses(views: Sequence[ViewPoses], robot: FloatArray, target: Target |
             if it
         ),
     )
+
+
+def has_rival(away: FloatArray, typical: float) -> Mask:
+    """(m,) for which views another pose is as likely as the nearest.
+
+    A view that is far from all others with any of its poses is wrong, which is for others to say.
+
+    Args:
+        away: (m, k) distances of their poses from the prediction [m].
+        typical: Distance of a sound view's pose [m].
+    """
+    ordered = np.sort(away, axis=1)
+    best, second = ordered[:, 0], ordered[:, 1:].min(axis=1, initial=np.inf)
+    near = best < CLEAR_RATIO**2 * typical
+    return np.asarray(near & (second < CLEAR_RATIO * np.maximum(best, typical)))
 
 
 def choose_by(view: ViewPoses, predicted: FloatArray, target: Target | None) -> ViewPoses:

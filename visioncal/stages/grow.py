@@ -15,10 +15,10 @@ import numpy as np
 from visioncal.stages.choose import CLEAR_RATIO
 from visioncal.stages.pairwise import FEWEST, consensus, hand_eye
 from visioncal.stages.placing import placed_by_points
-from visioncal.stages.sighted import Growth, Pair
+from visioncal.stages.sighted import Factor, Growth, factors_of, product_of
 from visioncal.stages.twoarms import between_arms
 from visioncal.transforms import invert
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import FloatArray
 
 # A view that is farther off than this says nothing more about which start is right [m].
 _FAR_M = 0.1
@@ -108,13 +108,13 @@ def _implied(
     """Frames that are all that is not placed of what some views have to do with."""
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
-        factors = _factors(growth, pair, rows)
+        factors = factors_of(growth, pair, rows)
         missing = [it for it in factors if it.frame and it.frame not in placed]
         if len(missing) != 1:
             continue
         (it,) = missing
         at = factors.index(it)
-        before, after = (_product(part, placed) for part in (factors[:at], factors[at + 1 :]))
+        before, after = (product_of(part, placed) for part in (factors[:at], factors[at + 1 :]))
         there = growth.sighted.candidates.take(rows).carried(invert(before), invert(after))
         if it.is_inverse:
             there = replace(there, poses=invert(there.poses))
@@ -134,7 +134,7 @@ def _parted(
     """
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
-        factors = _factors(growth, pair, rows)
+        factors = factors_of(growth, pair, rows)
         open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
         if len(rows) < FEWEST or len(open_ones) not in (2, 3):
             continue
@@ -143,7 +143,7 @@ def _parted(
         if not all(any(not it.frame for it in part) for part in inner):
             continue
         parts = [
-            _product(factors[begin + 1 : end], placed)
+            product_of(factors[begin + 1 : end], placed)
             for begin, end in pairwise([-1, *open_ones, len(factors)])
         ]
         there = growth.sighted.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
@@ -157,41 +157,9 @@ def _parted(
             yield _as_placed(factors[open_ones[1]], *middle)
 
 
-def _as_placed(
-    factor: "_Factor", matrix: FloatArray, sigma_m: float
-) -> tuple[str, FloatArray, float]:
+def _as_placed(factor: Factor, matrix: FloatArray, sigma_m: float) -> tuple[str, FloatArray, float]:
     there = invert(matrix) if factor.is_inverse else matrix
     return factor.frame, there[None], sigma_m
-
-
-@dataclass(frozen=True, eq=False)
-class _Factor:
-    """A part of a chain: where a frame is in its body, or a robot's poses (m, 4, 4)."""
-
-    frame: str
-    robot: FloatArray
-    is_inverse: bool
-
-
-def _factors(growth: Growth, pair: Pair, rows: IntArray) -> list[_Factor]:
-    """The chain `seer_from_seen` by bodies."""
-    stops = growth.sighted.stops[rows]
-    none = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
-    chain = [_Factor(pair.seer, none, True)]
-    for step in pair.robots:
-        robot = growth.poses[step.robot][stops]
-        base = _Factor(growth.tree.branches[step.frame].parent, none, step.is_up)
-        flange = _Factor("", robot, step.is_up)
-        chain += [flange, base] if step.is_up else [base, flange]
-    return [*chain, _Factor(pair.seen, none, False)]
-
-
-def _product(factors: Sequence[_Factor], placed: Mapping[str, FloatArray]) -> FloatArray:
-    product = np.eye(4)[None]
-    for it in factors:
-        matrix = it.robot @ placed[it.frame] if it.frame else it.robot
-        product = product @ (invert(matrix) if it.is_inverse else matrix)
-    return product
 
 
 def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
@@ -199,8 +167,8 @@ def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
     away = []
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
-        factors = _factors(growth, pair, rows)
+        factors = factors_of(growth, pair, rows)
         if all(it.frame in placed for it in factors if it.frame):
-            distances = growth.sighted.candidates.take(rows).distances(_product(factors, placed))
+            distances = growth.sighted.candidates.take(rows).distances(product_of(factors, placed))
             away.append(np.minimum(distances.min(axis=1), _FAR_M))
     return float(np.concatenate(away).mean()) if away else 0.0

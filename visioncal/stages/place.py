@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.errors import DegenerateError
 from visioncal.estimation.observability import FEWEST_VIEWS
-from visioncal.stages.choose import CLEAR_RATIO, Choice, choose_by, choose_poses
+from visioncal.stages.choose import Choice, choose_by, choose_poses, has_rival
 from visioncal.stages.pairwise import Candidates, consensus, trimmed
 from visioncal.stages.pnp import ViewPoses
 from visioncal.transforms import invert
@@ -108,10 +108,4 @@ def _place_of(
     if len(views) == 1:
         # It has nothing that speaks for one of its poses.
         return z, np.array([np.sum(candidates.valid & (candidates.turns == 0)) == 1])
-    ordered = np.sort(candidates.distances(z[None]), axis=1)
-    limit = CLEAR_RATIO * max(away, typical)
-    # A view far from all others with any of its poses is wrong, which is for others to say.
-    rival = np.zeros(len(views), dtype=bool)
-    if ordered.shape[1] > 1:
-        rival = ordered[:, 1] < np.maximum(limit, CLEAR_RATIO * ordered[:, 0])
-    return z, ~rival | (ordered[:, 0] > CLEAR_RATIO * limit)
+    return z, ~has_rival(candidates.distances(z[None]), max(away, typical))

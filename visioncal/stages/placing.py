@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.estimation.positions import Places, find_mounting
 from visioncal.estimation.procrustes import align, apply, spreads
-from visioncal.stages.sighted import Growth, Pair, Relation
+from visioncal.stages.sighted import Growth, Pair, Relation, factors_of, product_of
 from visioncal.transforms import compose, invert
 from visioncal.types import FloatArray
 
@@ -53,12 +53,11 @@ def placed_by_points(
     """Points that a placed instrument read, and instruments that read placed points."""
     open_seers: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
     for pair in growth.pointed:
-        bases = [growth.tree.branches[it.frame].parent for it in pair.robots]
-        if not all(it in placed for it in bases):
+        inner = factors_of(growth, pair, pair.rows)[1:-1]
+        if not all(it.frame in placed for it in inner if it.frame):
             continue
-        stops = growth.sighted.stops[pair.rows]
         read = growth.sighted.candidates.poses[pair.rows, 0, :3, 3]
-        body = _seer_from_body(growth, placed, pair)[stops]
+        body = product_of(inner, placed)
         if pair.seer in placed and pair.seen not in placed:
             seen = apply(invert(body), apply(placed[pair.seer][None], read[:, None]))
             yield pair.seen, compose(np.eye(3), np.median(seen[:, 0], axis=0))[None], _ROUGH_M
@@ -69,14 +68,3 @@ def placed_by_points(
         there, read = (np.concatenate(it) for it in zip(*parts, strict=True))
         if len(read) >= _FEWEST_POINTS and spreads(there)[0][1] > _SPREAD_M:
             yield seer, align(there, read)[None], _ROUGH_M
-
-
-def _seer_from_body(growth: Growth, placed: Mapping[str, FloatArray], pair: Pair) -> FloatArray:
-    """(s, 4, 4) where the seen one's body is in the seer's, stop by stop."""
-    stations = int(growth.sighted.stops.max()) + 1
-    product = np.broadcast_to(np.eye(4), (stations, 4, 4))
-    for step in pair.robots:
-        base = placed[growth.tree.branches[step.frame].parent]
-        pose = base @ growth.poses[step.robot][:stations]
-        product = product @ (invert(pose) if step.is_up else pose)
-    return product

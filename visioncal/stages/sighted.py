@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.estimation.tree import Step, Tree
 from visioncal.stages.pairwise import Candidates
+from visioncal.transforms import invert
 from visioncal.types import FloatArray, IntArray, Mask
 
 # The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
@@ -112,3 +113,34 @@ class Growth:
     def pointed(self) -> tuple[Pair, ...]:
         """The pairs of which places alone were read."""
         return tuple(it for it in self.pairs if self.sighted.places[it.rows[0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """A part of a chain: where a frame is in its body, or a robot's poses (m, 4, 4)."""
+
+    frame: str
+    robot: FloatArray
+    is_inverse: bool
+
+
+def factors_of(growth: Growth, pair: Pair, rows: IntArray) -> list[Factor]:
+    """The chain `seer_from_seen` by bodies."""
+    stops = growth.sighted.stops[rows]
+    none = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
+    chain = [Factor(pair.seer, none, True)]
+    for step in pair.robots:
+        robot = growth.poses[step.robot][stops]
+        base = Factor(growth.tree.branches[step.frame].parent, none, step.is_up)
+        flange = Factor("", robot, step.is_up)
+        chain += [flange, base] if step.is_up else [base, flange]
+    return [*chain, Factor(pair.seen, none, False)]
+
+
+def product_of(factors: Sequence[Factor], placed: Mapping[str, FloatArray]) -> FloatArray:
+    """Their product (m, 4, 4) with the frames where they are placed; (1, 4, 4) of no robot."""
+    product = np.eye(4)[None]
+    for it in factors:
+        matrix = it.robot @ placed[it.frame] if it.frame else it.robot
+        product = product @ (invert(matrix) if it.is_inverse else matrix)
+    return product
