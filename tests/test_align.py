@@ -439,3 +439,29 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
     np.testing.assert_allclose(
         cell.compliance, [it["compliance_rad_per_nm"] for it in cell.stages["elastic"]["joints"]]
     )
+
+
+def reported(cell, robot, poses):
+    """A session in which one robot reports other poses, and what was seen in its images."""
+    told = {**cell.base_from_flange, robot: poses}
+    session = network_session(replace(cell, base_from_flange=told), "cell", seen="names")
+    return session, {it.view: it for it in cell.corners}
+
+
+def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
+    cell = simulate_network(NetworkOptions(stops=40))
+    share = np.linspace(-0.5, 0.5, 40)[:, None]
+    crept = exp(share * np.array([0, 0, 0, 0, 6e-4, 0])) @ cell.base_from_flange["a"]
+    session, corners = reported(cell, "a", crept)
+    (said,) = [it for it in align(session, corners=corners).verdict.reasons if "drift" in it]
+    assert said.startswith("Robot a: residuals drift with time")
+    # Forty stops that repeat to 0.03 mm leave some 0.03 mm of what crept by 0.6 mm.
+    assert float(said.split("moved by ")[1].split(" mm")[0]) == pytest.approx(0.6, abs=0.1)
+    rng = np.random.default_rng(1)
+    alike = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 4, axis=0)
+    session, corners = reported(cell, "b", cell.base_from_flange["b"] @ exp(alike))
+    found = align(session, corners=corners)
+    assert any(it.startswith("Robot b: neighbouring stops") for it in found.verdict.reasons)
+    assert not any(it.startswith("Robot a:") for it in found.verdict.reasons)
+    _, squared = off(cell, found, "base_a", "base_b")
+    assert squared < 22.0
