@@ -11,12 +11,15 @@ from visioncal.estimation import joint
 from visioncal.estimation.closure import (
     Closure,
     fit_closure,
-    normal_equations,
-    residual_blocks,
     solve_closure,
 )
 from visioncal.estimation.problem import ROBOT, Effect
-from visioncal.estimation.solve import RATIO_PRIOR, left_out_residuals, robot_likelihood
+from visioncal.estimation.solve import (
+    RATIO_PRIOR,
+    left_out_residuals,
+    normal_equations,
+    robot_likelihood,
+)
 from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -34,11 +37,12 @@ def answered(given, **changes):
 def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
     data, fit = answered(given, views=12, seed=3)
     predicted = left_out_residuals(data.problem, fit.edges.state, fit.noise.levels)
-    spread = residual_blocks(data, fit.edges, fit.noise)[2]
+    linear = data.problem.linear(fit.edges.state)
+    spread = data.problem.total_covariance(linear, fit.noise.levels)
     for view in range(12):
         others = np.arange(12) != view
         without, _ = solve_closure(data.subset(others), fit.edges, fit.noise)
-        refitted = residual_blocks(data, without, fit.noise)[0][view]
+        refitted = data.problem.linear(without.state).residuals[view]
         sigma = np.sqrt(np.diagonal(spread[view]))
         # To first order: what is left is the curvature over a step of the size of the noise.
         np.testing.assert_allclose(predicted[view], refitted, atol=0.01 * sigma.max())
@@ -66,8 +70,8 @@ def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
     twice, stops = doubled(data)
     merged = twice.merged(stops)
     for expected, seen in zip(
-        normal_equations(data, once, fit.noise),
-        normal_equations(merged, once, fit.noise),
+        normal_equations(data.problem, once.state, fit.noise.levels),
+        normal_equations(merged.problem, once.state, fit.noise.levels),
         strict=True,
     ):
         # The same sums in another order.

@@ -14,7 +14,6 @@ from visioncal.estimation.closure import (
     Closure,
     Edges,
     Noise,
-    closure_jacobian,
     estimate_noise,
     fit_closure,
     solve_closure,
@@ -68,7 +67,7 @@ def test_jacobian_agrees_with_central_differences(mount):
     effect = Effect.free("any", known, by_camera, {ROBOT: by_flange})
     data = made_up(some_motion(5), x, z, Noise(0.05, 0.02), mount=mount).with_more(effect)
     edges = Edges(x, z, np.zeros(3))
-    analytic, step = closure_jacobian(data, edges), 1e-6
+    analytic, step = data.problem.linear(edges.state).jacobian, 1e-6
     for axis in range(15):
         shift = np.zeros(15)
         shift[axis] = step
@@ -151,7 +150,7 @@ def test_the_fit_is_the_least_squares_solution_from_far_starts_too():
     # The cost is settled to 1e-10 of itself, the edges to 1e-5 of their sigma of about 1e-4.
     np.testing.assert_allclose(far.x, near.x, atol=1e-8)
     np.testing.assert_allclose(far.z, near.z, atol=1e-8)
-    jacobian = closure_jacobian(data, near)
+    jacobian = data.problem.linear(near.state).jacobian
     residuals = log(invert(near.z) @ data.placed(near.x))
     weights = np.repeat(NOISE.sigmas**-2.0, 3)
     gradient = np.einsum("mij,i,mi->j", jacobian, weights, residuals)
@@ -319,7 +318,7 @@ def test_covariance_moves_with_its_frame():
     cell = simulate(exact(CellOptions(seed=6, views=4)))
     data = closure_of(cell)
     x, z = cell.transforms.values()
-    jacobian = closure_jacobian(data, Edges(x, z, HELD))
+    jacobian = data.problem.linear(Edges(x, z, HELD).state).jacobian
     np.testing.assert_allclose(jacobian[:, :, :6], adjoint(invert(data.camera)), atol=1e-9)
     np.testing.assert_allclose(jacobian[:, :, 6:], np.tile(-np.eye(6), (4, 1, 1)), atol=1e-9)
 

@@ -8,7 +8,6 @@ from visioncal.dynamics.base import BaseModel, random_motion
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.regression import Block
 from visioncal.errors import DegenerateError
-from visioncal.estimation.linalg import spectrum
 from visioncal.files import some_of
 from visioncal.types import FloatArray
 
@@ -87,18 +86,6 @@ def untold(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
     null = np.flatnonzero(values < _UNTOLD)
     shares = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1))
     return [int(it) for it in np.flatnonzero(shares > _SHARE)]
-
-
-def scaled_condition(blocks: Sequence[Block]) -> tuple[float, float]:
-    """Condition of the regressor with columns of unit length, and as it is."""
-    rows = np.concatenate([it.x.reshape(-1, it.x.shape[2]) for it in blocks])
-    information = rows.T @ rows
-    ratio = spectrum(information).ratio
-    raw = np.linalg.eigvalsh(information)
-    return (
-        float(1.0 / np.sqrt(max(ratio, 1e-30))),
-        float(np.sqrt(raw[-1] / max(raw[0], 1e-30 * raw[-1]))),
-    )
 
 
 def _usual(base: BaseModel) -> FloatArray:

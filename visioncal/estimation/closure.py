@@ -37,9 +37,6 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
-from visioncal.estimation.solve import (
-    normal_equations as information_and_gradient,
-)
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import exp, invert, log, mean_transform, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount
@@ -289,17 +286,6 @@ def solve_closure(data: Closure, edges: Edges, noise: Noise) -> tuple[Edges, boo
     return _edges(state), settled
 
 
-def closure_jacobian(data: Closure, edges: Edges) -> FloatArray:
-    """Derivatives (m, 6, 12 + k) of the residuals by the unknowns' steps: x, z, shared."""
-    return data.problem.linear(edges.state).jacobian
-
-
-def flange_to_residual(data: Closure, edges: Edges) -> FloatArray:
-    """How a small motion of each view's flange moves its residual, (m, 6, 6)."""
-    loose = replace(data.problem, is_combined=False)
-    return loose.linear(edges.state).by_errors
-
-
 def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
     """Fisher information (12 + k, 12 + k) on the unknowns.
 
@@ -308,38 +294,6 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
     """
     found = fisher_information(data.problem, edges.state, noise.levels)
     return np.asarray(found + np.diag(np.where(data.problem.counted, 0.0, _CHOSEN)))
-
-
-def held_shift(data: Closure, edges: Edges, noise: Noise) -> FloatArray:
-    """How far the answer (12 + k,) would move if what is anchored moved as well, to first order.
-
-    What is held is wrong by what is open about it, and by how far the data pull at it: beside the
-    covariance, which counts the former, the square of this shift is the error of holding.
-    """
-    problem, shift = data.problem, np.zeros(12 + len(edges.shared))
-    held = problem.counted & ~problem.moving
-    if not held.any():
-        return shift
-    still = replace(edges, shared=np.where(held[12:], 0.0, edges.shared))
-    pull = normal_equations(data, still, noise)[1]
-    shift[held] = pull[held]
-    return np.asarray(-covariance(closure_information(data, edges, noise)) @ shift)
-
-
-def normal_equations(data: Closure, edges: Edges, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Information (12 + k, 12 + k) and gradient (12 + k,) of half the whitened squared error."""
-    problem = data.problem
-    information, gradient = information_and_gradient(problem, edges.state, noise.levels)
-    scale = np.maximum(np.diag(information), 1.0)
-    return information + np.diag(np.where(problem.moving, 0.0, _CHOSEN * scale)), gradient
-
-
-def residual_blocks(
-    data: Closure, edges: Edges, noise: Noise
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (m, 6), their derivatives (m, 6, 12 + k) and their covariances (m, 6, 6)."""
-    linear = data.problem.linear(edges.state)
-    return linear.residuals, linear.jacobian, data.problem.total_covariance(linear, noise.levels)
 
 
 def estimate_noise(data: Closure, edges: Edges) -> Noise:

@@ -170,16 +170,6 @@ def _seen(known: Known) -> Known:
     return known
 
 
-def _of_one_board(known: Known) -> Known:
-    """Leaves the views of one board, the one with the most: poses of others do not compare."""
-    shown = [it.board for it in known.poses.values()]
-    if len(set(shown)) < 2:
-        return known
-    board = max(sorted(set(shown)), key=shown.count)
-    poses = {view: it for view, it in known.poses.items() if it.board == board}
-    return replace(known, poses=poses)
-
-
 def _seen_ways(seen: Known, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     """The camera's poses as the declared robot would have them, and then by the images alone.
 

@@ -16,7 +16,6 @@ from visioncal.estimation.closure import (
     closure_information,
     estimate_noise,
     fit_closure,
-    held_shift,
     solve_closure,
 )
 from visioncal.estimation.linalg import covariance
@@ -28,6 +27,8 @@ from visioncal.estimation.observability import (
     title,
 )
 from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.solve import Solution as Solved
+from visioncal.estimation.solve import held_shift
 from visioncal.solvers import SOLVERS
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert
@@ -119,7 +120,8 @@ def solve_hand_eye(
             fit = ClosureFit(edges, estimate_noise(data, edges))
         check_observability(data, fit.edges, fit.noise, boards, looks)
         # Away from its rest a closed form is pulled by more than what is held.
-        shift = held_shift(data, fit.edges, fit.noise) * float(solver == "joint")
+        rest = Solved(fit.edges.state, fit.noise.levels)
+        shift = held_shift(data.problem, rest) * float(solver == "joint")
         spread = covariance(closure_information(data, fit.edges, fit.noise))
         spread = spread + np.outer(shift, shift)
         if arm is not None and not arm.is_estimated:
