@@ -184,7 +184,7 @@ class Compressed:
         information: (v, 6, 6) on each pose's right perturbation.
         by_shared: (v, 6, k) how each pose moves with the appearance.
         shared_information: (k, k) on the appearance, the poses being free.
-        shared_pull: (k,) half the gradient of the squared error by the appearance.
+        shared_pulls: (v, k) half the gradient of the squared error by the appearance.
         residuals: (n, 2) [px].
     """
 
@@ -192,8 +192,13 @@ class Compressed:
     information: FloatArray
     by_shared: FloatArray
     shared_information: FloatArray
-    shared_pull: FloatArray
+    shared_pulls: FloatArray
     residuals: FloatArray
+
+    @property
+    def shared_pull(self) -> FloatArray:
+        """(k,) that of all views together."""
+        return np.asarray(self.shared_pulls.sum(axis=0))
 
 
 def compress(
@@ -221,9 +226,8 @@ def compress(
     found = compress_points(bent, appearance.camera, starts, shape, shares=shares)
     # A larger board farther away looks the same: what is left is rounding.
     if scales is not None:
-        information, pull = found.shared_information, found.shared_pull
-        information[scales] = information[:, scales] = 0.0
-        pull[scales] = 0.0
+        information = found.shared_information
+        information[scales] = information[:, scales] = found.shared_pulls[:, scales] = 0.0
     return found
 
 
@@ -260,12 +264,12 @@ def compress_points(
         left, residuals = roots[..., None] * left, roots * residuals
     flat = left.reshape(-1, left.shape[2])
     information = flat.T @ flat
-    pull = flat.T @ residuals.reshape(-1)
+    pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
     return Compressed(
         fit.cam_from_target,
         fit.information,
         answer,
         information,
-        pull,
+        pulls,
         now.residuals,
     )

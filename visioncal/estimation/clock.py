@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.chance import f_limit
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
-from visioncal.estimation.joint import chance_limit
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance, gram
 from visioncal.estimation.outliers import closed_form
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import Solution, fisher_information, fit_problem
@@ -28,6 +28,8 @@ from visioncal.types import Camera, FloatArray, IntArray, Mask
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4
 # So many tell times within images well enough: each has dozens of corners.
 _MOST_DELAYED = 400
+# Times within images are there by chance in one sweep of ten thousand.
+_FALSE_ALARM = 1e-4
 _ROUNDS, _SETTLED_S = 12, 1e-7
 # Frames that are off by so many times what is typical are wrong ones.
 _OUTLYING = 4.0
@@ -63,17 +65,20 @@ class DelayedFit:
         delays: The effects.
         times_s: (k,) their times [s].
         sigmas_s: (k,) the standard deviations of these [s].
+        freedom: How many degrees of freedom these were estimated with.
     """
 
     clock: ClockFit
     delays: tuple[Delay, ...]
     times_s: FloatArray
     sigmas_s: FloatArray
+    freedom: float
 
     @property
     def is_clear(self) -> Mask:
         """(k,) which of the times are beyond chance."""
-        return np.asarray((self.times_s / self.sigmas_s) ** 2 > chance_limit(1))
+        limit = f_limit(_FALSE_ALARM, 1, self.freedom)
+        return np.asarray((self.times_s / self.sigmas_s) ** 2 > limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +89,16 @@ class _Late:
     delays: tuple[Delay, ...]
     times_s: FloatArray
 
-    def problem(self, robot: Trajectory, frames: Frames, offset_s: float, state: State) -> Problem:
-        """The problem of some frames, with changes of the offset and of the times [s]."""
+    def problem(
+        self, robot: Trajectory, frames: Frames, offset_s: float, state: State
+    ) -> tuple[Problem, FloatArray]:
+        """The problem of some frames, with changes of the offset and of the times [s].
+
+        With it, (m, k) half the gradient of each frame's corners by the times, its pose being free.
+        """
         stack = frames.stack
         if self.camera is None or stack is None:
-            return clock_problem(robot, frames, offset_s)
+            return clock_problem(robot, frames, offset_s), np.zeros((len(frames), 0))
         at_s, poses = frames.stamps_s - offset_s, frames.cam_from_target
         flange, speeds = robot.at(at_s), robot.speeds(at_s)
         moved = target_twists(frames.mount, flange, state.edges[0], poses, speeds)
@@ -101,13 +111,14 @@ class _Late:
             weight * seen.shared_information + np.diag(prior),
             weight * seen.shared_pull + prior * self.times_s,
         )
-        return chain(
+        problem = chain(
             frames.mount,
             flange,
             seen.cam_from_target,
             covariance(weight * seen.information),
             effects=[clock_effect(speeds), Effect.free("delays", known, seen.by_shared)],
         )
+        return problem, weight * seen.shared_pulls
 
 
 def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tuple[ClockFit, ...]:
@@ -194,7 +205,7 @@ def _fitted(
         return None
     late, clock = replace(late, times_s=found.times_s), found.clock
     near = _covered(robot, frames, clock.offset_s)
-    sound = _sound(late.problem(robot, near, clock.offset_s, clock.fit.state), clock.fit)
+    sound = _sound(late.problem(robot, near, clock.offset_s, clock.fit.state)[0], clock.fit)
     if sound.all():
         return found
     return _settled(robot, near.only(sound), clock.offset_s, clock.fit.state, late)
@@ -213,7 +224,7 @@ def _settled(
             start = closed_form(clock_problem(robot, near, offset_s), first)
         if start is None:
             raise RuntimeError("no closed form gives a start")
-        problem = late.problem(robot, near, offset_s, start)
+        problem, pulls = late.problem(robot, near, offset_s, start)
         found = fit_problem(problem, State(start.edges, problem.start_values))
         # A step farther than angles are compared over is a slope that misleads.
         step_s = np.clip(found.state.values, -WINDOW_S, WINDOW_S)
@@ -222,9 +233,9 @@ def _settled(
         if np.abs(step_s).max() < _SETTLED_S:
             break
     fit = replace(found, state=State(found.state.edges, problem.start_values))
-    sigmas_s = _sigmas_s(problem, fit, near.stamps_s)
+    sigmas_s, freedom = _sigmas_s(problem, fit, near.stamps_s, pulls)
     clock = ClockFit(offset_s, float(sigmas_s[0]), fit, len(near))
-    return DelayedFit(clock, late.delays, late.times_s, sigmas_s[1:])
+    return DelayedFit(clock, late.delays, late.times_s, sigmas_s[1:], freedom)
 
 
 def _covered(robot: Trajectory, frames: Frames, offset_s: float) -> Frames:
@@ -252,12 +263,14 @@ def _sound(problem: Problem, fit: Solution) -> Mask:
     return np.asarray(squares <= _OUTLYING**2 * float(np.median(squares)))
 
 
-def _sigmas_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> FloatArray:
-    """Standard deviations of the offset and of times: the larger of two each.
+def _sigmas_s(
+    problem: Problem, fit: Solution, stamps_s: FloatArray, pulls: FloatArray
+) -> tuple[FloatArray, float]:
+    """Standard deviations of the offset and of times, the larger of two each, and their freedom.
 
     One takes the errors of all frames for independent. The other takes those of a stretch of time
     together, as they are: where a lens or an arm errs the same for a while, it is the honest one
-    (Liang and Zeger 1986, the sandwich over clusters).
+    (the jackknife over clusters; Bell and McCaffrey 2002).
     """
     # A direction without information has a very large variance here.
     spread = covariance(fisher_information(problem, fit.state, fit.noise))
@@ -265,12 +278,17 @@ def _sigmas_s(problem: Problem, fit: Solution, stamps_s: FloatArray) -> FloatArr
     stretches = np.unique((stamps_s - stamps_s[0]) // _STRETCH_S, return_inverse=True)[1]
     count = int(stretches.max()) + 1
     if count < _FEWEST_STRETCHES:
-        return np.sqrt(independent)
+        return np.sqrt(independent), 6.0 * len(stamps_s)
     linear = problem.linear(fit.state)
     residuals, jacobian = linear.residuals, linear.jacobian
     blocks = problem.total_covariance(linear, fit.noise)
-    weighted = np.linalg.solve(blocks, residuals[:, :, None])[:, :, 0]
-    scores = np.zeros((count, jacobian.shape[2]))
-    np.add.at(scores, stretches, np.einsum("mij,mi->mj", jacobian, weighted))
-    together = spread @ (scores.T @ scores) @ spread * count / max(count - 1, 1)
-    return np.asarray(np.sqrt(np.maximum(independent, np.diag(together)[12:])))
+    weighted = np.linalg.solve(blocks, np.concatenate([jacobian, residuals[:, :, None]], axis=2))
+    information, moved = covariance(spread), np.zeros((count, jacobian.shape[2]))
+    for stretch in range(count):
+        mine = stretches == stretch
+        both = gram(jacobian[mine], weighted[mine])
+        both[len(both) - pulls.shape[1] :, -1] += pulls[mine].sum(axis=0)
+        # Without the stretch: its own leverage would hide how far it is off.
+        moved[stretch] = covariance(information - both[:, :-1]) @ both[:, -1]
+    together = moved.T @ moved * (count - 1) / count
+    return np.sqrt(np.maximum(independent, np.diag(together)[12:])), count - 1.0
