@@ -132,6 +132,7 @@ def find_arm_errors(
     basis: FloatArray,
     *,
     of_links: bool,
+    white: tuple[FloatArray, float] | None = None,
 ) -> ArmErrors | None:
     """Estimates the size of the errors of one robot's arm, where they are significant.
 
@@ -142,13 +143,14 @@ def find_arm_errors(
         robot: The robot.
         basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
         of_links: Whether it is of this arm's links.
+        white: What `robot_levels` from above gives without these errors; None to seek it.
 
     Returns:
         The errors; None where white noise explains the residuals about as well.
     """
     if len(stops_of(problem, robot)) < _FEWEST_STOPS:
         return None
-    levels, white = robot_levels(problem, state, noise, from_above=True)
+    levels, unlikely = white or robot_levels(problem, state, noise, from_above=True)
     size = basis.shape[2]
     freely = Knowledge(np.zeros((size, size)), np.zeros(size))
     effect = replace(ArmErrors(basis, 1.0, 0.0, of_links).effect(robot), known=freely)
@@ -156,7 +158,7 @@ def find_arm_errors(
     still = State(state.edges, np.concatenate([state.values, np.zeros(size)]))
     likelihood = robot_likelihood(widened, still, noise)
     sigma, value = _most_likely_size(likelihood, size, levels)
-    gain = 2.0 * (white - value)
+    gain = 2.0 * (unlikely - value)
     return ArmErrors(basis, sigma, gain, of_links) if gain > _LIKELY else None
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from visioncal.estimation.arm import ArmErrors, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
-from visioncal.estimation.problem import Problem, State
-from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals
+from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals, robot_levels
 from visioncal.types import FloatArray, Mask
 
 
@@ -83,14 +83,17 @@ class ArmTrials:
         state: Where to start.
         robot: The robot.
         bases: (s, 6, p) by stop, columns of each block of errors by its name.
+        noise: The noise's levels to start from; those from above where None.
     """
 
     problem: Problem
     state: State
     robot: str
     bases: Mapping[str, FloatArray]
+    noise: Noise | None = None
     _fits: dict[tuple[ArmErrors, ...], Solution] = field(default_factory=dict)
-    _found: dict[tuple[object, ...], ArmErrors | None] = field(default_factory=dict)
+    _white: dict[tuple[ArmErrors, ...], tuple[FloatArray, float]] = field(default_factory=dict)
+    _found: dict[tuple[int, tuple[ArmErrors, ...]], ArmErrors | None] = field(default_factory=dict)
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
         """The observations with errors of the arm among the unknowns."""
@@ -102,19 +105,23 @@ class ArmTrials:
         key = tuple(errors.values())
         if key not in self._fits:
             problem, fewer = self.erring(errors), self._fits.get(key[:-1])
-            near = self.state if fewer is None else fewer.state
-            self._fits[key] = fit_problem(problem, State(near.edges, problem.start_values))
+            state, noise = (self.state, self.noise) if fewer is None else (fewer.state, fewer.noise)
+            start = State(state.edges, problem.start_values)
+            self._fits[key] = fit_problem(problem, start, noise)
         return self._fits[key]
 
     def found(self, among: Mapping[str, ArmErrors], basis: FloatArray) -> ArmErrors | None:
         """Looks for errors of one more block by its columns, which stay as long as this."""
-        key = (id(basis), *among.values())
-        if key not in self._found:
-            problem, fit = self.erring(among), self.fitted(among)
-            self._found[key] = find_arm_errors(
-                problem, fit.state, fit.noise, self.robot, basis, of_links=True
+        known = tuple(among.values())
+        if (id(basis), known) not in self._found:
+            fit = self.fitted(among)
+            fitted = (self.erring(among), fit.state, fit.noise)
+            if known not in self._white:
+                self._white[known] = robot_levels(*fitted, from_above=True)
+            self._found[id(basis), known] = find_arm_errors(
+                *fitted, self.robot, basis, of_links=True, white=self._white[known]
             )
-        return self._found[key]
+        return self._found[id(basis), known]
 
     def level(self, errors: Mapping[str, ArmErrors], gain: float) -> LevelFit:
         """Puts a level's fit together."""

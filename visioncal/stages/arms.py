@@ -225,7 +225,7 @@ class RobotArm:
         arm = replace(self, apart=apart)
         bases = {name: arm._columns(model, name) for name in blocks}
         start = State(fit.state.edges, problem.start_values)
-        found = choose_level(problem, start, self.robot, bases, asked)
+        found = choose_level(problem, start, self.robot, bases, asked, noise=fit.noise)
         arm = replace(arm, kinematics=found)
         return arm._bending(model.erring(found.errors)) if found.errors else arm
 

@@ -10,7 +10,7 @@ from visioncal.calibration import Rms
 from visioncal.errors import DataError
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, LevelFit, fit_level, resized
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.problem import Noise, Problem, State
 from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.figures import figure
 from visioncal.threads import one_blas_thread
@@ -96,6 +96,7 @@ def choose_level(
     bases: Mapping[str, FloatArray],
     asked: str,
     stated: Problem | None = None,
+    noise: Noise | None = None,
 ) -> Kinematics:
     """Chooses how much of a robot's arm to free.
 
@@ -110,9 +111,10 @@ def choose_level(
         asked: A key of `ASKED`.
         stated: The same observations with a lost zero where the model has it, where `problem` has
             it where it is; None where none is lost. Then offsets are what is taken at the least.
+        noise: The noise's levels to start from; those from above where None.
     """
     with one_blas_thread():
-        arm = ArmTrials(problem, state, robot, bases)
+        arm = ArmTrials(problem, state, robot, bases, noise)
         fits = {NOMINAL: fit_level(arm)}
         fits |= {name: fit_level(arm, blocks) for name, blocks in LEVELS.items()}
         if stated is not None:
