@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from visioncal.estimation.agreement import agreeing_groups
-from visioncal.estimation.groups import Groups, fit_groups, small_sets
+from visioncal.estimation.groups import Groups, fit_groups
+from visioncal.estimation.robust import small_sets
 
 TRUTH = np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.4])
 SIGMA = 1e-4

@@ -5,11 +5,9 @@ covariance of a group is what is known of it beforehand, plus one unknown level 
 `known + sigma^2 I`, with sigma by restricted maximum likelihood.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
-from math import comb
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -23,12 +21,10 @@ from visioncal.estimation.variance import (
     estimate_sigmas,
     profile_interval,
 )
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import FloatArray, Mask
 
 State = TypeVar("State")
 
-# With 40 % of the groups wrong, all 60 sets of three contain a wrong one with probability 3e-7.
-_SETS = 60
 _ROUNDS = 10
 _SETTLED = 1e-10
 # Under this scaled eigenvalue ratio the groups do not determine a direction.
@@ -104,7 +100,7 @@ class GroupProblem(Protocol[State]):
     """What is to be fitted: the unknowns are a state, and steps of (p,) numbers move it."""
 
     def guesses(self) -> Iterable[State]:
-        """Gives starts: the first from all groups, more from small sets (see `small_sets`).
+        """Gives starts: the first from all groups, more from small sets (see `robust.small_sets`).
 
         Each must lie near the answer where its set is sound; others may be anywhere.
         """
@@ -167,15 +163,6 @@ class GroupFit(Generic[State]):
         return profile_interval(
             profile, self.sigma, profile(float(np.log(max(self.sigma, LEAST_SIGMA))))
         )
-
-
-def small_sets(count: int, size: int) -> Iterator[IntArray]:
-    """Gives sets of `size` of `count` groups: all that there are, or sixty by chance."""
-    if comb(count, size) <= _SETS:
-        yield from (np.array(rows) for rows in combinations(range(count), size))
-        return
-    rng = np.random.default_rng(0)
-    yield from (np.sort(rng.choice(count, size, replace=False)) for _ in range(_SETS))
 
 
 def fit_groups(

@@ -28,7 +28,14 @@ from visioncal.estimation.moves import (
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Noise, Problem, State
-from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
+from visioncal.estimation.robust import (
+    Distances,
+    half_of,
+    settled,
+    small_sets,
+    trimmed_start,
+    widened,
+)
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
@@ -45,8 +52,8 @@ _FALSE_ALARM = 1e-3
 # The earliest share of the stops, at the least, that the search begins with.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 _MOST_MOVES = 8
-# With 40 % of 20 views wrong, all 60 sets of three contain a wrong one with probability 3e-6.
-_SETS, _SET_SIZE = 60, 3
+# So many views determine both edges beside a robot.
+_SET_SIZE = 3
 # An observation is near within so much [m], or so many times the median.
 _NEAR_M, _FAR = 0.04, 6.0
 # Whatever robots err by more is wrong, and no noise [rad, m].
@@ -271,12 +278,8 @@ def _starts(problem: Problem, state: State | None) -> Iterator[State]:
     if state is not None:
         yield state
         return
-    rng = np.random.default_rng(0)
     count = len(problem)
-    for rows in (
-        np.arange(count),
-        *(rng.choice(count, _SET_SIZE, replace=False) for _ in range(_SETS)),
-    ):
+    for rows in (np.arange(count), *small_sets(count, _SET_SIZE)):
         if (found := closed_form(problem, rows)) is not None:
             yield found
 

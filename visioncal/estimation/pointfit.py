@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.chance import t_chance
 from visioncal.errors import DataError
 from visioncal.estimation.agreement import Agreement, agreeing_groups
-from visioncal.estimation.groups import GroupFit, Groups, fit_groups, small_sets
+from visioncal.estimation.groups import GroupFit, Groups, fit_groups
 from visioncal.estimation.numbering import Numbering, find_numbering
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
 from visioncal.estimation.placing import left_out_words, noise_words, refuse_poor, worst_directions
@@ -25,6 +25,7 @@ from visioncal.estimation.pointpairs import (
     tells_hand,
 )
 from visioncal.estimation.procrustes import align, apply, misfit, scale_between, spreads
+from visioncal.estimation.robust import small_sets
 from visioncal.transforms import exp, skew
 from visioncal.types import FloatArray, IntArray, Mask
 

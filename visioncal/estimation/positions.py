@@ -15,7 +15,7 @@ from visioncal.estimation.closure import Edges
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
 from visioncal.estimation.procrustes import align
-from visioncal.estimation.robust import half_of, trimmed_start
+from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 from visioncal.transforms import adjoint, compose, exp, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -23,9 +23,9 @@ from visioncal.types import FloatArray, IntArray, Mask
 UNTOLD = 1.0
 # A cost [m^2] that changes by less than this share of itself and of a square metre is at rest.
 _SETTLED = 1e-14
-# Sets of stops to start from, and how many: with 30 % of the stops wrong, all of them contain a
-# wrong one with probability 1e-5.
-_SET_SIZE, _SETS = 5, 60
+# Sets of stops to start from: with 30 % of the stops wrong, all sixty contain a wrong one with
+# probability 1e-5.
+_SET_SIZE = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,10 +158,9 @@ def _starts(places: Places, count: int) -> Iterator[Mask]:
     yield np.ones(len(places.stops), dtype=bool)
     if count <= _SET_SIZE:
         return
-    rng = np.random.default_rng(0)
     points = len(np.unique(places.points))
-    for _ in range(_SETS):
-        chosen = np.isin(places.stops, rng.choice(count, _SET_SIZE, replace=False))
+    for stops in small_sets(count, _SET_SIZE):
+        chosen = np.isin(places.stops, stops)
         if len(np.unique(places.points[chosen])) == points:
             yield chosen
 
