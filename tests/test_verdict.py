@@ -156,6 +156,15 @@ def test_a_run_of_wrong_views_is_told(numbers, words):
     assert reason.endswith(words) if words else "follow each other" not in reason
 
 
+def test_a_pair_of_which_all_views_are_left_out_is_told():
+    """As of one camera of several, which by itself has no view that the others could precede."""
+    found = left_out(range(20))
+    several = (replace(PAIR, name="left of floor"), replace(found.pairs[0], name="right of floor"))
+    reasons = judge(replace(found, pairs=several)).reasons
+    assert any(it.startswith("right of floor: views 0, 1, 2") for it in reasons)
+    assert not any("follow each other" in it for it in reasons)
+
+
 def test_a_reason_is_told_once():
     found = left_out(range(12, 20))
     reasons = judge(found).reasons

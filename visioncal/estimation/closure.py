@@ -298,14 +298,9 @@ def closure_information(data: Closure, edges: Edges, noise: Noise) -> FloatArray
 
 def estimate_noise(data: Closure, edges: Edges) -> Noise:
     """Estimates the noise's levels from the residuals at some edges."""
-    return noise_likelihood(data, edges)[0]
-
-
-def noise_likelihood(data: Closure, edges: Edges) -> tuple[Noise, float]:
-    """The noise's most likely levels, and their negative restricted log-likelihood."""
     problem = data.problem
-    levels, value = robot_levels(problem, edges.state, starting_noise(problem), from_above=True)
-    return _noise(replace(starting_noise(problem), robots=levels)), value
+    levels, _ = robot_levels(problem, edges.state, starting_noise(problem), from_above=True)
+    return _noise(replace(starting_noise(problem), robots=levels))
 
 
 def _edges(state: State) -> Edges:

@@ -345,7 +345,7 @@ def _run(pair: Pair) -> str:
     compared = [it.view for it in pair.views if it.used or it.view in out]
     first = compared.index(out[0])
     end = first + len(out)
-    if len(out) < _LEAST_RUN or compared[first:end] != out:
+    if len(out) < _LEAST_RUN or compared[first:end] != out or compared == out:
         return ""
     when = f"from view {out[0]} on" if first else f"before view {compared[end]}"
     if first and end < len(compared):
