@@ -278,11 +278,34 @@ place_m = [2.0, 0.0, 0.3]
 on = "a"
 place_m = [0.0, 0.1, 0.1]
 """
+SWEPT = """
+[[sweeps]]
+camera = "top"
+robot = "a"
+target = "plate"
+camera_minus_robot_s = 0.04
+stops = 5
+"""
 PUSHED = """
 [[moved]]
 frame = "target_plate"
 from_stop = 4
 """
+
+
+def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
+    (place / "swept.toml").write_text(OWN.replace("stops = 6", "stops = 12") + SWEPT)
+    folder = place / "swept-cell"
+    done("simulate", folder, "--cell", place / "swept.toml", "--no-images")
+    session = Session.load(folder)
+    assert "a" in session.streams
+    timed = [it for it in session.views if it.stamp_s is not None]
+    assert all(it.base_from_flange() is None for it in timed)
+    done("calibrate", folder, "-o", place / "swept-cell-out")
+    clocks = Alignment.load(place / "swept-cell-out").details["clocks"]
+    clock = clocks["cam_top and robot a"]
+    # Four sigma: one run in fifteen thousand.
+    assert abs(clock["camera_minus_robot_s"] - 0.04) < 4.0 * clock["sigma_s"] < 4e-3
 
 
 def test_the_readmes_cell_can_be_made(tmp_path):
@@ -315,16 +338,18 @@ def test_the_readmes_cell_can_be_made(tmp_path):
         ("place_m = [2.0, 0.0, 0.3]", "", "own.toml, instruments.tracker: place_m is missing"),
         ('"fine"', '"tele"', 'own.toml, cameras.top: camera is .tele.; "wide" or "fine"'),
         ("from_stop = 4", "from_stop = 6", "target_plate is pushed before stop 6; of 6 stops"),
+        ('robot = "a"', 'robot = "b"', 'own.toml, sweeps 1: robot is .b.; "a" is needed'),
+        ('camera = "top"', 'camera = "left"', "a sweep is of camera 'left'; there are top"),
         ("[[moved]]", "[moved]", r"own.toml: moved is .*; a table \[\[moved\]\] for each"),
         ("stops = 6", "share_seen = 2", "own.toml: share_seen is 2.0; a share above 0"),
         ('robot = "ur10e"', "sigma_m = -1e-5", "own.toml, robots.a: sigma_m is -1e-05; a number"),
     ],
 )
 def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, tmp_path):
-    assert old in OWN + PUSHED
-    (tmp_path / "own.toml").write_text((OWN + PUSHED).replace(old, new))
+    assert old in OWN + PUSHED + SWEPT
+    (tmp_path / "own.toml").write_text((OWN + PUSHED + SWEPT).replace(old, new))
     with pytest.raises(DataError, match=words.replace("[robots.NAME]", r"\[robots.NAME\]")):
-        read_cell(str(tmp_path / "own.toml"))
+        simulate_network(read_cell(str(tmp_path / "own.toml")))
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from visioncal.simulation.layout import (
     NetworkOptions,
     PointAt,
     RobotAt,
+    Swept,
 )
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session, write_network
@@ -80,6 +81,7 @@ __all__ = [
     "Sight",
     "Sweep",
     "SweepOptions",
+    "Swept",
     "Truth",
     "WarmUp",
     "WarmUpOptions",

@@ -21,12 +21,15 @@ from visioncal.simulation.layout import (
     NetworkOptions,
     PointAt,
     RobotAt,
+    Swept,
 )
 from visioncal.simulation.optics import CAMERAS
 from visioncal.simulation.options import TARGETS
 from visioncal.types import Camera, Target
 
-Thing: TypeAlias = RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | NetworkOptions
+Thing: TypeAlias = (
+    RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | Swept | NetworkOptions
+)
 _T = TypeVar("_T", bound=Thing)
 
 _FOLDER = Path(__file__).with_name("cells")
@@ -38,7 +41,7 @@ _KINDS: Mapping[str, tuple[type[Thing], str]] = {
     "instruments": (InstrumentAt, "instruments"),
     "points": (PointAt, "points"),
 }
-_TABLES = (*_KINDS, "moved")
+_TABLES = (*_KINDS, "moved", "sweeps")
 # A board that is bent by more than this is none [m].
 _MOST_BOW_M = 0.05
 # Whole numbers go up to this.
@@ -85,11 +88,18 @@ def read_cell(name_or_path: str) -> NetworkOptions:
             culprits=[f"{path.name}: points"],
             next_step="Add a table [instruments.NAME], or leave the points out.",
         )
-    pushed = document.get("moved", [])
-    if not isinstance(pushed, list):
-        raise Table(document, path.name).refuse("moved", pushed, "a table [[moved]] for each push")
-    moved = tuple(reader.read(Moved, row, f"moved {at}") for at, row in enumerate(pushed, start=1))
-    return reader.read(NetworkOptions, own, "", moved=moved, **things)
+    moved = _listed(reader, document, "moved", Moved, path.name)
+    sweeps = _listed(reader, document, "sweeps", Swept, path.name)
+    return reader.read(NetworkOptions, own, "", moved=moved, sweeps=sweeps, **things)
+
+
+def _listed(
+    reader: "_Reader", document: Mapping[str, Any], key: str, kind: type[_T], label: str
+) -> tuple[_T, ...]:
+    rows = document.get(key, [])
+    if not isinstance(rows, list):
+        raise Table(document, label).refuse(key, rows, f"a table [[{key}]] for each")
+    return tuple(reader.read(kind, row, f"{key} {at}") for at, row in enumerate(rows, start=1))
 
 
 def _shipped() -> dict[str, Path]:
@@ -146,19 +156,19 @@ class _Reader:
         needed = {it.name for it in fields(kind) if _has_no_default(it)}
         table = Table(row, label)
         values: dict[str, Any] = {
-            key: self._value(table, key, hint)
+            key: self._value(table, key, hint, kind)
             for key, hint in types.items()
             if key in row or key in needed
         }
         return kind(**values | given)
 
-    def _value(self, table: Table, key: str, hint: object) -> object:
+    def _value(self, table: Table, key: str, hint: object, kind: type) -> object:
         if hint is Camera:
             return CAMERAS[table.choice(key, tuple(CAMERAS))]()
         if hint is Target:
             return TARGETS[table.choice(key, tuple(TARGETS))]()
         if key == "robot":
-            return table.choice(key, ARMS)
+            return table.choice(key, self.carriers[1:] if kind is Swept else ARMS)
         if key == "on":
             return table.choice(key, self.carriers)
         if hint is bool:

@@ -48,6 +48,7 @@ class CameraAt:
         camera: Its optics.
         state_intrinsics: Whether the session states them.
         looks_at_m: The place at which one in the cell looks [m].
+        at_stops: Whether it takes images at the robots' stops, and not in sweeps alone.
     """
 
     name: str
@@ -56,6 +57,7 @@ class CameraAt:
     camera: Camera = field(default_factory=wide_camera)
     state_intrinsics: bool = True
     looks_at_m: tuple[float, float, float] = MIDDLE_M
+    at_stops: bool = True
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,31 @@ class Moved:
     turn_rad: float = 0.01
 
 
+@dataclass(frozen=True)
+class Swept:
+    """A camera that sees a target while a robot, which carries one of the two, moves.
+
+    Attributes:
+        camera: The camera.
+        robot: The robot, which goes through its stops on a smooth way.
+        target: The target.
+        camera_minus_robot_s: What the camera's clock is ahead of the robot's [s].
+        stops: Through how many of its stops the robot goes.
+        pace_s: How long it takes from one to the next [s].
+        frames_hz: Frames of the camera in a second.
+        readout_s: How long after an image's first row its last is taken [s].
+    """
+
+    camera: str
+    robot: str
+    target: str
+    camera_minus_robot_s: float = 0.0
+    stops: int = 10
+    pace_s: float = 1.7
+    frames_hz: float = 10.0
+    readout_s: float = 0.0
+
+
 def _two_robots() -> tuple[RobotAt, ...]:
     return RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))
 
@@ -165,6 +192,7 @@ class NetworkOptions:
         lens_views: Images of each camera that are of its lens alone, as the board is held by hand.
         pixel_sigma_px: Noise of the corners, per axis [px].
         moved: What is pushed in the course of the recording.
+        sweeps: What cameras see of robots in motion, after the stops.
         swapped_rows: Pairs of rows of one camera and board whose images are exchanged.
         stray_images: Rows whose image is from another stop.
         recording: Which recording of the same cell: each has stops and noise of its own.
@@ -181,6 +209,7 @@ class NetworkOptions:
     lens_views: int = 0
     pixel_sigma_px: float = 0.05
     moved: tuple[Moved, ...] = ()
+    sweeps: tuple[Swept, ...] = ()
     swapped_rows: int = 0
     stray_images: int = 0
     recording: int = 0
@@ -195,6 +224,9 @@ class NetworkOptions:
                     f"simulation: {moved.frame} is pushed before stop {moved.from_stop}; of "
                     f"{self.stops} stops the last is {self.stops - 1}."
                 )
+        swept = [it.robot for it in self.sweeps]
+        if len(set(swept)) < len(swept):
+            raise DataError("simulation: a robot moves in one sweep; in two its streams are one.")
         known = {CELL, *(it.name for it in self.robots)}
         on = [(it.name, it.on) for it in self.cameras]
         on += [(it.name, it.on) for it in self.boards] + [(it.name, it.on) for it in self.points]

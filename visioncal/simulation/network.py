@@ -24,6 +24,7 @@ from visioncal.simulation.seen import (
     with_faults,
 )
 from visioncal.simulation.standing import Stream, mounted, parents_of, postures, sheet_of, stream
+from visioncal.simulation.swept import sweep_network
 from visioncal.transforms import exp, invert
 from visioncal.types import Corners, FloatArray, IntArray, Target
 
@@ -65,7 +66,14 @@ def simulate_network(options: NetworkOptions) -> Network:
         told=(),
         wrong_views=(),
     )
-    return with_faults(_observed(cell))
+    cell = with_faults(_observed(cell))
+    for swept in options.sweeps:
+        taken = [it.view for it in cell.sights] + [it.view for it in cell.readings]
+        first = 1 + max([*taken, *(it[0] for it in cell.told)], default=-1)
+        sights, told = sweep_network(cell, swept, first)
+        streams = {**cell.streams, swept.robot: told}
+        cell = replace(cell, sights=(*cell.sights, *sights), streams=streams)
+    return cell
 
 
 def _observed(cell: Network) -> Network:
@@ -76,6 +84,7 @@ def _observed(cell: Network) -> Network:
         @ where[frame_name("target", board.name)]
         for camera in options.cameras
         for board in options.boards
+        if camera.at_stops
     }
     shown = {key: _shown(cell, *key, pose) for key, pose in poses.items()}
     sights: list[Sight] = []

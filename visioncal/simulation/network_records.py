@@ -7,6 +7,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from visioncal.errors import DataError
 from visioncal.session import MemoryImages, Session, View, frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell
@@ -66,7 +67,7 @@ def write_network(
         for motion, it in done.streams.items()
     }
     session = network_session(cell, folder.name, progress, seen=seen)
-    session.with_streams(streams).save(folder)
+    session.with_streams({**session.streams, **streams}).save(folder)
     truth = _truth_of(cell)
     if touched:
         write_touches(touched, folder)
@@ -89,7 +90,13 @@ def network_session(
 
     With `seen="names"`, `Network.corners` is what was detected in the images that are not there.
     """
-    sights = [it for it in cell.sights if seen != "poses" or it.stop >= 0]
+    if seen != "names" and any(it.readout_s for it in cell.options.sweeps):
+        raise DataError(
+            "simulation: images and poses are those of a moment, and a sweep has readout_s.",
+            next_step="Leave readout_s out.",
+        )
+    lenses = seen != "poses"
+    sights = [it for it in cell.sights if lenses or it.stop >= 0 or it.stamp_s is not None]
     views = {it.view: _row(cell, it, seen) for it in sights}
     turned = {it.name for it in cell.options.instruments if it.sigma_rad}
     for reading in cell.readings:
@@ -116,7 +123,7 @@ def network_session(
         [[row.cell(column) for column in columns] for row in rows],
         MemoryImages(files),
         target_document=documents if len(documents) > 1 else single,
-    )
+    ).with_streams(cell.streams)
 
 
 def _document(cell: Network, name: str) -> dict[str, Any]:
@@ -151,7 +158,10 @@ def _camera_table(camera: CameraAt) -> dict[str, Any]:
 def _row(cell: Network, sight: Sight, seen: Seen) -> View:
     """The row of what a camera saw."""
     text = {"camera": sight.camera, "target": sight.board}
-    if sight.stop < 0:
+    timed = {} if sight.stamp_s is None else {"stamp_s": sight.stamp_s}
+    if timed and seen != "poses":
+        return View(sight.view, image=_image(sight), numbers=timed, text=text)
+    if sight.stop < 0 and not timed:
         return View(sight.view, image=_image(sight), text=text | {"role": "intrinsics"})
     frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
     robots = [it for frame in frames if (it := cell.teller(frame)) is not None]
@@ -164,6 +174,8 @@ def _row(cell: Network, sight: Sight, seen: Seen) -> View:
     optics = camera_named(cell.options, sight.camera).camera
     pose = noisy_pose(optics, sight.cam_from_target, points, sigma_px, draws)
     measured = {f"cft_{key}": value for key, value in pose_row(pose).items()}
+    if timed:
+        return View(sight.view, numbers=timed | measured, text=text)
     return _view(cell, sight.view, sight.stop, robot, measured, text)
 
 
@@ -188,7 +200,8 @@ def _view(
 
 
 def _image(sight: Sight) -> str:
-    folder = f"lens_{sight.camera}" if sight.stop < 0 else f"images/{sight.camera}"
+    of_lens = sight.stop < 0 and sight.stamp_s is None
+    folder = f"lens_{sight.camera}" if of_lens else f"images/{sight.camera}"
     return f"{folder}/{sight.view:04d}.png"
 
 

@@ -1,11 +1,12 @@
 """What was seen in a simulated cell of several robots, and what befalls the images."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from visioncal.errors import DataError
+from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm
 from visioncal.simulation.boards import Sheet
@@ -28,6 +29,7 @@ class Sight:
         exact: Where its corners are in that image.
         corners: The same as a detector would report them; which end of a board that looks alike
             from both it takes for the first, hangs on how it lies in the image.
+        stamp_s: When it was taken in a sweep, by the camera's clock [s]; None at a stop.
     """
 
     view: int
@@ -37,6 +39,7 @@ class Sight:
     cam_from_target: FloatArray
     exact: Corners
     corners: Corners
+    stamp_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,7 @@ class Network:
         told: The row that tells where a robot stood, for those that no other row of their stop
             tells: (view, stop, robot).
         wrong_views: Rows with another row's image, ascending.
+        streams: What robots' controllers told in sweeps, by the robots' names.
     """
 
     options: NetworkOptions
@@ -85,6 +89,7 @@ class Network:
     readings: tuple[Reading, ...]
     told: tuple[tuple[int, int, str], ...]
     wrong_views: tuple[int, ...]
+    streams: Mapping[str, Recorded] = field(default_factory=dict)
 
     @property
     def corners(self) -> tuple[Corners, ...]:

@@ -43,6 +43,7 @@ class Stream(IntEnum):
     LENS = 108
     READINGS = 109
     TOUCHES = 110
+    SWEEP = 111
 
 
 # What another recording of the same cell has in common with it.

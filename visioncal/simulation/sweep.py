@@ -97,7 +97,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
     """
     how = how or SweepOptions()
     stops = simulate(replace(options, views=how.stops, wrong_views=0)).joints
-    way = CubicSpline(how.pace_s * np.arange(how.stops), _in_turn(stops), bc_type="clamped")
+    way = CubicSpline(how.pace_s * np.arange(how.stops), in_turn(stops), bc_type="clamped")
     end_s = how.pace_s * (how.stops - 1)
     robot_s = np.arange(0.0, end_s, 1.0 / how.robot_hz)
     taken_s = np.arange(0.5 / how.frames_hz, end_s, 1.0 / how.frames_hz)
@@ -118,7 +118,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Sweep:
         how,
         _only(frames, seen),
         taken_s + ahead_s,
-        _recorded(robot_s, told, forward(frames.arm, told)),
+        recorded(robot_s, told, forward(frames.arm, told)),
     )
 
 
@@ -162,7 +162,7 @@ def _only(cell: Cell, seen: Sequence[int]) -> Cell:
     )
 
 
-def _in_turn(stops: FloatArray) -> FloatArray:
+def in_turn(stops: FloatArray) -> FloatArray:
     """Orders postures so that each is the nearest to the one before of those that are left."""
     left = list(range(1, len(stops)))
     order = [0]
@@ -172,7 +172,7 @@ def _in_turn(stops: FloatArray) -> FloatArray:
     return stops[order]
 
 
-def _recorded(stamps_s: FloatArray, joints: FloatArray, poses: FloatArray) -> Recorded:
+def recorded(stamps_s: FloatArray, joints: FloatArray, poses: FloatArray) -> Recorded:
     """The controller's stream; a quaternion does not jump to its negative."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
