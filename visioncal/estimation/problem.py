@@ -549,10 +549,10 @@ class Problem:
         pairs = pairs.reshape(-1, 2)
         links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
         units, of_key = connected_components(links, directed=False)
-        members = [np.unique(used[of_key == it] % count) for it in range(units)]
-        robots = np.full((units, max(map(len, members))), -1, dtype=np.int64)
-        for row, robot in zip(robots, members, strict=True):
-            row[: len(robot)] = robot
+        order = np.lexsort((used % count, of_key))
+        rows, sizes = of_key[order], np.bincount(of_key)
+        robots = np.full((units, sizes.max()), -1, dtype=np.int64)
+        robots[rows, np.arange(len(rows)) - (np.cumsum(sizes) - sizes)[rows]] = used[order] % count
         of = np.where(first < 0, -1, of_key[np.searchsorted(used, np.maximum(first, used[0]))])
         return of, robots
 
