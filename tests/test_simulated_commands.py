@@ -308,6 +308,24 @@ def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
     assert abs(clock["camera_minus_robot_s"] - 0.04) < 4.0 * clock["sigma_s"] < 4e-3
 
 
+def test_a_sweep_comes_after_what_was_pushed(place):
+    (place / "later.toml").write_text(OWN + PUSHED + SWEPT)
+    cell = simulate_network(read_cell(str(place / "later.toml")))
+    (place / "before.toml").write_text(OWN + SWEPT)
+    still = simulate_network(read_cell(str(place / "before.toml")))
+    pushed, unmoved = (
+        {it.stamp_s: it.cam_from_target for it in its.sights if it.stamp_s is not None}
+        for its in (cell, still)
+    )
+    away = [
+        1e3 * np.linalg.norm((invert(unmoved[it]) @ pushed[it])[:3, 3])
+        for it in pushed.keys() & unmoved.keys()
+    ]
+    # By default a push is of 5 mm; the robot repeats to some hundredths.
+    np.testing.assert_allclose(away, 5.0, atol=0.3)
+    assert len(away) > 10
+
+
 def test_the_readmes_cell_can_be_made(tmp_path):
     readme = Path(__file__).parents[1].joinpath("README.md").read_text(encoding="utf-8")
     (shown,) = [it for it in readme.split("```toml")[1:] if "[[moved]]" in it]

@@ -67,10 +67,11 @@ def simulate_network(options: NetworkOptions) -> Network:
         wrong_views=(),
     )
     cell = with_faults(_observed(cell))
+    last = {name: it[-1] for name, it in _hanging(cell).items()}
     for swept in options.sweeps:
         taken = [it.view for it in cell.sights] + [it.view for it in cell.readings]
         first = 1 + max([*taken, *(it[0] for it in cell.told)], default=-1)
-        sights, told = sweep_network(cell, swept, first)
+        sights, told = sweep_network(cell, swept, last, first)
         streams = {**cell.streams, swept.robot: told}
         cell = replace(cell, sights=(*cell.sights, *sights), streams=streams)
     return cell
@@ -118,8 +119,8 @@ def _need(cell: Network, needed: dict[str, bool], first: str, second: str) -> No
         needed[robot] = needed.get(robot, False) or place == 0
 
 
-def _places(cell: Network) -> dict[str, FloatArray]:
-    """(s, 4, 4) where each frame really is in the cell, stop by stop."""
+def _hanging(cell: Network) -> dict[str, FloatArray]:
+    """(s, 4, 4) where each frame hangs in its parent, stop by stop."""
     stops = cell.options.stops
     hangs = {name: np.tile(it, (stops, 1, 1)) for name, it in cell.transforms.items()}
     for at, moved in enumerate(cell.options.moved):
@@ -133,6 +134,12 @@ def _places(cell: Network) -> dict[str, FloatArray]:
             twist, axis=1, keepdims=True
         )
         hangs[moved.frame][start:] = hangs[moved.frame][start:] @ exp(twist.ravel())
+    return hangs
+
+
+def _places(cell: Network) -> dict[str, FloatArray]:
+    """(s, 4, 4) where each frame really is in the cell, stop by stop."""
+    hangs = _hanging(cell)
     for robot in cell.options.robots:
         base = hangs[frame_name("base", robot.name)]
         flange = frame_name("flange", robot.name)

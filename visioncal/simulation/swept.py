@@ -1,6 +1,6 @@
 """A camera of a simulated cell that takes frames while a robot moves, by a clock of its own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -24,12 +24,15 @@ _FEWEST_CORNERS, _FACING, _EDGE_PX = 12, 0.5, 2.0
 _ROUNDS = 5
 
 
-def sweep_network(cell: Network, swept: Swept, first_view: int) -> tuple[list[Sight], Recorded]:
+def sweep_network(
+    cell: Network, swept: Swept, transforms: Mapping[str, FloatArray], first_view: int
+) -> tuple[list[Sight], Recorded]:
     """The frames of one camera while one robot goes through its stops, and the robot's stream.
 
     Args:
         cell: The cell at its stops.
         swept: What moves, and what is seen.
+        transforms: (4, 4) where each frame hangs in its parent, once all is pushed.
         first_view: The first frame's number.
 
     Raises:
@@ -41,7 +44,7 @@ def sweep_network(cell: Network, swept: Swept, first_view: int) -> tuple[list[Si
             swept.stops, swept.pace_s, frames_hz=swept.frames_hz, readout_s=swept.readout_s
         ),
     )
-    seen_from = _chain(cell, swept)
+    seen_from = _chain(cell, swept, transforms)
     at = [it.name for it in options.robots].index(swept.robot)
     robot, rng = options.robots[at], stream(options, Stream.SWEEP, at)
     stops = in_turn(cell.joints[swept.robot][: how.stops])
@@ -78,7 +81,9 @@ def sweep_network(cell: Network, swept: Swept, first_view: int) -> tuple[list[Si
     return sights, recorded(robot_s, told, forward(cell.arms[swept.robot], told))
 
 
-def _chain(cell: Network, swept: Swept) -> Callable[[FloatArray], FloatArray]:
+def _chain(
+    cell: Network, swept: Swept, transforms: Mapping[str, FloatArray]
+) -> Callable[[FloatArray], FloatArray]:
     """Where the target (k, 4, 4) is before the camera, by (k, 4, 4) `base_from_flange`."""
     there = {
         "robot": [it.name for it in cell.options.robots],
@@ -98,11 +103,11 @@ def _chain(cell: Network, swept: Swept) -> Callable[[FloatArray], FloatArray]:
             f"simulation: of camera {swept.camera} and target {swept.target} of a sweep, one has "
             f"to be on robot {swept.robot} and the other in the cell."
         )
-    base = cell.transforms[frame_name("base", swept.robot)]
+    base = transforms[frame_name("base", swept.robot)]
 
     def seen_from(flanges: FloatArray) -> FloatArray:
         cam, target = (
-            base @ flanges @ cell.transforms[end] if parent == flange else cell.transforms[end]
+            base @ flanges @ transforms[end] if parent == flange else transforms[end]
             for end, parent in zip(ends, on, strict=True)
         )
         return np.asarray(invert(cam) @ target)
