@@ -8,7 +8,6 @@ import numpy as np
 
 from visioncal.estimation.appearance import (
     BOARD_NAMES,
-    Appearance,
     Compressed,
     board_prior,
     boards_basis,
@@ -104,11 +103,6 @@ class CornerProblem:
         sigma = self.prior_sigma.copy()
         sigma[columns] = np.inf
         return replace(self, prior_sigma=sigma)
-
-    @property
-    def stated(self) -> Appearance:
-        """Lens and board as they are given or were estimated before."""
-        return Appearance(self.scene.camera, np.zeros(self.basis.shape[2]))
 
     @property
     def lens(self) -> IntArray:
