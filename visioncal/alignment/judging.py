@@ -23,7 +23,7 @@ from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
-from visioncal.types import Rejection
+from visioncal.types import Mask, Rejection
 
 _HELD_BACK = "held back"
 
@@ -161,9 +161,22 @@ def check_cell(solved: Solved) -> None:
     agreed, cell = solved.agreed, solved.cell
     part = agreed.problem.subset(agreed.used)
     names = {it: _names(part.tree, it) for it in part.unknown}
-    scene = Scene(
-        "align", names, lambda frame: _motion(cell, part, frame), lambda it, _: _more(cell, it)
-    )
+    lost = agreed.problem.subset(~agreed.used)
+
+    def motion(frame: str) -> str:
+        if not _of_frame(part, frame).any() and (count := int(_of_frame(lost, frame).sum())):
+            return f"all {count} observations of it disagree with the rest of the cell"
+        return _motion(cell, part, frame)
+
+    def advice(frame: str, _: str) -> str:
+        if _of_frame(part, frame).any() or not len(lost):
+            return _more(cell, frame)
+        return (
+            "Look whether the board that ties it has the stated size, and whether images and poses "
+            "belong together."
+        )
+
+    scene = Scene("align", names, motion, advice)
     state = State(agreed.fit.state.edges, np.zeros(0))
     check_determined(part.with_effects(()), state, agreed.fit.noise, scene)
 
@@ -174,12 +187,17 @@ def _names(tree: Tree, frame: str) -> tuple[str, str]:
     return frame.partition("@")[0], "the cell" if parent == tree.root else parent
 
 
+def _of_frame(problem: Problem, frame: str) -> Mask:
+    """(n,) the observations on whose way an edge is."""
+    rows = np.zeros(len(problem), dtype=bool)
+    for group in problem.groups:
+        rows[group.rows] = any(step.frame == frame for step in group.path)
+    return rows
+
+
 def _motion(cell: Cell, part: Problem, frame: str) -> str:
     """Says how the robots stood by way of which a frame was observed."""
-    rows = np.zeros(len(part), dtype=bool)
-    for group in part.groups:
-        rows[group.rows] = any(step.frame == frame for step in group.path)
-    told = []
+    rows, told = _of_frame(part, frame), []
     for branch in part.tree.branches.values():
         if branch.robot:
             stops = np.unique(part.observations.stops[rows & by_way_of(part, branch.robot)])
