@@ -216,7 +216,8 @@ class RobotArm:
             fit: Where to start.
             asked: A key of `stages.kinematics.ASKED`.
         """
-        if self.matched is None or self.joints_rad is None:
+        observed = len(stops_of(problem, self.robot)) > 0
+        if self.matched is None or self.joints_rad is None or not observed:
             return self
         q, loads = self.joints_rad, self.loads
         model = ArmModel.of(self.matched.arm, q, self.reported[self.stood]).loaded(q, loads)
