@@ -7,7 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.text import Text
+from typer.main import get_command
 
+from visioncal.cli.app import app
 from visioncal.errors import DataError
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
@@ -165,6 +168,20 @@ def test_demo_compares_itself_with_the_truth(tmp_path):
 def test_help_and_version_name_the_program():
     assert "calibrate" in visioncal("--help").stdout
     assert visioncal("--version").stdout.strip().count(".") == 2
+
+
+def test_help_loses_no_unit_to_markup():
+    """In the terminal's markup `[mm]` is a style, and what is written so is not shown."""
+
+    def texts(command, name):
+        yield name, command.help
+        yield from ((f"{name} {it.name}", getattr(it, "help", None)) for it in command.params)
+        for sub, it in getattr(command, "commands", {}).items():
+            yield from texts(it, f"{name} {sub}")
+
+    every = [(name, it) for name, it in texts(get_command(app), "visioncal") if it]
+    assert len(every) > 100
+    assert [name for name, it in every if Text.from_markup(it).plain != it] == []
 
 
 def test_boards_and_robots_are_found_from_any_folder(tmp_path):

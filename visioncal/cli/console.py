@@ -150,7 +150,7 @@ def unused_words(views: Iterable[ViewResult | Sight]) -> Iterator[str]:
 
 def _solver_table(calibration: Calibration) -> Table:
     differences = [f"{name} differs by" for name in calibration.edges]
-    table = Table("solver", "rms [mm]", "rms [deg]", *differences, box=None)
+    table = Table("solver", "rms, mm", "rms, deg", *differences, box=None)
     for name, result in calibration.solvers.items():
         away = [
             pose_difference(edge.transform.as_matrix(), result.transforms[it].as_matrix())

@@ -72,12 +72,12 @@ def correct_command(
     ] = None,
     payload_kg: Annotated[
         float,
-        typer.Option("--payload-kg", help="What hangs on the flange, for joints that bend [kg]."),
+        typer.Option("--payload-kg", help="What hangs on the flange, for joints that bend (kg)."),
     ] = 0.0,
     payload_m: Annotated[
         str,
         typer.Option(
-            "--payload-m", metavar="X,Y,Z", help="Where its centre is, in the flange's frame [m]."
+            "--payload-m", metavar="X,Y,Z", help="Where its centre is, in the flange's frame (m)."
         ),
     ] = "0,0,0",
     widest_deg: Annotated[

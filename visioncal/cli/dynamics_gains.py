@@ -26,11 +26,11 @@ def dynamics_gains_command(
     loaded: Annotated[
         Path, typer.Option("--loaded", help="A session of the same arm with the body on it.")
     ],
-    mass_kg: Annotated[float, typer.Option("--mass-kg", help="Of the body [kg].")],
+    mass_kg: Annotated[float, typer.Option("--mass-kg", help="Of the body (kg).")],
     com_mm: Annotated[
         str,
         typer.Option(
-            "--com-mm", metavar="X,Y,Z", help="Its centre of mass in the flange's frame [mm]."
+            "--com-mm", metavar="X,Y,Z", help="Its centre of mass in the flange's frame (mm)."
         ),
     ],
     inertia: Annotated[
@@ -38,7 +38,7 @@ def dynamics_gains_command(
         typer.Option(
             "--inertia",
             metavar="XX,XY,YY,XZ,YZ,ZZ",
-            help="Its inertia about that centre [kg m^2].",
+            help="Its inertia about that centre (kg m^2).",
         ),
     ] = "0,0,0,0,0,0",
     cutoff_hz: CutoffOption = None,

@@ -57,11 +57,11 @@ def export_command(
         typer.Option("--number", help="Which of the controller's tools or bases it becomes."),
     ] = None,
     mass_kg: Annotated[
-        float | None, typer.Option("--mass-kg", help="The tool's mass, for ABB's tooldata [kg].")
+        float | None, typer.Option("--mass-kg", help="The tool's mass, for ABB's tooldata (kg).")
     ] = None,
     cog_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--cog-mm", help="Its centre of mass in the flange's frame: X Y Z [mm]."),
+        typer.Option("--cog-mm", help="Its centre of mass in the flange's frame: X Y Z (mm)."),
     ] = None,
     convention: Annotated[
         str | None,

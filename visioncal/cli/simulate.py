@@ -56,16 +56,16 @@ def simulate_command(
         bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")
     ] = False,
     robot_sigma_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Repeatability of the robot [mm].")
+        float, typer.Option(min=0.0, max=100.0, help="Repeatability of the robot (mm).")
     ] = 0.03,
     robot_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation [mrad].")
+        float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation (mrad).")
     ] = 0.05,
     arm_sigma_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Departure of the arm's lengths [mm].")
+        float, typer.Option(min=0.0, max=100.0, help="Departure of the arm's lengths (mm).")
     ] = 0.0,
     arm_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Departure of its angles [mrad].")
+        float, typer.Option(min=0.0, max=100.0, help="Departure of its angles (mrad).")
     ] = 0.0,
     wrong_views: Annotated[
         int, typer.Option(min=0, help="Views whose reported pose is wrong.")
@@ -84,12 +84,12 @@ def simulate_command(
         typer.Option(help="A sweep without stops: pose pairs by one clock, the robot by another."),
     ] = False,
     clock_offset_ms: Annotated[
-        float, typer.Option(help="With --sweep: what the camera's clock is ahead [ms].")
+        float, typer.Option(help="With --sweep: what the camera's clock is ahead (ms).")
     ] = 37.0,
     readout_ms: Annotated[
         float,
         typer.Option(
-            help="With --sweep: how long after its first row an image's last is taken [ms]; other "
+            help="With --sweep: how long after its first row an image's last is taken (ms); other "
             "than 0, the frames have corners (corners.csv) in the place of poses."
         ),
     ] = 0.0,
@@ -136,7 +136,7 @@ def simulate_command(
     ] = False,
     stiffness_knm: Annotated[
         float | None,
-        typer.Option(min=0.1, help="Stiffness of every joint [kN m/rad]; rigid if left out."),
+        typer.Option(min=0.1, help="Stiffness of every joint (kN m/rad); rigid if left out."),
     ] = None,
     payload_kg: Annotated[
         list[float] | None,
@@ -150,7 +150,7 @@ def simulate_command(
     ] = 0,
     camera_moved_mm: Annotated[
         float,
-        typer.Option(min=0.0, max=100.0, help="How far the camera was knocked [mm]; the first."),
+        typer.Option(min=0.0, max=100.0, help="How far the camera was knocked (mm); the first."),
     ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Another cell for every number.")] = 0,
 ) -> None:
