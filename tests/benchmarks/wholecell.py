@@ -16,22 +16,18 @@ from multiprocessing import Pool
 
 import numpy as np
 from results import wished, write_section
-from scipy.interpolate import CubicSpline
 
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
-from visioncal.session import Session, Stream, View
+from visioncal.session import Session
 from visioncal.simulation.arms import forward
-from visioncal.simulation.boards import corners_m
-from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt
+from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
-from visioncal.simulation.optics import fine_camera, project, sees
+from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import checkerboard_target
-from visioncal.simulation.records import pose_row
-from visioncal.simulation.seen import Network, camera_named, sheet_named
-from visioncal.simulation.sweep import POSE_COLUMNS
-from visioncal.transforms import exp, invert, log
+from visioncal.simulation.seen import Network
+from visioncal.transforms import invert, log
 from visioncal.types import Corners, FloatArray
 
 CELLS = 50
@@ -40,9 +36,6 @@ OFFSET_RAD = 1e-3
 SCALE = 1.002
 AHEAD_S = 0.0437
 GAUGE_M = 0.0005
-_ROBOT_HZ, _FRAMES_HZ, _PACE_S = 125.0, 10.0, 1.7
-# So many postures of the first arm are swept through.
-_SWEPT = 10
 
 
 def options(seed: int) -> NetworkOptions:
@@ -60,7 +53,8 @@ def options(seed: int) -> NetworkOptions:
         BoardAt("plate_a", "a", target=checkerboard_target()),
         BoardAt("plate_b", "b"),
     )
-    return NetworkOptions(robots, cameras, boards, stops=STOPS, seed=seed)
+    sweep = Swept("left", "a", "plate_a", camera_minus_robot_s=AHEAD_S)
+    return NetworkOptions(robots, cameras, boards, stops=STOPS, seed=seed, sweeps=(sweep,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,75 +76,17 @@ def world(seed: int) -> World:
     cell = simulate_network(options(seed))
     rng = np.random.default_rng([seed, 77])
     session = network_session(cell, "everything", seen="names")
-    corners = {it.view: it for it in cell.corners}
-    rows, more, stream = _sweep(cell, 1 + max(it.number for it in session.views), rng)
     height_m = cell.between("base_a", "base_b")[2, 3] + GAUGE_M * float(rng.standard_normal())
     prior = {"z_m": height_m, "sigma_m": GAUGE_M}
-    document = {**session.document, "prior": {"base_a_from_base_b": prior}}
-    views = (*session.views, *rows)
-    columns = (*session.columns, "stamp_s")
     built = Session.assemble(
-        document,
-        columns,
-        [[row.cell(column) for column in columns] for row in views],
+        {**session.document, "prior": {"base_a_from_base_b": prior}},
+        session.columns,
+        [[row.cell(column) for column in session.columns] for row in session.views],
         session.images,
         target_document=session.target_document,
     )
-    return World(cell, built.with_streams({"a": stream}), {**corners, **more})
-
-
-def _sweep(
-    cell: Network, view: int, rng: np.random.Generator
-) -> tuple[list[View], dict[int, Corners], Stream]:
-    """The rows of the camera `left` while the first arm moves, and what its controller tells."""
-    seen = [it.stop for it in cell.sights if (it.camera, it.board) == ("left", "plate_a")]
-    stops = cell.joints["a"][seen[:_SWEPT]]
-    way = CubicSpline(_PACE_S * np.arange(len(stops)), _in_turn(stops), bc_type="clamped")
-    end_s = _PACE_S * (len(stops) - 1)
-    robot_s, frames_s = (
-        np.arange(0.0, end_s, 1.0 / _ROBOT_HZ),
-        np.arange(0.1, end_s - 0.1, 1.0 / _FRAMES_HZ),
-    )
-    robot = next(it for it in cell.options.robots if it.name == "a")
-    sigmas = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
-    flanges = forward(cell.true_arms["a"], way(frames_s)) @ exp(
-        sigmas * rng.standard_normal((len(frames_s), 6))
-    )
-    camera, sheet = camera_named(cell.options, "left").camera, sheet_named(cell.options, "plate_a")
-    hung = cell.transforms
-    plates = hung["base_a"] @ flanges @ hung["target_plate_a"]
-    poses = invert(hung["cam_left"]) @ plates
-    rows, corners = [], {}
-    for stamp_s, pose in zip(frames_s + AHEAD_S, poses, strict=True):
-        points = corners_m(sheet) @ pose[:3, :3].T + pose[:3, 3]
-        ids = np.flatnonzero(sees(camera, points, 2.0))
-        if len(ids) < len(points):
-            continue
-        px = project(camera, points[ids])
-        if px[0].sum() > px[-1].sum():
-            continue
-        corners[view] = Corners(
-            view, ids, px + cell.options.pixel_sigma_px * rng.standard_normal(px.shape), 0.7
-        )
-        text = {"camera": "left", "target": "plate_a"}
-        rows.append(
-            View(view, f"sweep/{view:04d}.png", numbers={"stamp_s": float(stamp_s)}, text=text)
-        )
-        view += 1
-    q = way(robot_s)
-    told = [list(pose_row(it).values()) for it in forward(cell.arms["a"], q)]
-    names = [f"q{at}_rad" for at in range(1, 1 + q.shape[1])]
-    stream = Stream(("stamp_s", *POSE_COLUMNS, *names), np.hstack([robot_s[:, None], told, q]))
-    return rows, corners, stream
-
-
-def _in_turn(stops: FloatArray) -> FloatArray:
-    """Orders postures so that each is the nearest to the one before of those that are left."""
-    left, order = list(range(1, len(stops))), [0]
-    while left:
-        away = [float(np.abs(stops[at] - stops[order[-1]]).max()) for at in left]
-        order.append(left.pop(int(np.argmin(away))))
-    return stops[order]
+    corners = {it.view: it for it in cell.corners}
+    return World(cell, built.with_streams(session.streams), corners)
 
 
 @dataclass(frozen=True, eq=False)

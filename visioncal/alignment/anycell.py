@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from visioncal import pipeline
 from visioncal.alignment.arms import LEVELS
 from visioncal.alignment.run import align
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
+from visioncal.pipeline import run
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell
@@ -50,9 +50,9 @@ def calibrate(
         check_whole(solver, level)
         found = align(loaded, level=level, convention=convention, progress=progress)
         return Calibration.whole(found)
-    return pipeline.calibrate(
+    return run(
         loaded, solver=solver, level=level, convention=convention, progress=progress
-    )
+    ).calibration
 
 
 def check_whole(solver: SolverName, level: str) -> None:

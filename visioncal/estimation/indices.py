@@ -50,17 +50,3 @@ class Indices:
             o4=least**2 / greatest,
             o5=1.0 / float(np.sum(1.0 / values)),
         )
-
-
-def singular_values(slopes: FloatArray, units: FloatArray) -> FloatArray:
-    """Singular values of slopes in any units of the unknowns, in descending order.
-
-    They depend on these units, and their ratio does: a condition number means something only where
-    each unknown is counted in what it may be off by.
-
-    Args:
-        slopes: (..., k) derivatives of what is measured.
-        units: (k,) what one of each unknown is.
-    """
-    flat = slopes.reshape(-1, len(units)) * units
-    return np.asarray(np.linalg.svd(flat, compute_uv=False))

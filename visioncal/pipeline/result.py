@@ -48,42 +48,6 @@ class Run:
     evidence: tuple[ViewEvidence, ...]
 
 
-def calibrate(
-    session: Session | Path | str,
-    *,
-    solver: SolverName = "joint",
-    level: str = "auto",
-    convention: Convention | None = None,
-    progress: Progress | None = None,
-) -> Calibration:
-    """Calibrates a session.
-
-    Several threads may do so at once. While one does, BLAS has one thread for each, and OpenCV,
-    too, while targets are looked for; afterwards both have those that they had.
-
-    Args:
-        session: A session, or the path of its folder or recording.
-        solver: `joint` for the fit of both edges, or the name of a closed form.
-        level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
-            arm, `offsets` of its joints, its `kinematics`, `elastic` for joints that bend, too, or
-            `thermal` for its drift with temperature, too.
-        convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
-            `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
-        progress: Told of long work.
-
-    Returns:
-        The result with its verdict.
-
-    Raises:
-        DataError: The input is wrong or shows no target.
-        DegenerateError: The motion leaves a direction of the answer open.
-        ConvergenceError: The intrinsics do not come to rest.
-    """
-    return run(
-        session, solver=solver, level=level, convention=convention, progress=progress
-    ).calibration
-
-
 def run(
     session: Session | Path | str,
     *,
