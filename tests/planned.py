@@ -6,7 +6,7 @@ import numpy as np
 from cells import known_of
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.recorded import SoFar
@@ -36,7 +36,7 @@ def true_cell(options: CellOptions) -> PlanCell:
         z,
         0.0,
         0.0,
-        Noise(options.robot_sigma_rad, options.robot_sigma_m),
+        Noise.of_robot(options.robot_sigma_rad, options.robot_sigma_m),
         options.pixel_sigma_px,
     )
 

@@ -8,7 +8,7 @@ import pytest
 from apart import UR5E_RADIUS_M, clearances, corners, lines, lines_apart, tubes
 
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.planning.candidates import candidates
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.design import chosen
@@ -43,7 +43,7 @@ def cell_of(options: CellOptions, **changes) -> PlanCell:
         z=z,
         sigma_rad=0.005,
         sigma_m=0.002,
-        noise=Noise(5e-5, 3e-5),
+        noise=Noise.of_robot(5e-5, 3e-5),
         pixel_px=0.05,
         limits=Limits(floor_m=floor_m),
     )

@@ -7,11 +7,10 @@ import pytest
 
 from visioncal.estimation.causes import Belief, Cause, _at, explain, undone
 from visioncal.estimation.chain import chain
-from visioncal.estimation.closure import Noise
-from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.problem import ROBOT, Noise, State
 from visioncal.transforms import adjoint, exp, invert, log
 
-NOISE = Noise(1e-4, 1e-4)
+NOISE = Noise.of_robot(1e-4, 1e-4)
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 
@@ -41,7 +40,7 @@ def slipped(data, rng):
 
 
 def belief_of(state, freedom=np.inf, sigma=1e-5):
-    return Belief(state, sigma**2 * np.eye(12), NOISE.levels, freedom)
+    return Belief(state, sigma**2 * np.eye(12), NOISE, freedom)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -89,7 +88,7 @@ def test_a_board_that_was_turned_over_is_told_exactly(mount):
 def test_misfit_and_evidence_follow_their_distributions():
     rng = np.random.default_rng(5)
     data, state = stops_of("eye-in-hand", rng)
-    sigma = np.repeat([NOISE.sigma_rad, NOISE.sigma_m], 3)
+    sigma = np.repeat(NOISE.robots[0], 3)
     misfits, ratios = [], []
     for _ in range(60):
         noise = exp(sigma * rng.standard_normal((5, 6)))

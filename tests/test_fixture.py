@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import Edge, FrameFile, Verdict
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.frames.drawn import drawn_fixture
 from visioncal.frames.fitted import Setting
 from visioncal.frames.fixture import touched_fixture
@@ -117,16 +117,16 @@ def test_the_tips_error_is_a_pure_offset_where_all_touches_stand_alike(features)
 @pytest.mark.parametrize("features", [False, True])
 def test_the_error_over_its_sigma_is_as_it_should_be(features):
     squares = []
-    noise = Noise(1e-4, 3e-5)
+    noise = Noise.of_robot(1e-4, 3e-5)
     local = np.tile(ON_FEATURES, (2, 1)) if features else 1e-3 * CAD_MM
     kinds = KINDS * 2 if features else ("",) * len(local)
-    known = {"robot_rotation_deg": np.rad2deg(noise.sigma_rad), "robot_translation_mm": 0.03}
+    known = {"robot_rotation_deg": np.rad2deg(noise.robots[0, 0]), "robot_translation_mm": 0.03}
     calibration = replace(made_up(5).calibration, noise=known)
     for seed in range(100):
         rng = np.random.default_rng(seed)
         off = made.FLANGE_FROM_TOOL[:3, :3] @ TIP_SIGMA @ rng.normal(size=3)
         poses = touching(local, rng, NOISE_M, TIP + off)
-        sigmas = np.repeat([noise.sigma_rad, noise.sigma_m], 3)
+        sigmas = np.repeat(noise.robots[0], 3)
         poses = poses @ exp(sigmas * rng.normal(size=(len(poses), 6)))
         frame = touched_fixture(
             rows_of(poses, kinds, () if features else NAMES),
@@ -306,7 +306,7 @@ def test_errors_that_points_share_are_carried_to_the_answer():
     # As a camera's: another covariance than a tip's, for all points together.
     rng = np.random.default_rng(8)
     rows = rows_of(touching(1e-3 * CAD_MM, rng), points=NAMES)
-    measured = touched_points(rows, tool(), Noise(0.0, 1e-6), None)
+    measured = touched_points(rows, tool(), Noise.of_robot(0.0, 1e-6), None)
     # As if the whole set were turned about the base, and shifted.
     sigmas = np.array([1e-4, 2e-4, 3e-4, 1e-4, 1e-4, 5e-5])
     slopes = np.concatenate([sigmas * _turning(it) for it in measured.points])

@@ -18,7 +18,6 @@ from tracked import (
 import visioncal
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.chain import chain
-from visioncal.estimation.closure import Edges
 from visioncal.estimation.positions import Mounting, Places, fit_mounting, supplied_poses
 from visioncal.estimation.problem import State
 from visioncal.estimation.workspace import postures
@@ -327,6 +326,8 @@ def test_supplied_poses_stand_for_the_places_that_they_came_from():
     )
     found = fit_mounting(places, off, 2)
     assert found.on_flange == pytest.approx(mounting.on_flange, abs=1e-5)
-    moved = mounting.moved(Edges(x, compose(np.eye(3), np.ones(3)), np.array([0.1, 0.2, 0.3])))
+    moved = mounting.moved(
+        State(np.stack([x, compose(np.eye(3), np.ones(3))]), np.array([0.1, 0.2, 0.3]))
+    )
     assert moved.on_flange[0] == pytest.approx(np.ones(3))
     assert moved.from_first[1] == pytest.approx(mounting.from_first[1] + [0.1, 0.2, 0.3])

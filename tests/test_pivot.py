@@ -21,14 +21,14 @@ from touched import (
 )
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.closure import Noise
 from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.problem import Noise
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Placed, Touches, TouchProblem
 from visioncal.transforms import compose, exp, invert
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-ROBOT = Noise(5e-5, 3e-5)
+ROBOT = Noise.of_robot(5e-5, 3e-5)
 WAY = np.array([0.48, -0.6, 0.64])
 
 
@@ -90,7 +90,7 @@ def test_the_gradient_is_exact_far_from_closing_too():
 
 def test_the_robots_noise_is_carried_to_the_touched_point():
     made = touched(Job(tips=1, axes=1), 3)
-    problem = TouchProblem(made.touches, Noise(1e-3, 2e-3), oriented=True)
+    problem = TouchProblem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
     tool, point = compose(TURN.as_matrix(), TIP), np.array([*POINTS[0], 1.0])
     known = problem.linearise(Placed(tool, POINTS[:1])).known
     for at, flange in enumerate(made.touches.base_from_flange):

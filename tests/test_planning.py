@@ -9,8 +9,9 @@ from cells import calibrated
 from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Edges, Noise, closure_information
 from visioncal.estimation.linalg import covariance, covariance_root
+from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.solve import fisher_information
 from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Box
 from visioncal.planning.design import chosen, shortfall
@@ -45,14 +46,15 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     """A plan is made of the estimator's own numbers, at the same poses."""
     options = exact(replace(CELL, mount=mount, views=6, cut_views=0.0))
     seen = so_far_of(simulate(options)).known
-    cell = replace(true_cell(options), noise=Noise(5e-5, 3e-5), pixel_px=0.05)
+    cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
     q = simulate(options).joints
     factors = stop_factors(cell, HAND_EYE, q)
-    closure = seen.closure(seen.used)
+    problem = seen.problem(seen.used)
     # The same corners at the plan's noise; exact ones count as seen to a millionth of a pixel.
     scale = (0.05 / max(seen.pixel_px, 1e-6)) ** 2
-    data = replace(closure, camera_covariance=scale * closure.camera_covariance)
-    there = closure_information(data, Edges(cell.x, cell.z, data.unchanged), cell.noise)
+    views = replace(problem.observations, covariance=scale * problem.observations.covariance)
+    state = State(np.stack([cell.x, cell.z]), problem.start_values)
+    there = fisher_information(replace(problem, observations=views), state, cell.noise)
     summed = np.einsum("kij,kil->jl", factors, factors)
     size = 1.0 / np.sqrt(np.diag(there)[:12])
     # Poses and corners agree to rounding of the fit of each pose (1e-6 rad and m).

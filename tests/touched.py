@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.estimation.touching import Touches
 
 TIP = np.array([0.034, 0.001, 0.16])
 TURN = Rotation.from_euler("xyz", [10.0, -20.0, 35.0], degrees=True)
 POINTS = np.array([[0.62, 0.1, 0.2], [0.45, -0.25, 0.21], [0.7, 0.3, 0.05]])
-EXACT = Noise(0.0, 0.0)
+EXACT = Noise.of_robot(0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def touched(job: Job, seed: int) -> Made:
     met = POINTS[which] + job.contact_m * rng.standard_normal((count, 3))
     # The point of the tool at `reached` stands where the contact was.
     place = met - truly.apply(TURN.apply(reached) + TIP)
-    shift = job.noise.sigma_m * rng.standard_normal((count, 3))
-    read = truly * Rotation.from_rotvec(job.noise.sigma_rad * rng.standard_normal((count, 3)))
+    shift = job.noise.robots[0, 1] * rng.standard_normal((count, 3))
+    read = truly * Rotation.from_rotvec(job.noise.robots[0, 0] * rng.standard_normal((count, 3)))
     return Made(_touches(read, place + truly.apply(shift), which, kinds), truly, reached, job)
 
 
@@ -98,7 +98,7 @@ def bound(made: Made) -> np.ndarray:
     """Least covariance (6, 6) of rotation and tip, in the tool's frame, by central differences."""
     job, kinds, which = made.job, made.touches.kinds, made.touches.points
     size = 6 + 3 * job.points
-    sigmas = np.repeat([job.noise.sigma_rad, job.noise.sigma_m, job.contact_m], 3)
+    sigmas = np.repeat([*job.noise.robots[0], job.contact_m], 3)
     place = POINTS[which] - made.truly.apply(TURN.apply(made.reached) + TIP)
 
     def seen(change: np.ndarray, slack: np.ndarray) -> np.ndarray:

@@ -19,7 +19,6 @@ from test_candidates import cell_of, whole
 from test_kinematics import WRONG_LINKS, error_m
 
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
 from visioncal.pipeline.known import Known
 from visioncal.planning.candidates import candidates
 from visioncal.planning.design import chosen
@@ -228,11 +227,11 @@ def sigmas(spread: FloatArray) -> tuple[float, float]:
 
 def at_noise(begun: Begun, added: FloatArray, known: Known) -> tuple[float, float]:
     """The prediction at the noise that the whole session shows."""
-    noise = known.solved.noise
+    noise = known.solved.noise.levels
     scale = (known.pixel_px / begun.cell.pixel_px) ** 2
     problem = begun.recorded.problem
     seen = replace(problem.observations, covariance=scale * problem.observations.covariance)
-    cell = replace(begun.cell, noise=Noise(*noise.sigmas), pixel_px=known.pixel_px)
+    cell = replace(begun.cell, noise=noise, pixel_px=known.pixel_px)
     recorded = replace(begun.recorded, problem=replace(problem, observations=seen), noise=noise)
     world = worlds_of([cell], PURPOSES["hand-eye"], added, recorded=recorded)[0]
     return sigmas(world.covariance(range(len(added))))

@@ -13,12 +13,12 @@ import numpy as np
 from results import few, write_section
 from touched import TURN, Job, Made, bound, error_of, slipped, touched, turned
 
-from visioncal.estimation.closure import Noise
 from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.problem import Noise
 from visioncal.transforms import compose
 
 SEEDS, SLIP_SEEDS, WORKERS = *few((1000, 300), (3, 3)), 2
-ROBOT = Noise(5e-5, 3e-5)
+ROBOT = Noise.of_robot(5e-5, 3e-5)
 JOBS = {
     "10 of a point": Job(),
     "10 of a point, robot's noise": Job(noise=ROBOT),

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.calibration import Calibration
 from visioncal.cli.numbers import numbers_in
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.files import absence, read_bytes, some_of
 from visioncal.formats.boards import described_target
 from visioncal.formats.intrinsics import read_intrinsics
@@ -308,11 +308,11 @@ def _with_noise(cell: PlanCell, words: CellWords) -> PlanCell:
                 f"{option} is {value}; zero or more is needed.",
                 culprits=[option],
             )
-    noise = cell.noise
-    sigma_m = noise.sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
-    sigma_rad = noise.sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))
+    sigma_rad, sigma_m = cell.noise.robots[0].tolist()
+    sigma_m = sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
+    sigma_rad = sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))
     pixel_px = cell.pixel_px if words.noise_px is None else words.noise_px
-    return replace(cell, noise=Noise(sigma_rad, sigma_m), pixel_px=pixel_px)
+    return replace(cell, noise=Noise.of_robot(sigma_rad, sigma_m), pixel_px=pixel_px)
 
 
 def _target(words: str) -> Target:

@@ -12,9 +12,9 @@ import numpy as np
 from visioncal.chance import f_limit
 from visioncal.errors import DataError
 from visioncal.estimation.agreement import Agreement, agreeing_groups
-from visioncal.estimation.closure import Noise
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.observability import Direction
+from visioncal.estimation.problem import Noise
 from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
 from visioncal.estimation.turning import CARELESS_M, check_counts, check_turning
 from visioncal.threads import one_blas_thread
@@ -22,7 +22,7 @@ from visioncal.types import FloatArray, Mask
 
 # A touch that errs fits another point by chance in one of a thousand.
 _FALSE_ALARM = 1e-3
-_NO_NOISE = Noise(0.0, 0.0)
+_NO_NOISE = Noise.of_robot(0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

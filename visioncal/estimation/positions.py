@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.closure import Edges
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
+from visioncal.estimation.problem import State
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 from visioncal.transforms import adjoint, compose, exp, invert, skew
@@ -79,16 +79,16 @@ class Mounting:
         """(p, 3) the points in the first one's frame [m]."""
         return np.asarray(self.on_flange - self.on_flange[0])
 
-    def moved(self, edges: Edges) -> "Mounting":
+    def moved(self, state: State) -> "Mounting":
         """Returns the mounting that a fit of the chain found, starting from this one.
 
         Args:
-            edges: Its edges; what is shared begins with the changes of the further points.
+            state: Its edges; the values begin with the changes of the further points.
         """
         changes = np.zeros_like(self.on_flange)
-        changes[1:] = edges.shared[: 3 * len(changes) - 3].reshape(-1, 3)
-        on_flange = edges.z[:3, 3] + (self.from_first + changes) @ edges.z[:3, :3].T
-        return Mounting(edges.x, on_flange)
+        changes[1:] = state.values[: 3 * len(changes) - 3].reshape(-1, 3)
+        x, z = state.edges
+        return Mounting(x, z[:3, 3] + (self.from_first + changes) @ z[:3, :3].T)
 
 
 def supplied_poses(places: Places, mounting: Mounting) -> tuple[FloatArray, FloatArray]:

@@ -255,6 +255,11 @@ class Noise:
     robots: FloatArray
     sensors: FloatArray
 
+    @classmethod
+    def of_robot(cls, sigma_rad: float, sigma_m: float) -> "Noise":
+        """The noise of an only robot's flange, per axis, where that of all else is known."""
+        return cls(np.array([[sigma_rad, sigma_m]]), np.zeros(0))
+
 
 @dataclass(frozen=True, eq=False)
 class _Group:

@@ -17,9 +17,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.estimation.closure import Noise
 from visioncal.estimation.groups import Groups
 from visioncal.estimation.placing import LEAST_NOISE_M
+from visioncal.estimation.problem import Noise
 from visioncal.transforms import compose, exp, invert, nearest_rotation, skew
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -163,9 +163,9 @@ class TouchProblem:
     def _known(self, rotation: FloatArray, seen: FloatArray) -> FloatArray:
         """Covariances (n, 3, 3) of the touched points in the tool, from the flange's errors."""
         lever = rotation.T @ skew(seen)
-        level = self.noise.sigma_m**2 + LEAST_NOISE_M**2
-        turned = self.noise.sigma_rad**2 * lever @ np.swapaxes(lever, 1, 2)
-        return np.asarray(level * np.eye(3) + turned)
+        turn_sq, shift_sq = self.noise.robots[0] ** 2
+        turned = turn_sq * lever @ np.swapaxes(lever, 1, 2)
+        return np.asarray((shift_sq + LEAST_NOISE_M**2) * np.eye(3) + turned)
 
 
 def in_tool(touches: Touches, state: Placed) -> FloatArray:

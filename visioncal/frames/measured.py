@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 
 from visioncal.calibration import Calibration, Edge, Frame, Verdict
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.files import did_you_mean, some_of
 from visioncal.frames.touches import TouchRows, check_lengths, flange_poses, refuse_copies
 from visioncal.robot import Robot
@@ -155,7 +155,8 @@ def touched_points(
         axis = turn[:, 2] if tool.oriented else np.array([0.0, 0.0, 1.0])
     refuse_copies(poses, rows.places)
     turns = poses[:, :3, :3]
-    lever = noise.sigma_m**2 * np.eye(3) + noise.sigma_rad**2 * skew(away) @ skew(away).T
+    turn_sq, shift_sq = noise.robots[0] ** 2
+    lever = shift_sq * np.eye(3) + turn_sq * skew(away) @ skew(away).T
     there = np.where(np.isfinite(turns), turns, np.eye(3))
     flat = np.concatenate(list(there), axis=0)
     return MeasuredPoints(

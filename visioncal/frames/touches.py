@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.files import did_you_mean, some_of
 from visioncal.frames.verdicts import Doubt
 from visioncal.robot import Robot
@@ -210,7 +210,7 @@ def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
 def robot_noise(calibration: Calibration | None) -> Noise:
     """Errors of the flange from stop to stop, as calibrated; zero where nothing is known."""
     found = {} if calibration is None else calibration.noise
-    return Noise(
+    return Noise.of_robot(
         float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
         1e-3 * found.get("robot_translation_mm", 0.0),
     )

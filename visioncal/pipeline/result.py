@@ -218,7 +218,7 @@ def _instrument(known: Known, readings: Readings) -> dict[str, Any]:
     }
     document: dict[str, Any] = {"instrument": {k: v for k, v in stated.items() if v is not None}}
     if readings.mounting is not None:
-        on_flange = readings.mounting.moved(known.solved.edges).on_flange
+        on_flange = readings.mounting.moved(known.solved.edges.state).on_flange
         document["points"] = [
             {"point": name or "probe", **dict(zip(("x_m", "y_m", "z_m"), place, strict=True))}
             | {"sigma_mm": _point_sigma_mm(known.solved.covariance, point)}

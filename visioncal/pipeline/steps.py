@@ -364,7 +364,7 @@ def _hand_eye(known: Known) -> Known:
         if model is not None:
             known = replace(known, arm_model=model.moved(step[: known.arm_size]))
         if readings is not None:
-            known = known.with_readings(readings.moved(result.edges))
+            known = known.with_readings(readings.moved(result.edges.state))
     found = components(data.problem, known.solved.edges.state, known.solved.covariance)
     notes = (it.remark for it in found if not it.is_contradicted)
     known = replace(known, notes=(*known.notes, *notes))

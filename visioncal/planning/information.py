@@ -1,7 +1,7 @@
 """What a stop of the robot would tell, by the estimator's own derivatives and priors.
 
 A stop's corners are predicted, compressed as seen ones are, and joined with the noise of the robot;
-what comes out is the information that the closure of the chain would have of it.
+what comes out is the information that the joint fit would have of it.
 """
 
 from collections.abc import Sequence
@@ -24,10 +24,9 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
-from visioncal.estimation.closure import Noise
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import ROBOT, Effect, Problem, State
+from visioncal.estimation.problem import ROBOT, Effect, Noise, Problem, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
@@ -185,7 +184,7 @@ def stop_factors(
         )
         problem, state = _erring(cell, purpose, problem, q[seen])
         linear = problem.linear(state, ideal=True)
-        root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise.levels))
+        root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
         factors[seen] = np.linalg.solve(root, linear.jacobian)
     return factors
 
@@ -270,7 +269,7 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) 
     stops = len(recorded.problem.poses[ROBOT])
     at = np.zeros((stops, cell.robot.joint_count)) if q is None else q
     problem, state = _erring(cell, purpose, recorded.problem, at)
-    found = fisher_information(problem, state, recorded.noise.levels)
+    found = fisher_information(problem, state, recorded.noise)
     found[12:, 12:] -= _of_effects(problem)
     return found
 

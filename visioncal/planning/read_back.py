@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.documents.jsons import parse_json
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
 from visioncal.files import Table, read_text
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.purposes import Purpose, purpose_of
@@ -131,7 +131,7 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
         _array(guesses[z], (4, 4)),
         float(guesses["sigma_rad"]),
         float(guesses["sigma_m"]),
-        Noise(float(noise["robot_rotation_rad"]), float(noise["robot_translation_m"])),
+        Noise.of_robot(float(noise["robot_rotation_rad"]), float(noise["robot_translation_m"])),
         float(noise["pixel_px"]),
         Limits(**limits),
         tuple(

@@ -6,10 +6,8 @@ import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import Noise
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import Noise as Levels
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.problem import Noise, Problem, State
 from visioncal.estimation.solve import fisher_information, fit_problem, normal_equations
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -27,9 +25,9 @@ _MOUNTED_M = 0.1
 # Stops cannot be found for edges that are known no better [rad and m].
 _TOO_VAGUE_RAD, _TOO_VAGUE_M = 0.5, 0.5
 # No arm repeats better; a few stops may show less by chance [rad and m].
-_LEAST_NOISE = Noise(2e-5, 1e-5)
+_LEAST_NOISE = Noise.of_robot(2e-5, 1e-5)
 # What well-kept arms repeat to, where nothing has been seen of it [rad and m].
-_TYPICAL = Noise(5e-5, 3e-5)
+_TYPICAL = Noise.of_robot(5e-5, 3e-5)
 # Newton's steps to the nearest edges; the problem is as good as linear.
 _STEPS = 20
 
@@ -132,7 +130,7 @@ def begin(
     problem = replace(known, arm=None).closure(views).merged(stops).problem
     with one_blas_thread():
         state, noise = _start(known, problem, guess)
-        nearest, spread = _nearest(problem, state, noise.levels, known.session.mount, guess)
+        nearest, spread = _nearest(problem, state, noise, known.session.mount, guess)
     sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
         raise _too_vague(known, len(first))
@@ -169,19 +167,21 @@ def _arm(known: Known, robot: Robot) -> Robot:
 def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, Noise]:
     still = problem.start_values
     if known.hand_eye is not None:
-        found, noise = known.hand_eye.edges.state, known.hand_eye.noise.sigmas
+        found, noise = known.hand_eye.edges.state, known.hand_eye.noise.levels
     elif known.agreed is not None:
         fit = fit_problem(problem, State(known.edges[:2], still))
-        found, noise = fit.state, fit.noise.robots[0]
+        found, noise = fit.state, fit.noise
     elif guess is not None:
         return State(np.stack([guess.x, guess.z]), still), _TYPICAL
     else:
         raise _too_vague(known, len(problem))
-    return State(found.edges, still), Noise(*np.maximum(noise, _LEAST_NOISE.sigmas).tolist())
+    return State(found.edges, still), replace(
+        noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)
+    )
 
 
 def _nearest(
-    problem: Problem, state: State, noise: Levels, mount: Mount, guess: Guess | None
+    problem: Problem, state: State, noise: Noise, mount: Mount, guess: Guess | None
 ) -> tuple[State, FloatArray]:
     """The likeliest edges with what is known beforehand, and their covariance (12, 12)."""
     weights = np.zeros((problem.size, problem.size))

@@ -1,16 +1,19 @@
 """Cells as an earlier calibration knows them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimation.closure import Noise
+from visioncal.estimation.problem import Noise
+from visioncal.frames.touches import robot_noise
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.robot import Robot
 from visioncal.types import Target
 
 # What well-kept arms and cameras repeat to, where nothing is known of it [rad, m and px].
-TYPICAL_NOISE, TYPICAL_PX = Noise(5e-5, 3e-5), 0.1
+TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(5e-5, 3e-5), 0.1
 # A calibrated cell may have been touched since, by about this [rad and m].
 _TOUCHED_RAD, _TOUCHED_M = 5e-3, 2e-3
 
@@ -75,13 +78,7 @@ def cell_of_calibration(
 
 def _noise(calibration: Calibration) -> tuple[Noise, float]:
     found = calibration.noise
-    noise = Noise(
-        float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
-        1e-3 * found.get("robot_translation_mm", 0.0),
-    )
+    noise = robot_noise(calibration)
     # A few stops may show less than there is by chance.
-    at_least = Noise(
-        max(noise.sigma_rad, 0.5 * TYPICAL_NOISE.sigma_rad),
-        max(noise.sigma_m, 0.5 * TYPICAL_NOISE.sigma_m),
-    )
-    return at_least, found.get("pixel_px", TYPICAL_PX)
+    at_least = np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots)
+    return replace(noise, robots=at_least), found.get("pixel_px", TYPICAL_PX)

@@ -202,8 +202,8 @@ def _cell_document(cell: PlanCell) -> dict[str, Any]:
         },
         "noise": {
             "pixel_px": cell.pixel_px,
-            "robot_translation_m": cell.noise.sigma_m,
-            "robot_rotation_rad": cell.noise.sigma_rad,
+            "robot_translation_m": float(cell.noise.robots[0, 1]),
+            "robot_rotation_rad": float(cell.noise.robots[0, 0]),
         },
         "limits": _limits_document(cell.limits),
         "boxes": [_box_document(it) for it in cell.boxes],

@@ -17,7 +17,7 @@ from visioncal.estimation.positions import (
     residuals,
     supplied_poses,
 )
-from visioncal.estimation.problem import Effect
+from visioncal.estimation.problem import Effect, State
 from visioncal.estimation.variance import Knowledge
 from visioncal.figures import figure
 from visioncal.files import did_you_mean, some_of
@@ -127,9 +127,9 @@ class Readings:
             data, camera_covariance=spread, guess=guess, effects=tuple(self.effects(poses))
         )
 
-    def moved(self, edges: Edges) -> "Readings":
+    def moved(self, state: State) -> "Readings":
         """Returns the readings with what a fit found of the mounting."""
-        return self if self.mounting is None else replace(self, mounting=self._mounted.moved(edges))
+        return self if self.mounting is None else replace(self, mounting=self._mounted.moved(state))
 
     @property
     def _mounted(self) -> Mounting:

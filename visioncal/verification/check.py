@@ -140,7 +140,7 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     belief = Belief(
         footing.state,
         footing.covariance,
-        footing.noise(from_corners=seen.from_corners).levels,
+        footing.noise(from_corners=seen.from_corners),
         footing.freedom,
     )
     causes = causes_of(seen, footing, board_placed_anew=board_placed_anew)

@@ -18,8 +18,7 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.closure import Noise
-from visioncal.estimation.problem import State
+from visioncal.estimation.problem import Noise, State
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document
@@ -117,13 +116,14 @@ class Footing:
         if f"{of}_rotation_deg" not in stated:
             # Poses of another origin than the calibration's: as they scattered there in all.
             rms = self.calibration.rms
-            return Noise(float(np.deg2rad(rms.deg or 0.0) / np.sqrt(3)), 1e-3 * rms.mm / np.sqrt(3))
+            deg, mm = (rms.deg or 0.0) / np.sqrt(3), rms.mm / np.sqrt(3)
+            return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
         intervals = stages.get("uncertainty", {}).get("noise_95", {})
         deg, mm = (
             max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
             for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
         )
-        return Noise(float(np.deg2rad(deg)), 1e-3 * mm)
+        return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
 
     @property
     def freedom(self) -> float:
