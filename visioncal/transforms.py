@@ -140,6 +140,14 @@ def rotation_angle(matrices: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(sine, cosine))
 
 
+def distances(poses: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (m,) [m] and (m,) [rad] of (m, 4, 4) poses from another, or from one each."""
+    return (
+        np.linalg.norm(poses[:, :3, 3] - others[..., :3, 3], axis=1),
+        rotation_angle(invert(others) @ poses),
+    )
+
+
 def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     """Distance between the origins [mm] and angle [deg] of two (4, 4) poses in one frame."""
     between = invert(a) @ b

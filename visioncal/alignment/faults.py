@@ -9,13 +9,12 @@ import numpy as np
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
 from visioncal.chance import chi2_limit
-from visioncal.estimation.closure import deviations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import by_noise_alone
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.stages.validate import apart
-from visioncal.transforms import mean_transform, pose_difference
+from visioncal.transforms import distances, mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
 
 # An image fits another stop where it is as near to what is predicted there as noise may put it, and
@@ -190,8 +189,9 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
 def _moved_by(solved: Solved, base: str, rows: IntArray) -> str:
     """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
     asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
-    shift_mm, turn_deg = pose_difference(np.eye(4), mean_transform(asked))
-    scatter_mm = 1e3 * float(np.median(deviations(asked)[0]))
+    mean = mean_transform(asked)
+    shift_mm, turn_deg = pose_difference(np.eye(4), mean)
+    scatter_mm = 1e3 * float(np.median(distances(asked, mean)[0]))
     return f"{figure(shift_mm)} mm and {figure(turn_deg)} deg" * (scatter_mm < _ALIKE * shift_mm)
 
 

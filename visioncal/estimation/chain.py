@@ -35,6 +35,7 @@ def chain(
     *,
     stops: IntArray | None = None,
     targets: Sequence[str] = (),
+    order: Sequence[str] = (),
     effects: Sequence[Effect] = (),
     priors: Sequence[FramePrior] = (),
     turned_by_choice: bool = False,
@@ -48,6 +49,7 @@ def chain(
         covariance: (m, 6, 6) of its right perturbations; None where nothing is known of it.
         stops: (m,) the stop of each view, numbered from 0; None where each has its own.
         targets: (m,) the frame of the target that each view shows; empty for an only one.
+        order: The targets in the order of the unknowns; empty for that of their first views.
         effects: What moves views together.
         priors: What was measured of frames by hand.
         turned_by_choice: Whether the targets' rotation is a matter of choice, as of points.
@@ -55,7 +57,8 @@ def chain(
     count = len(cam_from_target)
     (camera, observer), (target, only) = (it.split("_from_") for it in edge_names(mount))
     observed = tuple(targets) or (only,) * count
-    unknown = {observer: Branch(camera), **{it: Branch(target) for it in observed or (only,)}}
+    targets = order or observed or (only,)
+    unknown = {observer: Branch(camera), **{it: Branch(target) for it in targets}}
     return Problem(
         Tree(BASE, {FLANGE: Branch(BASE, robot=ROBOT), **unknown}),
         {ROBOT: base_from_flange},

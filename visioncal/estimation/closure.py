@@ -38,7 +38,7 @@ from visioncal.estimation.solve import (
     starting_noise,
 )
 from visioncal.estimation.variance import Knowledge
-from visioncal.transforms import exp, invert, log, mean_transform, rotation_angle
+from visioncal.transforms import distances, exp, invert, log, mean_transform
 from visioncal.types import FloatArray, IntArray, Mask, Mount
 
 # Information that keeps the target's rotation, where that is a matter of choice [1 / rad^2].
@@ -252,14 +252,6 @@ class ClosureFit:
 def deviations(placed: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Deviation of each view's target from the mean of all: (m,) [m] and (m,) [rad]."""
     return distances(placed, mean_transform(placed))
-
-
-def distances(placed: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance of each view's target from a place, or from its own: (m,) [m] and (m,) [rad]."""
-    return (
-        np.linalg.norm(placed[:, :3, 3] - z[..., :3, 3], axis=1),
-        rotation_angle(invert(z) @ placed),
-    )
 
 
 def fit_closure(data: Closure, edges: Edges) -> ClosureFit:

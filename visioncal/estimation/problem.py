@@ -367,12 +367,17 @@ class Problem:
 
     @cached_property
     def of_one_stop(self) -> IntArray:
-        """(n,) what is of the same frames at one stop, numbered in the order of appearance."""
-        seen, keys = self.observations, dict[tuple[int, str, str], int]()
-        every = zip(seen.stops.tolist(), seen.observers, seen.observed, strict=True)
+        """(n,) what is of the same frames at one stop, numbered in the order of appearance.
+
+        What several effects on sensors move stays apart: merged, it would tell of them together.
+        """
+        seen, keys = self.observations, dict[tuple[int, str, str, int], int]()
+        moved = [it.by_sensor.any(axis=(1, 2)) for it in self.effects if it.by_sensor is not None]
+        apart = np.where(np.sum(moved, axis=0) > 1, np.arange(len(seen)), -1).tolist()
+        every = zip(seen.stops.tolist(), seen.observers, seen.observed, apart, strict=True)
         return np.array([keys.setdefault(it, len(keys)) for it in every], dtype=np.int64)
 
-    def merged(self, units: IntArray) -> "Problem":
+    def merged(self, units: IntArray | None = None) -> "Problem":
         """Makes one observation of all of one unit.
 
         Their poses are averaged with their information, and by how much they disagree they tell of
@@ -381,8 +386,9 @@ class Problem:
 
         Args:
             units: (n,) the unit of each observation, numbered from 0 in the order of first
-                appearance; those of one are of the same frames at one stop.
+                appearance; those of one are of the same frames at one stop. None for `of_one_stop`.
         """
+        units = self.of_one_stop if units is None else units
         first = np.unique(units, return_index=True)[1]
         if len(first) == len(units):
             return self

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel, blocks_of
-from visioncal.estimation.closure import distances
 from visioncal.estimation.problem import ROBOT, State
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree
 from visioncal.stages.kinematics import check_asked, choose_level, doubts, findings
-from visioncal.transforms import invert, mean_transform
+from visioncal.transforms import distances, invert, mean_transform
 from visioncal.types import Mask
 
 # Poses and joints are written with so many digits [m, rad].

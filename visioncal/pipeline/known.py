@@ -316,6 +316,7 @@ class Known:
             covariance,
             stops=self.stops_of(views),
             targets=self.targets(views),
+            order=[self.frame_of(it) for it in self.boards],
             # What is shared counts from where it is.
             effects=[replace(it, values=np.zeros(len(it))) for it in effects],
             priors=self.priors,
@@ -488,7 +489,9 @@ class Known:
         )
         if len(self.boards) < 2 or all(self.poses[view].corners is not None for view in views):
             return stops
-        return self.shown(views).units(stops)
+        of_board: dict[tuple[int, int], int] = {}
+        both = zip(stops.tolist(), (self.poses[view].board for view in views), strict=True)
+        return np.array([of_board.setdefault(it, len(of_board)) for it in both], dtype=np.int64)
 
     @cached_property
     def _visits(self) -> Mapping[int, object]:

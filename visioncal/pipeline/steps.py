@@ -289,9 +289,8 @@ def _refine(known: Known) -> Known:
     if agreed is None or known.solver != "joint":
         return known
     if scene is None or free is None or any(it is None for it in known.seen(known.used)):
-        problem = known.closure(known.used).merged(known.stops).problem
-        frames = dict(zip(problem.unknown, known.edges[:2], strict=True))
-        return replace(known, arm=arm_errors(_arm(known), problem, frames))
+        problem = known.problem(known.used).merged()
+        return replace(known, arm=arm_errors(_arm(known), problem, known.frames))
     notes = known.notes
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]

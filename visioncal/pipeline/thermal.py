@@ -111,8 +111,8 @@ def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
     q = known.joints(known.used)
     model = ArmModel.of(robot, q, known.flange_poses(known.used))
     known = replace(known, arm=None)
-    problem = known.closure(known.used).merged(known.stops).problem
-    state = State(known.edges[:2], problem.start_values)
+    problem = known.problem(known.used).merged()
+    state = problem.start(known.frames)
     noise, basis = starting_noise(problem), model.columns("links", q[first])
     links = find_arm_errors(problem, state, noise, ROBOT, basis, of_links=True)
     if links is not None:

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration import Rms, ViewResult
-from visioncal.estimation.closure import distances
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import HELD_BACK, Known, rms_of
 from visioncal.pipeline.layout import own_numbers
 from visioncal.stages.validate import chain_rms_px, predict_corners
-from visioncal.transforms import mean_transform
+from visioncal.transforms import distances, mean_transform
 from visioncal.types import Corners, FloatArray
 
 _NO_POSE = (
