@@ -57,7 +57,9 @@ class Recorded:
 
     Attributes:
         problem: The stops, without errors of the arm. Of its effects, what lens and boards leave
-            open comes first, and behind it where further boards are.
+            open comes first.
+        edges: Those of the problem, the camera's first.
+        board: The frame of the board that is planned for.
         free: Lens and boards as the views see them.
         q: (s, n) joint angles of the stops [rad]; None where they are not known.
         noise: Of the robot at the stops.
@@ -65,6 +67,8 @@ class Recorded:
     """
 
     problem: Problem
+    edges: FloatArray
+    board: str
     free: Free
     q: FloatArray | None
     noise: Noise
@@ -74,6 +78,11 @@ class Recorded:
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
         return _of_effects(self.problem)
+
+    def edges_in(self, cell: PlanCell) -> FloatArray:
+        """The edges where a cell is guessed to be; further boards go with the one planned for."""
+        before = self.edges[self.problem.unknown[self.board]]
+        return np.concatenate([cell.x[None], cell.z @ invert(before) @ self.edges[1:]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +178,7 @@ def stop_factors(
     poses = cell.cam_from_target(q)
     stack, seen = _predicted(cell, poses, 0 if recorded is None else recorded.first_corner)
     known = free.information if recorded is None else recorded.shared
-    # No further board is seen, wherever it is.
+    # Nothing else of what is shared moves a stop that stands still.
     elsewhere = np.zeros((int(seen.sum()), 6, len(known) - len(free.columns)))
     size = 12 + len(known) + sum(_arm_sizes(cell.robot, purpose))
     factors = np.zeros((len(q), 6, size))
@@ -182,7 +191,8 @@ def stop_factors(
             floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
             effects=[_effect(known, [found.by_shared[:, :, free.columns], elsewhere])],
         )
-        problem, state = _erring(cell, purpose, problem, q[seen])
+        problem = _erring(cell, purpose, problem, q[seen])
+        state = State(np.stack([cell.x, cell.z]), problem.start_values)
         linear = problem.linear(state, ideal=True)
         root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
         factors[seen] = np.linalg.solve(root, linear.jacobian)
@@ -268,21 +278,26 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) 
         )
     stops = len(recorded.problem.poses[ROBOT])
     at = np.zeros((stops, cell.robot.joint_count)) if q is None else q
-    problem, state = _erring(cell, purpose, recorded.problem, at)
+    problem = _erring(cell, purpose, recorded.problem, at)
+    state = State(recorded.edges_in(cell), problem.start_values)
     found = fisher_information(problem, state, recorded.noise)
-    found[12:, 12:] -= _of_effects(problem)
-    return found
+    edges, every = 6 * len(problem.unknown), np.arange(problem.size)
+    found[edges:, edges:] -= _of_effects(problem)
+    kept = np.concatenate([every[:6], every[problem.edge_columns(recorded.board)], every[edges:]])
+    # Further boards lie anywhere: what is left once they are eliminated is known of all else.
+    others = np.setdiff1d(every, kept)
+    cross = found[np.ix_(others, kept)]
+    taken = cross.T @ np.linalg.solve(found[np.ix_(others, others)], cross)
+    return np.asarray(found[np.ix_(kept, kept)] - taken)
 
 
-def _erring(
-    cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray
-) -> tuple[Problem, State]:
-    """The problem with the errors of the arm that a purpose is about, and the cell as guessed."""
-    if purpose.blocks:
-        basis = _model(cell.robot, purpose).basis(q)
-        errors = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).effect(ROBOT)
-        problem = problem.with_effects([*problem.effects, errors])
-    return problem, State(np.stack([cell.x, cell.z]), problem.start_values)
+def _erring(cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray) -> Problem:
+    """The problem with the errors of the arm that a purpose is about."""
+    if not purpose.blocks:
+        return problem
+    basis = _model(cell.robot, purpose).basis(q)
+    errors = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).effect(ROBOT)
+    return problem.with_effects([*problem.effects, errors])
 
 
 def _of_effects(problem: Problem) -> FloatArray:

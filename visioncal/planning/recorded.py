@@ -123,24 +123,25 @@ def begin(
     robot, free, targets = known.robot, known.free, tuple(known.session.boards.values())
     if robot is None or free is None or not targets or known.pixel_px is None:
         raise _lacking(known)
-    views, stops = known.used, known.stops
-    first = np.unique(stops, return_index=True)[1]
+    first = known.first_of_stops(known.used)
     arm = _arm(known, robot)
     # The arm's own errors are the purpose's business: they are put in again with its priors.
-    problem = replace(known, arm=None).closure(views).merged(stops).problem
+    problem = replace(known, arm=None).problem(known.used)
+    problem = problem.merged(problem.of_one_stop)
+    board = known.frame_of(known.boards[0])
     with one_blas_thread():
         state, noise = _start(known, problem, guess)
-        nearest, spread = _nearest(problem, state, noise, known.session.mount, guess)
+        edges, spread = _nearest(problem, state, noise, known, guess)
     sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
-        raise _too_vague(known, len(first))
+        raise _too_vague(known)
     cell = PlanCell(
         known.session.mount,
         arm,
         free.appearance.camera,
         targets[known.boards[0]],
-        nearest.edges[0],
-        nearest.edges[1],
+        edges[0],
+        edges[problem.unknown[board]],
         float(sigmas[0]),
         float(sigmas[1]),
         noise,
@@ -149,10 +150,10 @@ def begin(
         boxes,
         spread,
     )
-    q = None if known.joints_rad is None else known.joints(views)[first]
+    q = None if known.joints_rad is None else known.joints(first)
     corner = int(first_corners(targets)[known.boards[0]])
-    recorded = Recorded(problem, free, q, noise, corner)
-    return Begun(cell, recorded, found.refusal, tuple(views[at] for at in first.tolist()))
+    recorded = Recorded(problem, edges, board, free, q, noise, corner)
+    return Begun(cell, recorded, found.refusal, tuple(first))
 
 
 def _arm(known: Known, robot: Robot) -> Robot:
@@ -165,39 +166,46 @@ def _arm(known: Known, robot: Robot) -> Robot:
 
 
 def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, Noise]:
-    still = problem.start_values
+    if known.agreed is None and guess is None:
+        raise _too_vague(known)
+    frames = known.frames
+    if guess is not None and not frames:
+        frames = known.framed(np.stack([guess.x, guess.z]))
+    state = problem.start(frames)
+    if known.agreed is None:
+        return state, _TYPICAL
     if known.hand_eye is not None:
-        found, noise = known.hand_eye.edges.state, known.hand_eye.noise.levels
-    elif known.agreed is not None:
-        fit = fit_problem(problem, State(known.edges[:2], still))
-        found, noise = fit.state, fit.noise
-    elif guess is not None:
-        return State(np.stack([guess.x, guess.z]), still), _TYPICAL
+        noise = known.hand_eye.noise.levels
     else:
-        raise _too_vague(known, len(problem))
-    return State(found.edges, still), replace(
-        noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)
-    )
+        fit = fit_problem(problem, state)
+        state, noise = State(fit.state.edges, state.values), fit.noise
+    return state, replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots))
 
 
 def _nearest(
-    problem: Problem, state: State, noise: Noise, mount: Mount, guess: Guess | None
-) -> tuple[State, FloatArray]:
-    """The likeliest edges with what is known beforehand, and their covariance (12, 12)."""
+    problem: Problem, state: State, noise: Noise, known: Known, guess: Guess | None
+) -> tuple[FloatArray, FloatArray]:
+    """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two.
+
+    These are the camera's and that of the board that is planned for.
+    """
+    pair = [0, problem.unknown[known.frame_of(known.boards[0])]]
+    size = 6 * len(problem.unknown)
+    both = np.arange(size).reshape(-1, 6)[pair].ravel()
     weights = np.zeros((problem.size, problem.size))
-    weights[:12, :12] = np.diag(_weights(mount, guess))
+    weights[both, both] = _weights(known.session.mount, guess)
     for _ in range(_STEPS):
         information, gradient = normal_equations(problem, state, noise)
         away = np.zeros(problem.size)
-        away[:12] = _away(state.edges, guess)
+        away[both] = _away(state.edges[pair], guess)
         step = -covariance_among(information + weights, problem.moving) @ (
             gradient + weights @ away
         )
         # What is shared has settled before; it may follow, but it does not move.
-        step[12:] = 0.0
+        step[size:] = 0.0
         state = state.moved(step)
     spread = covariance_among(fisher_information(problem, state, noise) + weights, problem.counted)
-    return state, spread[:12, :12]
+    return state.edges, spread[np.ix_(both, both)]
 
 
 def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
@@ -233,7 +241,8 @@ def _lacking(known: Known) -> DataError:
     )
 
 
-def _too_vague(known: Known, stops: int) -> DataError:
+def _too_vague(known: Known) -> DataError:
+    stops = len(known.first_of_stops(known.used))
     return DataError(
         f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
         "of the robot do not tell where camera and board are, not even roughly.",
