@@ -6,13 +6,13 @@ import numpy as np
 
 from visioncal.estimation.boards import place
 from visioncal.pipeline.known import Known
-from visioncal.pipeline.layout import numbered_through
 from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell, Sweep
 from visioncal.simulation.records import approach_text, load_row
 from visioncal.simulation.second import BOARDS
+from visioncal.stages.cameras import detect_targets
 from visioncal.transforms import invert, log
 
 
@@ -59,14 +59,8 @@ def known_of(cell: Cell, *, joints: bool = True, **changes) -> Known:
         arm = {"joints_rad": dict(enumerate(cell.joints)), "robot": load_robot(cell.options.robot)}
         changes = arm | changes
     poses = dict(enumerate(cell.base_from_flange))
-    known = replace(
-        Known(session_of(cell), "joint"),
-        base_from_flange=poses,
-        corners={it.view: it for it in cell.corners},
-        resolution=cell.options.camera.resolution,
-        **changes,
-    )
-    return numbered_through(known)
+    known = replace(Known(session_of(cell)), base_from_flange=poses, **changes)
+    return detect_targets(known, {it.view: it for it in cell.corners})
 
 
 def calibrated(cell: Cell, **changes) -> Known:

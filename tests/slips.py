@@ -16,6 +16,7 @@ from visioncal.robot import load_robot, read_robot_document
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 from visioncal.simulation import Cell
+from visioncal.stages.cameras import detect_targets
 from visioncal.transforms import compose
 from visioncal.types import FloatArray
 
@@ -62,12 +63,10 @@ class Told:
 
     def known(self, **changes) -> Iterator[Known]:
         """What is known after each stage; detection is given."""
-        known = Known(self.session, "joint", **changes)
+        known = Known(self.session, **changes)
         for stage in STAGES:
             if stage.name == "detect":
-                corners = {it.view: it for it in self.cell.corners}
-                size = self.cell.options.camera.resolution
-                known = replace(known, corners=corners, resolution=size)
+                known = detect_targets(known, {it.view: it for it in self.cell.corners})
             else:
                 known = stage.run(known)
             yield known

@@ -374,6 +374,28 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
         aligned(cell)
 
 
+def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
+    cell, _ = clean
+    session = network_session(cell, "cell", seen="names")
+    corners = {it.view: it for it in cell.corners}
+    held = set(list(corners)[::7])
+    views = [replace(it, holdout=it.number in held) for it in session.views]
+    rng = np.random.default_rng(0)
+    spoilt = {
+        view: replace(it, px=it.px + rng.normal(0.0, 3.0, it.px.shape)) if view in held else it
+        for view, it in corners.items()
+    }
+    kept, without = (
+        align(replace(session, views=tuple(views)), corners=it)
+        for it in (spoilt, {view: it for view, it in corners.items() if view not in held})
+    )
+    assert {it.view for it in kept.sights if not it.used} == held
+    assert kept.noise == without.noise
+    for name, edge in without.edges.items():
+        np.testing.assert_array_equal(kept.edges[name].matrix, edge.matrix)
+        np.testing.assert_array_equal(kept.edges[name].covariance, edge.covariance)
+
+
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_one_camera_on_one_robot_gives_what_calibrate_gives(mount):
     # A board whose size is known: one of the two would hold it, and the other weigh it.

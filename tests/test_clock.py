@@ -302,7 +302,7 @@ def test_a_stated_offset_stands_where_motion_does_not_tell_it():
 
 
 def test_what_is_open_about_the_clocks_counts(session):
-    known = Known(session, "joint")
+    known = Known(session)
     for stage in STAGES[: [it.name for it in STAGES].index("clock") + 1]:
         known = stage.run(known)
     spreads = []

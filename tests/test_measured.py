@@ -120,7 +120,7 @@ def test_what_cannot_be_used_is_said():
     cell = simulate(CellOptions(robot="ur5e", views=12, seed=1))
     session = known_of(cell).session
     document = {**session.document, "prior": {"base_from_cam": prior}}
-    elsewhere = Known(replace(session, document=document), "joint")
+    elsewhere = Known(replace(session, document=document))
     assert elsewhere.priors == ()
     other = calibrate(scara_with_tilt({"base_from_cam": prior}))
     assert any(

@@ -8,7 +8,6 @@ from cells import calibrated, error_of, known_of, session_of
 
 from visioncal.errors import DataError
 from visioncal.pipeline.steps import STAGES
-from visioncal.pipeline.unused import nothing_seen
 from visioncal.pipeline.views import view_evidence
 from visioncal.simulation import (
     CellOptions,
@@ -18,6 +17,7 @@ from visioncal.simulation import (
     wide_camera,
 )
 from visioncal.solvers import SOLVERS
+from visioncal.stages.observed import nothing_seen
 from visioncal.types import MOUNTS, Camera, Target
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
@@ -165,5 +165,5 @@ def test_a_session_that_holds_all_views_back_is_told_so(given):
 )
 def test_a_board_with_too_few_corners_is_told_from_one_that_is_not_seen(reason, words):
     known = known_of(simulate(FINE))
-    unseen = replace(known, corners={}, reasons=dict.fromkeys(known.corners, reason))
+    unseen = replace(known, cameras={}, reasons=dict.fromkeys(known.corners, reason))
     assert words in nothing_seen(unseen).message

@@ -73,15 +73,11 @@ def refusal(folder: Path) -> DataError:
 def test_what_the_folder_holds_is_what_the_session_says(folder: Path) -> None:
     session = Session.load(folder)
     assert (session.name, session.mount) == ("bench", "eye-in-hand")
-    assert (session.camera_name, session.camera_model) == ("oak", "brown")
-    assert session.resolution == (1280, 800)
     assert session.camera is not None
+    assert (session.camera_name, session.camera.model) == ("oak", "brown")
+    assert session.resolution == (1280, 800)
     assert session.camera.matrix.tolist() == [800, 801.5, 640, 400]
-    assert (session.intrinsics_mode, session.robot_name, session.robot_tip) == (
-        "auto",
-        "ur10e",
-        "tool0",
-    )
+    assert (session.robot_name, session.robot_tip) == ("ur10e", "tool0")
     assert session.target is not None
     assert session.target.columns == 9
     assert session.columns == tuple(HEADER.split(","))

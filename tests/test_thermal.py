@@ -396,7 +396,7 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
 
 def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
     found = learnt["temperatures"]
-    known = replace(Known(found.session, "joint"), used=tuple(range(len(found.session.views))))
+    known = replace(Known(found.session), used=tuple(range(len(found.session.views))))
     for stage in STAGES[:5]:
         known = stage.run(known)
     # 24 views and then six again, every five minutes; the poses that are told are the same ones.

@@ -258,8 +258,9 @@ def test_other_cells_are_refused_by_what_differs():
     known = known_again(place.cell, np.random.default_rng(9))
     with pytest.raises(DataError, match="no joint angles"):
         seen_by(replace(known, joints_rad=None), footing)
+    look = known.cameras["cam"]
     with pytest.raises(DataError, match="640 x 480"):
-        seen_by(replace(known, resolution=(640, 480)), footing)
+        seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), footing)
     older = dict(place.calibration.stages)
     del older["joint_fit"]
     with pytest.raises(DataError, match="an older version"):

@@ -18,7 +18,7 @@ from visioncal.types import FloatArray
 
 def known_of(session: Session, **changes) -> Known:
     """What is known at the end of the way."""
-    known = replace(Known(session, "joint"), **changes)
+    known = replace(Known(session), **changes)
     for stage in STAGES:
         known = stage.run(known)
     return known
@@ -37,7 +37,7 @@ def errors_of(shop: Shop, known: Known) -> FloatArray:
 
 def solved_of(session: Session, **changes) -> Known:
     """What is known once both edges are, with the nominal arm unless a `level` is asked for."""
-    known = replace(Known(session, "joint"), **({"level": "hand-eye"} | changes))
+    known = replace(Known(session), **({"level": "hand-eye"} | changes))
     for stage in STAGES:
         known = stage.run(known)
         if stage.name == "hand-eye":

@@ -321,7 +321,7 @@ def real_folds(path: Path, repeats: int) -> tuple[float, float]:
     from visioncal.pipeline.steps import STAGES
 
     session = Session.load(path)
-    seen = Known(session, "joint")
+    seen = Known(session)
     for stage in STAGES:
         if stage.name in ("robot", "detect", "intrinsics", "pnp", "choose"):
             seen = stage.run(seen)

@@ -13,6 +13,7 @@ from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, View, frame_name
+from visioncal.stages.observed import HELD_BACK
 from visioncal.types import FloatArray
 
 _CELL = "cell"
@@ -138,8 +139,8 @@ def robot_key(name: str) -> str:
 
 
 def _unusable(it: Observation) -> str:
-    if it.view.text.get("role", "").strip() == "holdout":
-        return "held back: role is holdout"
+    if it.view.holdout:
+        return HELD_BACK
     if it.lacks:
         robots = ", ".join(filter(None, it.lacks)) or "the robot"
         return f"no row of its stop tells where {robots} stood"

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.alignment.cell import Cell, robot_key
-from visioncal.alignment.looking import Looked
 from visioncal.errors import VisioncalError
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay
@@ -20,6 +19,7 @@ from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.tables import ClockTable
 from visioncal.stages.clock import Clocked, Sweep, set_clock
 from visioncal.stages.motion import has_motion, is_open, motion_of
+from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import numbered_positions
@@ -81,12 +81,12 @@ class Clocks:
                 ]
         return tuple(found)
 
-    def looked(self, before: Looked) -> Looked:
+    def looked(self, before: Observed) -> Observed:
         """What the cameras saw, with poses that were made anew."""
         return replace(before, poses={**before.poses, **self.poses})
 
 
-def set_clocks(session: Session, looked: Looked) -> Clocks:
+def set_clocks(session: Session, looked: Observed) -> Clocks:
     """Gives rows the poses of robots at their times.
 
     Args:
@@ -112,7 +112,7 @@ def stream_of(session: Session, robot: str) -> str:
     return name if name in session.streams and has_motion(session.streams[name]) else ""
 
 
-def _with_pair(clocks: Clocks, pair: Pair, rows: list[Observation], looked: Looked) -> Clocks:
+def _with_pair(clocks: Clocks, pair: Pair, rows: list[Observation], looked: Observed) -> Clocks:
     session = clocks.session
     document = session.robot_documents.get(pair.robot)
     model = None if document is None else Robot.from_document(document)
@@ -122,7 +122,7 @@ def _with_pair(clocks: Clocks, pair: Pair, rows: list[Observation], looked: Look
         "eye-in-hand" if session.frames[pair.camera] == flange else "eye-to-hand",
         tuple(it.view for it in rows),
         _stated_s(session, pair.camera),
-        looked.cameras[pair.camera].camera if pair.camera in looked.cameras else None,
+        looked.lenses[pair.camera].camera if pair.camera in looked.lenses else None,
         numbered_positions(tuple(session.boards.values())),
     )
     try:

@@ -23,9 +23,8 @@ from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.stages.observed import HELD_BACK
 from visioncal.types import Mask, Rejection
-
-_HELD_BACK = "held back"
 
 
 def findings_of(
@@ -111,7 +110,7 @@ def _sensors(
         lost = [
             Rejection(it.view, it.reason)
             for it in mine
-            if not it.used and it.view not in spared and not it.reason.startswith(_HELD_BACK)
+            if not it.used and it.view not in spared and it.reason != HELD_BACK
         ]
         levels = noise.get(seer, {})
         found.append(

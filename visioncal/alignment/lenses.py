@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.alignment.cell import Cell
-from visioncal.alignment.looking import CameraLook
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import Fitted, settle
 from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.problem import Effect, Noise, Problem
-from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
+from visioncal.estimation.scene import CornerProblem, repeat_shares
+from visioncal.stages.observed import Observed
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.refine import chosen
 from visioncal.types import Corners, FloatArray, IntArray
@@ -70,14 +70,14 @@ class CellSide:
 
 def with_looks(
     cell: Cell,
-    cameras: Mapping[str, CameraLook],
+    looked: Observed,
     views: Sequence[ViewPoses],
     agreed: Agreed,
     others: Sequence[Effect],
 ) -> tuple[Agreed, Seen]:
     """Fits lenses and boards with the rest, and with other effects."""
     side = CellSide(cell, agreed, others)
-    looks = _looks(cell, cameras, views, _shares(cell, agreed))
+    looks = _looks(looked, views, _shares(cell, agreed))
     return side.settled(chosen(side, settle(looks, side, looks.first, side.frames)))
 
 
@@ -94,30 +94,18 @@ def _shares(cell: Cell, agreed: Agreed) -> dict[int, float]:
     )
 
 
-def _looks(
-    cell: Cell,
-    cameras: Mapping[str, CameraLook],
-    views: Sequence[ViewPoses],
-    shares: Mapping[int, float],
-) -> Looks:
-    targets = tuple(cell.session.boards.values())
-    one = {it.view: it for it in views}
+def _looks(looked: Observed, views: Sequence[ViewPoses], shares: Mapping[int, float]) -> Looks:
+    known = {**looked.poses, **{it.view: it for it in views}}
     problems, poses = {}, {}
-    for name, it in cameras.items():
-        scene = Scene(
-            targets,
-            it.camera,
-            it.estimated,
-            it.table.intrinsics,
-            it.table.matrix_sigma_px,
-            tuple(cell.session.boards),
-        )
-        mine = [one.get(view.view, view) for view in it.views]
+    for name, scene in looked.scenes.items():
+        mine = [known[it] for it in looked.cameras[name].corners if it in known]
         corners: dict[int, Corners] = {
-            view.view: view.corners for view in mine if view.corners is not None
+            view.view: view.corners
+            for view in mine
+            if view.corners is not None and view.view not in looked.held_back
         }
         problems[name] = CornerProblem.of(scene, corners, shares)
-        poses[name] = np.array([view.cam_from_target[0] for view in mine])
+        poses[name] = np.array([known[it].cam_from_target[0] for it in corners])
     return Looks.of(problems, poses)
 
 

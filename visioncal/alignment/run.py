@@ -34,7 +34,7 @@ from visioncal.alignment.judging import (
     findings_of,
     weakest_link,
 )
-from visioncal.alignment.looking import Looked, look_around, stated_camera
+from visioncal.alignment.reading import readings
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.alignment.unseen import budget_mm, left_out
@@ -46,9 +46,11 @@ from visioncal.estimation.solve import covariance_of
 from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.arms import ArmFound
+from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.stages.delays import FoundDelay
 from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
+from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.validate import HeldOut
 from visioncal.targets import corner_positions, target_document
@@ -88,7 +90,8 @@ def align(
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    looked = look_around(read_cell(loaded), corners, progress)
+    looked = Observed(loaded, progress, poses=readings(read_cell(loaded)))
+    looked = locate_targets(estimate_lenses(detect_targets(looked, corners)))
     if progress is not None:
         progress("align", 0, 1)
     with one_blas_thread():
@@ -103,7 +106,7 @@ def align(
 def alignment_of(
     session: Session,
     cell: Cell,
-    looked: Looked,
+    looked: Observed,
     clocks: Clocks,
     solved: Solved,
     convention: Convention | None = None,
@@ -233,7 +236,7 @@ def _arms(session: Session, solved: Solved, told: Mapping[str, ArmFound]) -> dic
 
 
 def _warnings(
-    solved: Solved, looked: Looked, spread: FloatArray, found: Mapping[str, Misfit]
+    solved: Solved, looked: Observed, spread: FloatArray, found: Mapping[str, Misfit]
 ) -> list[str]:
     """Reasons for doubt that are no figure of the result."""
     agreed = solved.agreed
@@ -332,7 +335,7 @@ def _noise(solved: Solved) -> dict[str, dict[str, float]]:
 
 
 def _cameras(
-    solved: Solved, looked: Looked, spread: FloatArray, edges: int
+    solved: Solved, looked: Observed, spread: FloatArray, edges: int
 ) -> dict[str, CameraResult]:
     seen, looks = solved.seen, solved.looks
     # Measured poses do without a camera; whoever looks through it later does not.
@@ -340,20 +343,19 @@ def _cameras(
         frame: CameraResult(camera, estimated=False)
         for name, table in solved.cell.session.cameras.items()
         if (frame := frame_name("camera", name)) in solved.cell.tree.branches
-        and table.resolution is not None
-        and (camera := stated_camera(table, (table.resolution[0], table.resolution[1]))) is not None
+        and (camera := table.stated) is not None
     }
     if seen is None or looks is None:
         return found
-    for name, look in looked.cameras.items():
+    for name, scene in looked.scenes.items():
         lens = np.arange(looks.lenses[name].start, looks.lenses[name].stop)
         if not np.isin(lens, seen.free).all():
-            found[name] = CameraResult(looks.camera(name), look.estimated)
+            found[name] = CameraResult(looks.camera(name), scene.estimated)
             continue
         at = solved.columns_of(lens)
         found[name] = CameraResult(
             looks.camera(name),
-            look.estimated,
+            scene.estimated,
             spread[np.ix_(at, at)],
             spread[at, : 6 * edges],
         )

@@ -9,7 +9,6 @@ from visioncal.alignment.arms import arms_of, check_arms, with_errors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.clocks import Clocks
 from visioncal.alignment.lenses import settled_looks, with_looks
-from visioncal.alignment.looking import Looked
 from visioncal.alignment.priors import most_contradicted
 from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
@@ -19,6 +18,7 @@ from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.stages.arms import RobotArm, effects_of
 from visioncal.stages.choose import chosen
+from visioncal.stages.observed import Observed
 from visioncal.stages.pairwise import Candidates
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.sighted import Sighted
@@ -72,7 +72,7 @@ class Solved:
         return np.asarray(first + np.searchsorted(free, places))
 
 
-def solve(cell: Cell, looked: Looked, clocks: Clocks, asked: str = "auto") -> Solved:
+def solve(cell: Cell, looked: Observed, clocks: Clocks, asked: str = "auto") -> Solved:
     """Solves a whole cell.
 
     Args:
@@ -100,8 +100,8 @@ def solve(cell: Cell, looked: Looked, clocks: Clocks, asked: str = "auto") -> So
     arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
     seen, late = None, clocks.effects(cell)
     others = (*late, *effects_of(arms))
-    if looked.cameras:
-        agreed, seen = with_looks(cell, looked.cameras, views, agreed, others)
+    if looked.scenes:
+        agreed, seen = with_looks(cell, looked, views, agreed, others)
     elif others:
         agreed = _with_effects(agreed, others)
     if asked != "hand-eye":

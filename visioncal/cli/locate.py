@@ -29,10 +29,10 @@ from visioncal.frames.located import Located
 from visioncal.frames.look import check_size
 from visioncal.frames.picks import locate_views
 from visioncal.frames.sighting import check_mount, pose_of
-from visioncal.pipeline.known import by_reason
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
 from visioncal.session.selecting import has_several, select
+from visioncal.stages.observed import by_reason
 from visioncal.stored import load_result
 from visioncal.targets import target_from_document
 from visioncal.types import FloatArray, Target

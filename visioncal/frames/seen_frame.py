@@ -26,9 +26,9 @@ from visioncal.frames.sighting import (
     without_label,
 )
 from visioncal.frames.verdicts import Doubt, verdict_of, weak_directions
-from visioncal.pipeline.known import HELD_BACK, by_reason
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
+from visioncal.stages.observed import HELD_BACK, by_reason
 from visioncal.types import FloatArray, Progress
 
 # The detail of a frame by which its camera's calibration is known.

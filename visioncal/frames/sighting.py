@@ -9,12 +9,12 @@ from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.frames.chain import Eye
 from visioncal.frames.sight import Parent, Sight, needs_robot
-from visioncal.pipeline.known import HELD_BACK, by_reason
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.detect import detect, image_of
+from visioncal.stages.observed import HELD_BACK, by_reason
 from visioncal.stages.reported import Reported, reported_poses
 from visioncal.types import FloatArray, Progress, Rejection, Target
 

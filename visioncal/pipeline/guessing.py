@@ -44,7 +44,7 @@ def guess_session(
         DegenerateError: Too few views have both poses, or the lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    return guess_seen(_seen(Known(session, "joint", progress)), robot)
+    return guess_seen(_seen(Known(session, progress)), robot)
 
 
 def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
@@ -84,7 +84,7 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
         DegenerateError: The lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    seen = _seen(Known(session, "joint", progress))
+    seen = _seen(Known(session, progress))
     return _camera_numbers(replace(seen, poses=seen.poses_of_one_board))
 
 

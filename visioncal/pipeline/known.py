@@ -1,6 +1,5 @@
 """What is known of a session so far; every stage adds to it."""
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,11 +16,10 @@ from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.closure import Closure, Noise
 from visioncal.estimation.problem import ROBOT, FramePrior, Problem
 from visioncal.estimation.scene import Scene
-from visioncal.files import some_of
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
 from visioncal.robot import Convention, Loads, Robot, with_zeros
-from visioncal.session import Session, frame_name
+from visioncal.session import frame_name
 from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
@@ -31,6 +29,7 @@ from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.measured import priors_of
+from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
@@ -39,22 +38,15 @@ from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
 from visioncal.thermal import Inputs, Stops, ThermalFit
 from visioncal.transforms import invert
-from visioncal.types import Corners, FloatArray, IntArray, Progress, Rejection, SolverName
-
-# So many views of one reason are named.
-_LISTED = 40
-# Why a view is in no fit although nothing is wrong with it.
-HELD_BACK = "held out of the fit by the session (role = holdout)"
+from visioncal.types import Corners, FloatArray, IntArray, Rejection, SolverName
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """Everything that is known of a session at some point of the way.
+class Known(Observed):
+    """Everything that is known of a session of one pair at some point of the way.
 
     Attributes:
-        session: What was recorded.
         solver: The hand-eye solver asked for.
-        progress: Told of long work.
         robot: The nominal robot, where the session names a known one.
         base_from_flange: (4, 4) by view, as the robot reported it.
         boards: Which of the session's boards the chain holds: the one it ends at, and others.
@@ -63,14 +55,9 @@ class Known:
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         matched: The joints beside the reported poses; None without a robot.
         lost_zero: A joint whose zero is far from where the model has it.
-        corners: What was found of the target, by view; those of several are numbered through.
-        resolution: Size of the images [px].
-        camera: The intrinsics, where there are images.
         clock: How the clocks of camera and robot go together; None where all poses were reported.
         spared: Why views of a sweep are not needed, by view.
         readings: What an instrument read, where that is all that was observed.
-        poses: The target's pose by view; several candidates until they are chosen from.
-        pixel_px: Noise of a corner's coordinate [px].
         used: The views in the fit, in the session's order.
         candidates: The views that could be in the fit, if they agree.
         agreed: Which of them do.
@@ -89,14 +76,10 @@ class Known:
         held_out: Residuals of used views, left out of the fit.
         findings: What the verdict is made of.
         verdict: Whether to trust it all.
-        reasons: Why a view cannot be used, by view.
-        warnings: What the user should know, in sentences.
         notes: What is good to know and no reason for doubt.
     """
 
-    session: Session
-    solver: SolverName
-    progress: Progress | None = None
+    solver: SolverName = "joint"
     robot: Robot | None = None
     base_from_flange: Mapping[int, FloatArray] = field(default_factory=dict)
     joints_rad: Mapping[int, FloatArray] | None = None
@@ -105,14 +88,9 @@ class Known:
     compared_frames: Mapping[str, FloatArray] = field(default_factory=dict)
     matched: Matched | None = None
     lost_zero: JointReading | None = None
-    corners: Mapping[int, Corners] = field(default_factory=dict)
-    resolution: tuple[int, int] | None = None
-    camera: CameraResult | None = None
     clock: Clock | None = None
     spared: Mapping[int, str] = field(default_factory=dict)
     readings: Readings | None = None
-    poses: Mapping[int, ViewPoses] = field(default_factory=dict)
-    pixel_px: float | None = None
     used: tuple[int, ...] = ()
     candidates: tuple[int, ...] = ()
     agreed: Agreed | None = None
@@ -131,14 +109,22 @@ class Known:
     held_out: HeldOut | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None
-    reasons: Mapping[int, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def noting(self, rejections: Iterable[Rejection], warnings: Iterable[str] = ()) -> Self:
-        """Adds rejected views, of which the first reason counts, and warnings."""
-        reasons = {it.view: it.reason for it in rejections} | dict(self.reasons)
-        return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))
+    @property
+    def camera(self) -> CameraResult | None:
+        """The intrinsics, where there are images."""
+        return next(iter(self.lenses.values()), None)
+
+    @property
+    def pixel_px(self) -> float | None:
+        """Noise of a corner's coordinate [px]."""
+        return next((it.pixel_px for it in self.cameras.values()), None)
+
+    def with_noise(self, pixel_px: float) -> Self:
+        """Takes over the noise of corners."""
+        cameras = {it: replace(look, pixel_px=pixel_px) for it, look in self.cameras.items()}
+        return replace(self, cameras=cameras)
 
     def without_poses(self, rejections: Iterable[Rejection]) -> Self:
         """Leaves out the robot's side of some views."""
@@ -162,7 +148,7 @@ class Known:
     def seeing(self, refined: Refined) -> Self:
         """Takes over lens, board and poses, and makes the poses of all other views anew."""
         seen = {it.view: it for it in refined.views}
-        known = replace(self, free=refined.free, pixel_px=refined.sigma_px, arm=refined.arm)
+        known = replace(self.with_noise(refined.sigma_px), free=refined.free, arm=refined.arm)
         known = known.posed([it for view, it in self.poses.items() if view not in seen])
         return replace(known, poses={**known.poses, **seen})
 
@@ -214,30 +200,7 @@ class Known:
     @property
     def scene(self) -> Scene | None:
         """What is looked at, and with what; None where there are no corners."""
-        session, camera = self.session, self.camera
-        if camera is None or not session.boards or self.pixel_px is None:
-            return None
-        table = session.declaration.only_camera
-        sigma_px = None if table is None else table.matrix_sigma_px
-        return Scene(
-            tuple(session.boards.values()),
-            camera.camera,
-            camera.estimated,
-            session.intrinsics_mode,
-            sigma_px,
-            tuple(session.boards),
-        )
-
-    @property
-    def lost_views(self) -> tuple[str, ...]:
-        """The rejected views and those held back, grouped by their reason, in words."""
-        held = dict.fromkeys(sorted(self.held_back - self.reasons.keys()), HELD_BACK)
-        return by_reason({**self.reasons, **held})
-
-    @cached_property
-    def held_back(self) -> frozenset[int]:
-        """The views that the session keeps from every fit (`role = holdout`)."""
-        return frozenset(view.number for view in self.session.views if view.holdout)
+        return next(iter(self.scenes.values()), None)
 
     @property
     def measurable_held_back(self) -> frozenset[int]:
@@ -523,18 +486,6 @@ def _moved(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> Flo
     """Poses (m, 4, 4) of what is on the flange of one model, on that of another."""
     on_flange = invert(before.base_from_flange(q)) @ poses
     return np.asarray(after.base_from_flange(q) @ on_flange)
-
-
-def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
-    """Groups views by why they cannot be used, in words: the commonest reason first."""
-    views = defaultdict(list)
-    for view, reason in reasons.items():
-        views[reason].append(view)
-    grouped = sorted(views.items(), key=lambda item: -len(item[1]))
-    return tuple(
-        f"view{'s' if len(it) > 1 else ''} {some_of([*map(str, it)], _LISTED)}: {reason}"
-        for reason, it in grouped
-    )
 
 
 def rms_of(away_m: FloatArray, away_rad: FloatArray, rms_px: FloatArray) -> Rms:

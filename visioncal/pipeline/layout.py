@@ -6,34 +6,15 @@ import numpy as np
 
 from visioncal.pipeline.known import Known
 from visioncal.targets import corner_positions, first_corners
-from visioncal.types import Corners, FloatArray, IntArray, Rejection
-
-
-def numbered_through(known: Known) -> Known:
-    """Numbers the corners of several boards through, as all stages from here on have them."""
-    session = known.session
-    starts = dict(zip(session.boards, _starts(known).tolist(), strict=True))
-    if len(starts) < 2:
-        return known
-    board_of = {view.number: session.board_of(view) for view in session.views}
-    corners = {view: _shifted(it, starts[board_of[view]]) for view, it in known.corners.items()}
-    return replace(known, corners=corners)
+from visioncal.types import Corners, FloatArray, Rejection
 
 
 def own_numbers(known: Known, corners: Corners) -> Corners:
     """The corners of a view by their numbers on its own board, again."""
     if len(known.session.boards) < 2 or not len(corners.ids):
         return corners
-    starts = _starts(known)
-    return _shifted(corners, -int(starts[starts <= corners.ids[0]][-1]))
-
-
-def _starts(known: Known) -> IntArray:
-    return first_corners(tuple(known.session.boards.values()))
-
-
-def _shifted(corners: Corners, by: int) -> Corners:
-    return replace(corners, ids=corners.ids + by)
+    starts = first_corners(tuple(known.session.boards.values()))
+    return replace(corners, ids=corners.ids - int(starts[starts <= corners.ids[0]][-1]))
 
 
 def without_lost_boards(known: Known) -> Known:

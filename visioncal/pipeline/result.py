@@ -65,7 +65,7 @@ def run(
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
     with one_blas_thread():
-        return _run(Known(loaded, solver, progress, level=level, convention=convention))
+        return _run(Known(loaded, progress, solver=solver, level=level, convention=convention))
 
 
 def _run(known: Known) -> Run:

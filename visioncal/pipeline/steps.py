@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.boards import place
@@ -19,28 +18,28 @@ from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.choosing import arm_told, with_views_back
 from visioncal.pipeline.elastic import check_loads, with_springs
 from visioncal.pipeline.known import Known, rms_of
-from visioncal.pipeline.layout import middles, numbered_through, without_lost_boards
+from visioncal.pipeline.layout import middles, without_lost_boards
 from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unseen import left_out
-from visioncal.pipeline.unused import all_held_back, not_used, nothing_seen
+from visioncal.pipeline.unused import not_used
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
+from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clock import set_clock, sweep_of
-from visioncal.stages.detect import detect
 from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import robot_part, solve_hand_eye
-from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked
 from visioncal.stages.measured import components
 from visioncal.stages.motion import waits_for_clock
+from visioncal.stages.observed import all_held_back, nothing_seen
 from visioncal.stages.place import lay_out
-from visioncal.stages.pnp import ViewPoses, estimate_poses, given_poses, measure_poses
+from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import mounted, read_instrument
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.reported import reported_poses
@@ -152,46 +151,6 @@ def _readings(known: Known) -> Known:
             raise nothing_seen(known)
         readings = mounted(readings, views, known.base_from_flange, known.stops_of(views))
     return known.with_readings(readings)
-
-
-def _detect(known: Known) -> Known:
-    if not any(view.image or view.has_corners for view in known.session.views):
-        return known
-    found = detect(known.session, progress=known.progress)
-    known = replace(known, corners=found.corners, resolution=found.resolution)
-    return numbered_through(known).noting(found.rejections)
-
-
-def _intrinsics(known: Known) -> Known:
-    session, targets = known.session, tuple(known.session.boards.values())
-    fitted = {view: it for view, it in known.corners.items() if view not in known.held_back}
-    if not fitted or not targets or known.resolution is None:
-        return known
-    if session.camera is not None:
-        return replace(known, camera=CameraResult(session.camera, estimated=False))
-    result = estimate_intrinsics(fitted, targets, known.resolution, session.camera_model)
-    camera = CameraResult(result.camera, estimated=True, covariance=result.covariance)
-    return replace(known, camera=camera).noting(result.rejections, result.warnings)
-
-
-def _pnp(known: Known) -> Known:
-    if known.readings is not None:
-        return known
-    targets, poses = tuple(known.session.boards.values()), given_poses(known.session)
-    corners = {view: it for view, it in known.corners.items() if view not in known.reasons}
-    fitted = {view: it for view, it in corners.items() if view not in known.held_back}
-    if fitted and targets and known.camera is not None:
-        unknowns = 0 if known.camera.covariance is None else len(known.camera.covariance)
-        result = estimate_poses(fitted, targets, known.camera.camera, unknowns)
-        rest = {view: it for view, it in corners.items() if view in known.held_back}
-        # What is held back neither sets the noise of the others nor is it left out for its own.
-        held = measure_poses(rest, targets, known.camera.camera, result.sigma_px)
-        seen = {view.view: view for view in (*result.views, *held)}
-        known = replace(known, pixel_px=result.sigma_px).noting(result.rejections)
-        poses = poses | seen
-    if not poses:
-        raise nothing_seen(known)
-    return replace(known, poses=poses)
 
 
 def _joints(known: Known) -> Known:
@@ -457,9 +416,9 @@ def _judge(known: Known) -> Known:
 STAGES: tuple[Stage, ...] = (
     Stage("robot", _read_robot),
     Stage("readings", _readings),
-    Stage("detect", _detect),
-    Stage("intrinsics", _intrinsics),
-    Stage("pnp", _pnp),
+    Stage("detect", detect_targets),
+    Stage("intrinsics", estimate_lenses),
+    Stage("pnp", locate_targets),
     Stage("clock", _clock),
     Stage("joints", _joints),
     Stage("choose", _choose),

@@ -7,8 +7,9 @@ import numpy as np
 
 from visioncal.calibration import Rms, ViewResult
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.known import HELD_BACK, Known, rms_of
+from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import own_numbers
+from visioncal.stages.observed import HELD_BACK
 from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.transforms import distances, mean_transform
 from visioncal.types import Corners, FloatArray

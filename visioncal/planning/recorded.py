@@ -86,7 +86,7 @@ def so_far(session: Session, *, level: str = "hand-eye", progress: Progress | No
     Raises:
         DataError: The input is wrong or shows no target.
     """
-    known = Known(session, "joint", progress, level=level)
+    known = Known(session, progress, level=level)
     for at, stage in enumerate(STAGES):
         if progress is not None:
             progress(stage.name, at, len(STAGES))

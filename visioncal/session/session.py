@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomli_w
 
 from visioncal.errors import DataError
@@ -44,7 +43,7 @@ from visioncal.session.streams import (
 )
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
-from visioncal.types import Camera, CameraKind, Corners, Mount, Target
+from visioncal.types import Camera, Corners, Mount, Target
 
 # The columns of a session without views.
 ALONE = ("view",)
@@ -353,20 +352,7 @@ class Session:
     def camera(self) -> Camera | None:
         """The camera's intrinsics; None where the session leaves them to be estimated."""
         table = self.declaration.only_camera
-        if table is None or table.matrix is None or table.distortion is None:
-            return None
-        if table.resolution is None:
-            return None
-        width, height = table.resolution
-        matrix, distortion = np.array(table.matrix, float), np.array(table.distortion, float)
-        return Camera(table.model, (width, height), matrix, distortion)
-
-    @property
-    def camera_model(self) -> CameraKind:
-        """The model of the camera's lens, known or to be estimated."""
-        return (
-            "brown" if self.declaration.only_camera is None else self.declaration.only_camera.model
-        )
+        return None if table is None else table.stated
 
     @property
     def camera_name(self) -> str:
@@ -379,18 +365,7 @@ class Session:
     def resolution(self) -> tuple[int, int] | None:
         """(width, height) of the images [px], if declared."""
         table = self.declaration.only_camera
-        if table is None or table.resolution is None:
-            return None
-        return table.resolution[0], table.resolution[1]
-
-    @property
-    def intrinsics_mode(self) -> str:
-        """What to do with given intrinsics: `auto`, `hold` or `refine`."""
-        return (
-            "auto"
-            if self.declaration.only_camera is None
-            else self.declaration.only_camera.intrinsics
-        )
+        return None if table is None else table.size
 
     @property
     def robot_name(self) -> str | None:

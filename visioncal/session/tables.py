@@ -2,9 +2,10 @@
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from visioncal.types import CameraKind
+from visioncal.types import Camera, CameraKind
 
 # Squares and products of larger numbers leave what floats hold; no field of a cell has such.
 _LARGEST = 1e15
@@ -34,6 +35,19 @@ class CameraTable(TableModel):
     distortion: list[Number] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
     matrix_sigma_px: PixelSigma | None = None
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """(width, height) of its images [px], if declared."""
+        return None if self.resolution is None else (self.resolution[0], self.resolution[1])
+
+    @property
+    def stated(self) -> Camera | None:
+        """Its intrinsics; None where they are left to be estimated."""
+        if self.matrix is None or self.distortion is None or self.size is None:
+            return None
+        matrix, distortion = np.array(self.matrix, float), np.array(self.distortion, float)
+        return Camera(self.model, self.size, matrix, distortion)
 
 
 class RobotTable(TableModel):

@@ -118,18 +118,19 @@ def detect(
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
     among = session.views if among is None else among
     views = [view for view in among if view.image and not view.has_corners]
+    stated = _stated_resolution(session, among)
     looks: list[_Look] = []
     room = _Room()
     with (
         _ONE_OPENCV_THREAD.held(),
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
-        for look in pool.map(lambda view: _look(session, view, options, room), views):
+        for look in pool.map(lambda view: _look(session, view, stated, options, room), views):
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
     given = [view for view in among if view.has_corners]
-    resolution = _common_resolution(session, views, looks, given)
+    resolution = _common_resolution(session, views, looks, given, stated)
     for name in session.boards:
         _check_layout(session, name, views, looks)
     own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
@@ -168,7 +169,13 @@ def _decoded(view: View, data: bytes) -> Image | Rejection:
     return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
 
 
-def _look(session: Session, view: View, options: DetectOptions, room: _Room) -> _Look:
+def _look(
+    session: Session,
+    view: View,
+    stated: tuple[int, int] | None,
+    options: DetectOptions,
+    room: _Room,
+) -> _Look:
     absence = session.images.absence(view.image)
     if absence:
         return _Look(Rejection(view.number, f"{view.image} {absence}"), None)
@@ -177,7 +184,7 @@ def _look(session: Session, view: View, options: DetectOptions, room: _Room) -> 
     data = session.images.read(view.image)
     size = claimed_size(data) or (0, 0)
     pixels = size[0] * size[1]
-    if session.resolution not in (None, size) and 0 < pixels <= MOST_PIXELS:
+    if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
         # Refused in any case: what another size shows need not be looked at.
         return _Look(Rejection(view.number, f"{view.image} is of another size"), size)
     most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
@@ -260,11 +267,14 @@ def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptio
 
 
 def _common_resolution(
-    session: Session, views: Sequence[View], looks: Sequence[_Look], given: Sequence[View]
+    session: Session,
+    views: Sequence[View],
+    looks: Sequence[_Look],
+    given: Sequence[View],
+    stated: tuple[int, int] | None,
 ) -> tuple[int, int]:
     """Checks that all images have the camera's size, or at least one size between them."""
     sizes = [look.resolution for look in looks if look.resolution is not None]
-    stated = _stated_resolution(session, given)
     if not sizes and given:
         if stated is None:
             raise DataError(
@@ -282,7 +292,7 @@ def _common_resolution(
             culprits=reasons,
             next_step=f"First: {reasons[0]}." if reasons else "Give the views images.",
         )
-    wanted = session.resolution or max(set(sizes), key=sizes.count)
+    wanted = stated or max(set(sizes), key=sizes.count)
     line_of = {view.number: line for line, view in enumerate(session.views, start=2)}
     culprits = [
         f"views.csv line {line_of[view.number]}, column image: {view.image} is "
@@ -291,7 +301,7 @@ def _common_resolution(
         if look.resolution is not None and look.resolution != wanted
     ]
     if culprits:
-        source = "the camera's resolution" if session.resolution else "most other images"
+        source = "the camera's resolution" if stated else "most other images"
         raise DataError(
             f"{culprits[0]}, but {source} is {wanted[0]} x {wanted[1]} px"
             + (f" ({len(culprits)} images in all)." if len(culprits) > 1 else "."),
@@ -301,14 +311,11 @@ def _common_resolution(
     return wanted
 
 
-def _stated_resolution(session: Session, given: Sequence[View]) -> tuple[int, int] | None:
+def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:
     """The size of the images of the camera that took some views, if it is stated."""
-    names = {name_of(session.declaration, "camera", view) for view in given}
-    for name in names & session.cameras.keys():
-        table = session.cameras[name]
-        if table.resolution is not None:
-            return table.resolution[0], table.resolution[1]
-    return session.resolution
+    names = {name_of(session.declaration, "camera", view) for view in views}
+    sizes = {session.cameras[name].size for name in names & session.cameras.keys()} - {None}
+    return sizes.pop() if len(sizes) == 1 else None
 
 
 def _rejections(looks: Sequence[_Look]) -> list[Rejection]:

@@ -93,22 +93,24 @@ def known_before(session: Session, footing: Footing, progress: Progress | None =
     if robot is not None:
         # As calibrated, with its base in the frame of the poses.
         session = replace(session, robot_document=robot.document)
-    return Known(session, "joint", progress)
+    return Known(session, progress)
 
 
 def seen_by(known: Known, footing: Footing) -> Seen:
     """Carries on where targets have been detected; see `see_again`."""
     calibration = footing.calibration
-    if known.resolution is not None:
+    for frame, look in known.cameras.items():
+        if look.resolution is None:
+            continue
         if calibration.camera is None:
             raise DataError(
                 f"calibration {calibration.session_name!r} holds no camera, and session "
                 f"{known.session.name!r} has images.",
                 next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
             )
-        check_resolution(known.session, calibration, known.resolution)
-        camera = CameraResult(calibration.camera.camera, estimated=False)
-        known = replace(known, camera=camera)
+        check_resolution(known.session, calibration, look.resolution)
+        lens = CameraResult(calibration.camera.camera, estimated=False)
+        known = known.with_camera(frame, replace(look, lens=lens))
     # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
     known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clock=None)
     known = _with_arm(known, footing)
@@ -161,7 +163,7 @@ def _posed(known: Known, footing: Footing) -> Known:
     known = replace(known, used=tuple(views), boards=footing.boards, free=footing.free)
     known = replace(known, frames=known.framed(np.concatenate([x[None], placed]))).posed(chosen)
     if known.free is not None and all(it.corners is not None for it in chosen):
-        known = replace(known, pixel_px=_noise_px(known)).posed(chosen)
+        known = known.with_noise(_noise_px(known)).posed(chosen)
     return _with_errors(known, footing)
 
 
