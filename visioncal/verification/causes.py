@@ -61,17 +61,12 @@ def _camera(seen: Seen) -> Cause:
 
 def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each board's edge: a twist on its right."""
-    boards, names = footing.boards, tuple(footing.targets) or ("",)
-    away = log(asked_of_board(seen, footing))
-    shown = _shown(seen)
-    for at, board in enumerate(boards):
-        mine = shown == at
+    names, away = tuple(footing.targets) or ("",), log(seen.away(footing))
+    for at, board in enumerate(footing.boards):
+        mine = seen.boards == at
         if not mine.any():
             continue
-        carried = adjoint(invert(footing.from_first[at]))
-        # The chain ends at the first board: what turns this one is carried there.
-        by_sensor = -np.where(mine[:, None, None], carried, 0.0)
-        start = adjoint(footing.from_first[at]) @ away[mine].mean(axis=0)
+        by_sensor, start = np.where(mine[:, None, None], -np.eye(6), 0.0), away[mine].mean(axis=0)
         yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
 
 
@@ -89,11 +84,6 @@ def _both(camera: Cause, board: Cause) -> Cause:
         np.concatenate([camera.units, board.units]),
         np.concatenate([camera.start, np.zeros(len(board.units))]),
     )
-
-
-def _shown(seen: Seen) -> FloatArray:
-    """(m,) which of the calibration's boards each stop shows; the first of several."""
-    return np.array([seen.known.shown([views[0]]).shown[0] for views in seen.stops])
 
 
 def _joints(seen: Seen, footing: Footing) -> Iterator[Cause]:
@@ -133,13 +123,16 @@ def _noise(seen: Seen) -> Cause:
 
 def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
-    if len(seen.stops) < 2:
+    if seen.stops < 2:
         return
-    away = log(asked_of_board(seen, footing))
-    for at, views in enumerate(seen.stops):
-        by_sensor = np.zeros((len(seen.problem), 6, 6))
-        by_sensor[at] = -np.eye(6)
-        yield _cause(f"{VIEW} {views[0]}", seen, _KNOCK, by_sensor, start=away[at])
+    away, placed = log(seen.away(footing)), footing.edges[1:][seen.boards]
+    for stop in range(seen.stops):
+        mine = seen.problem.observations.stops == stop
+        first = int(np.argmax(mine))
+        # All boards of a stop move together.
+        carried = adjoint(invert(placed) @ placed[first])
+        by_sensor = np.where(mine[:, None, None], -carried, 0.0)
+        yield _cause(f"{VIEW} {seen.views[first][0]}", seen, _KNOCK, by_sensor, start=away[first])
 
 
 def _cause(
@@ -151,7 +144,7 @@ def _cause(
     start: FloatArray | None = None,
 ) -> Cause:
     still = np.zeros((len(seen.problem), 6, len(units)))
-    resting = np.zeros((len(seen.stops), 6, len(units)))
+    resting = np.zeros((seen.stops, 6, len(units)))
     return Cause(
         name,
         still if by_sensor is None else by_sensor,
@@ -159,8 +152,3 @@ def _cause(
         units,
         np.zeros(len(units)) if start is None else start,
     )
-
-
-def asked_of_board(seen: Seen, footing: Footing) -> FloatArray:
-    """(m, 4, 4) by how much the board has moved, on its right, as each stop places it."""
-    return seen.problem.change_of(seen.problem.observations.observed[0], footing.state)

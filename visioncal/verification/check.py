@@ -15,9 +15,9 @@ from visioncal.session.choosing import Choice
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import log, mean_transform
 from visioncal.types import FloatArray, Progress
-from visioncal.verification.causes import BOTH, CAMERA, NOISE, asked_of_board, causes_of, kind_of
+from visioncal.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of
 from visioncal.verification.footing import Footing
-from visioncal.verification.seeing import Seen, see_again
+from visioncal.verification.seeing import Seen, asked_of_boards, see_again
 
 # A change is told where it makes the stops so many times as likely as none. Chance does that in one
 # check of as many at most, by Markov's inequality: the ratio is one on average.
@@ -56,8 +56,8 @@ class Check:
         calibration: The one that was checked.
         seen: The stops.
         footing: What the calibration rests on.
-        away: (m, 6) where each stop places its board (of several, the first), from where it was
-            (rotation [rad], translation [m]), in its frame.
+        away: (m, 6) where each sight places its board, from where it was (rotation [rad],
+            translation [m]), in its frame.
         left: (m, 6) the same with the likeliest change undone, where one was found.
         log_evidence: Logarithm of how many times as likely the stops are with a change as without.
         misfit: Squared distance of the stops from the prediction, in units of sigma.
@@ -135,11 +135,11 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
                 next_step="Leave --board-moved out: each board is compared by itself, and the one "
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
-        moved = mean_transform(asked_of_board(seen, footing))
-        footing = footing.placed_anew(footing.state.edges[1] @ moved, _ANYWHERE)
+        moved = mean_transform(seen.away(footing))
+        footing = footing.placed_anew(footing.edges[1] @ moved, _ANYWHERE)
     belief = Belief(
-        footing.state,
-        footing.covariance,
+        seen.state(footing),
+        seen.covariance(footing),
         footing.noise(from_corners=seen.from_corners),
         footing.freedom,
     )
@@ -155,8 +155,8 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     log_evidence = evidence - nothing.likelihood
     named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
     camera = next(it for it in suspects if it.name == CAMERA)
-    away = log(asked_of_board(seen, footing))
-    left = _left(seen, footing, causes[order[0]], suspects[0].explained) if named else away
+    away = log(seen.away(footing))
+    left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
     return Check(
         footing.calibration,
         seen,
@@ -174,11 +174,10 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
     )
 
 
-def _left(seen: Seen, footing: Footing, cause: Cause, explained: Explained) -> FloatArray:
-    """(m, 6) where each stop places its board with a change undone, from where it was."""
+def _left(seen: Seen, belief: Belief, cause: Cause, explained: Explained) -> FloatArray:
+    """(m, 6) where each sight places its board with a change undone, from where it was."""
     before = undone(seen.problem, cause, explained.values)
-    board = before.observations.observed[0]
-    return log(before.change_of(board, with_change(footing.state, cause)))
+    return log(asked_of_boards(before, with_change(belief.state, cause)))
 
 
 def _shares(causes: Sequence[Cause]) -> FloatArray:

@@ -46,7 +46,7 @@ def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
                 "left_mm": 1e3 * float(np.linalg.norm(left[3:])),
                 "left_deg": float(np.rad2deg(np.linalg.norm(left[:3]))),
             }
-            for views, away, left in zip(check.seen.stops, check.away, check.left, strict=True)
+            for views, away, left in zip(check.seen.views, check.away, check.left, strict=True)
         ],
         "not_used": [
             {"view": view, "reason": reason} for view, reason in sorted(known.reasons.items())

@@ -18,11 +18,11 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.problem import Noise
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document
-from visioncal.transforms import invert, log
+from visioncal.transforms import adjoint, invert, log
 from visioncal.types import FloatArray, Target
 
 # A scale that is known by more degrees of freedom is as good as known.
@@ -38,10 +38,10 @@ class Footing:
     Attributes:
         calibration: Whose.
         targets: What was printed, by the session's names for it; that of an only one is empty.
-        boards: Places among the targets: the one that the chain ends at, then the others.
-        state: x, z, and the values of what all stops share: lens, board, other boards and arm.
-        from_first: (b, 4, 4) where the boards lie from the first.
-        covariance: (12 + k, 12 + k).
+        boards: (b,) places among the targets, of those that were placed.
+        edges: (1 + b, 4, 4) of the camera and of these boards.
+        values: (k,) of what all stops share: lens and boards, then the arm.
+        covariance: (6 + 6 b + k, 6 + 6 b + k) of edges and values.
         looks: (l,) which values of lens and board are among them.
         arm: What the last of them are errors of.
         arm_size: How many these are.
@@ -51,8 +51,8 @@ class Footing:
     calibration: Calibration
     targets: Mapping[str, Target]
     boards: tuple[int, ...]
-    state: State
-    from_first: FloatArray
+    edges: FloatArray
+    values: FloatArray
     covariance: FloatArray
     looks: tuple[int, ...]
     arm: ArmKind
@@ -131,7 +131,7 @@ class Footing:
         return min(noise_freedom(self.calibration), _MOST_FREEDOM)
 
     def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "Footing":
-        """The same with a board that lies somewhere else.
+        """The same with an only board that lies somewhere else.
 
         Args:
             z: (4, 4) about where.
@@ -140,36 +140,57 @@ class Footing:
         spread = self.covariance.copy()
         spread[6:12], spread[:, 6:12] = 0.0, 0.0
         spread[6:12, 6:12] = np.diag(sigmas**2)
-        moved = State(np.stack([self.state.edges[0], z]), self.state.values)
-        return replace(self, state=moved, covariance=spread)
+        return replace(self, edges=np.stack([self.edges[0], z]), covariance=spread)
 
 
 def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
     names = document["boards"]
     x_name, z_name = edge_names(calibration.mount)
-    places = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
+    placed = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
     targets = {
         name: target_from_document(it, name or "target") for name, it in document["targets"].items()
     }
     spread, looks = read_covariance(document, "covariance", (-1, -1)), tuple(document["looks"])
     arm = document.get("arm", {"of": "none", "values": []})
     size = len(arm["values"])
-    before = len(looks) + 6 * (len(names) - 1)
-    if spread.shape != (12 + before + size,) * 2:
+    slopes = _slopes(np.array(placed), len(looks), size)
+    if spread.shape != (slopes.shape[1],) * 2:
         raise ValueError(f"covariance has the shape {spread.shape}")
-    values = np.concatenate([np.zeros(before), np.array(arm["values"], dtype=float)])
     return Footing(
         calibration,
         targets,
         tuple(list(targets).index(it) for it in names) if targets else (0,),
-        State(np.stack([calibration.edges[x_name].matrix, places[0]]), values),
-        invert(np.array(places)) @ places[0],
-        spread,
+        np.stack([calibration.edges[x_name].matrix, *placed]),
+        np.concatenate([np.zeros(len(looks)), np.array(arm["values"], dtype=float)]),
+        slopes @ spread @ slopes.T,
         looks,
         arm["of"],
         size,
         _model(calibration.calibrated_robot, arm),
     )
+
+
+def _slopes(placed: FloatArray, looks: int, arm: int) -> FloatArray:
+    """How edges and values move with the unknowns as they are written.
+
+    Written are the camera's edge and the first board's, then lens and boards, then where each
+    further board lies from the first, and the arm.
+
+    Args:
+        placed: (b, 4, 4) the boards' edges.
+        looks: How many values are of lens and boards.
+        arm: How many are of the arm.
+    """
+    edges, behind = 6 + 6 * len(placed), 6 * len(placed) + 6 + looks
+    slopes = np.zeros((edges + looks + arm, behind + arm))
+    slopes[:12, :12] = np.eye(12)
+    slopes[edges : edges + looks, 12 : 12 + looks] = np.eye(looks)
+    slopes[edges + looks :, behind:] = np.eye(arm)
+    for row, carried in enumerate(adjoint(invert(placed[1:]) @ placed[0])):
+        # z_k exp(d_k) = z_1 exp(d_1) exp(-d) target_1_from_target_k
+        mine, at = slice(12 + 6 * row, 18 + 6 * row), 12 + looks + 6 * row
+        slopes[mine, 6:12], slopes[mine, at : at + 6] = carried, -carried
+    return slopes
 
 
 def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:

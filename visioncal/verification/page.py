@@ -29,7 +29,7 @@ def page_of(check: Check, triggers: Sequence[Outcome]) -> CheckPage:
         sentences(check),
         [] if check.passed else [_change(check, it) for it in listed_suspects(check)],
         _undone(check),
-        [", ".join(map(str, views)) for views in check.seen.stops],
+        [", ".join(map(str, views)) for views in check.seen.views],
         _lengths(check.away),
         _lengths(check.left),
         [TriggerRow(it.state, it.words) for it in sorted(triggers, key=lambda it: order[it.state])],

@@ -10,7 +10,7 @@ from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem import ROBOT, Problem, State
 from visioncal.frames.sighting import check_mount, check_resolution
 from visioncal.pipeline import STAGES
 from visioncal.pipeline.known import Known
@@ -21,7 +21,7 @@ from visioncal.stages.choose import choose_by
 from visioncal.stages.handeye import robot_part
 from visioncal.targets import target_document
 from visioncal.transforms import invert, pose_difference
-from visioncal.types import FloatArray, Progress, Target
+from visioncal.types import FloatArray, IntArray, Progress, Target
 from visioncal.verification.footing import Footing
 
 # Models that place the flange alike to this are of one robot; tables are written with six digits.
@@ -38,22 +38,49 @@ class Seen:
 
     Attributes:
         known: What is known of the session, with the calibration's lens, boards and arm.
-        problem: The m stops, with all that the calibration's unknowns are.
-        stops: The views of each stop.
+        problem: The m sights of a board at a stop, with the calibration's unknowns.
+        places: (e,) those of its edges among the calibration's.
+        views: (m,) the views of each sight.
         warnings: What is odd, in sentences.
     """
 
     known: Known
     problem: Problem
-    stops: tuple[tuple[int, ...], ...]
+    places: IntArray
+    views: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...]
 
     @property
+    def stops(self) -> int:
+        """How many stops there are."""
+        return len(self.problem.poses[ROBOT])
+
+    @property
     def joints_rad(self) -> FloatArray | None:
-        """(m, n) joint angles of the stops [rad]; None where not all have them."""
+        """(s, n) joint angles of the stops [rad]; None where not all have them."""
         if self.known.joints_rad is None or self.known.robot is None:
             return None
-        return self.known.joints([views[0] for views in self.stops])
+        return self.known.joints(self.known.first_of_stops(self.known.used))
+
+    @property
+    def boards(self) -> IntArray:
+        """(m,) which of the calibration's boards each sight is of."""
+        observed = self.problem.observations.observed
+        return np.array([self.places[self.problem.unknown[it]] - 1 for it in observed])
+
+    def state(self, footing: Footing) -> State:
+        """The unknowns as the calibration has them."""
+        return State(footing.edges[self.places], footing.values)
+
+    def covariance(self, footing: Footing) -> FloatArray:
+        """(p, p) of them."""
+        edges = (6 * self.places[:, None] + np.arange(6)).ravel()
+        rows = np.concatenate([edges, np.arange(6 * len(footing.edges), len(footing.covariance))])
+        return np.asarray(footing.covariance[np.ix_(rows, rows)])
+
+    def away(self, footing: Footing) -> FloatArray:
+        """(m, 4, 4) by how much its board has moved, on its right, as each sight places it."""
+        return asked_of_boards(self.problem, self.state(footing))
 
     @property
     def from_corners(self) -> bool:
@@ -115,12 +142,24 @@ def seen_by(known: Known, footing: Footing) -> Seen:
     known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clock=None)
     known = _with_arm(known, footing)
     known = _posed(known, footing)
-    numbered = known.stops
-    stops = tuple(
-        tuple(np.array(known.used)[numbered == at].tolist()) for at in range(numbered.max() + 1)
+    problem = known.problem(known.used)
+    sights, order = problem.of_one_stop, list(known.frames)
+    return Seen(
+        known,
+        problem.merged(sights),
+        np.array([order.index(it) for it in problem.unknown]),
+        tuple(tuple(np.array(known.used)[sights == at].tolist()) for at in range(sights.max() + 1)),
+        tuple(_warnings(known, footing)),
     )
-    problem = known.closure(known.used).merged(numbered).problem
-    return Seen(known, problem, stops, tuple(_warnings(known, footing)))
+
+
+def asked_of_boards(problem: Problem, state: State) -> FloatArray:
+    """(m, 4, 4) the change of its board's edge, on the right, that each observation asks for."""
+    asked, observed = np.zeros((len(problem), 4, 4)), np.array(problem.observations.observed)
+    for board in set(problem.observations.observed):
+        mine = observed == board
+        asked[mine] = problem.change_of(board, state)[mine]
+    return asked
 
 
 def _with_arm(known: Known, footing: Footing) -> Known:
@@ -142,8 +181,7 @@ def _with_arm(known: Known, footing: Footing) -> Known:
 def _posed(known: Known, footing: Footing) -> Known:
     """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
     mount, targets = known.session.mount, tuple(footing.targets.values())
-    x, z = footing.state.edges
-    placed = z @ invert(footing.from_first)
+    x, *placed = footing.edges
     order = {board: at for at, board in enumerate(footing.boards)}
     views, chosen = [], []
     for view in (it.number for it in known.session.views):
@@ -161,7 +199,7 @@ def _posed(known: Known, footing: Footing) -> Known:
             culprits=known.lost_views,
         )
     known = replace(known, used=tuple(views), boards=footing.boards, free=footing.free)
-    known = replace(known, frames=known.framed(np.concatenate([x[None], placed]))).posed(chosen)
+    known = replace(known, frames=known.framed(footing.edges)).posed(chosen)
     if known.free is not None and all(it.corners is not None for it in chosen):
         known = known.with_noise(_noise_px(known)).posed(chosen)
     return _with_errors(known, footing)

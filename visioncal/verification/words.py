@@ -141,12 +141,13 @@ def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
 
 
 def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> Motion:
-    x, z = check.footing.state.edges
+    x, *boards = check.footing.edges
     hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
         rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if hand else "base"
     else:
-        rotation, point = z[:3, :3], _middle(check, name)
+        place = _board(check, name)
+        rotation, point = boards[place][:3, :3], _middle(check, place)
         parent = "base" if hand else "tool"
     moved = exp(twist)
     shift = moved[:3, :3] @ point + moved[:3, 3] - point
@@ -165,11 +166,22 @@ def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> M
     )
 
 
-def _middle(check: Check, name: str) -> FloatArray:
-    """(3,) middle of the board that a cause is about, in its frame [m]."""
-    targets = check.footing.targets
-    target = targets.get(name.partition(" ")[2], next(iter(targets.values()), None))
-    return np.zeros(3) if target is None else corner_positions(target).mean(axis=0)
+def _board(check: Check, name: str) -> int:
+    """The place among the calibration's boards of the one that a cause is about."""
+    kind, _, which = name.partition(" ")
+    footing, seen = check.footing, check.seen
+    if kind == BOARD:
+        names = list(footing.targets)
+        return footing.boards.index(names.index(which)) if which in names else 0
+    return int(seen.boards[[int(which) in it for it in seen.views]][0])
+
+
+def _middle(check: Check, place: int) -> FloatArray:
+    """(3,) middle of one of the calibration's boards, in its frame [m]."""
+    targets = tuple(check.footing.targets.values())
+    if not targets:
+        return np.zeros(3)
+    return np.asarray(corner_positions(targets[check.footing.boards[place]]).mean(axis=0))
 
 
 def _length(vector: FloatArray, spread: FloatArray) -> tuple[float, float]:
@@ -260,7 +272,7 @@ def _agreement(check: Check) -> str:
 
 
 def _doubts(check: Check) -> tuple[str, ...]:
-    if len(check.seen.stops) >= FEW_STOPS:
+    if check.seen.stops >= FEW_STOPS:
         return ()
     return (
         f"{_capital(_stops(check))} hardly tell one change from another: take {FEW_STOPS} or more.",
@@ -268,7 +280,7 @@ def _doubts(check: Check) -> tuple[str, ...]:
 
 
 def _stops(check: Check) -> str:
-    count = len(check.seen.stops)
+    count = check.seen.stops
     return f"{count} stop{'' if count == 1 else 's'}"
 
 
