@@ -2,19 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from visioncal.alignment.cell import Cell
+from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import Fitted, settle
 from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.problem import Effect, Noise, Problem
 from visioncal.estimation.scene import CornerProblem, repeat_shares
+from visioncal.stages.arms import RobotArm, effects_of
 from visioncal.stages.observed import Observed
 from visioncal.stages.pnp import ViewPoses
-from visioncal.stages.refine import chosen
-from visioncal.types import Corners, FloatArray, IntArray
+from visioncal.stages.refine import refined
+from visioncal.types import Corners, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,15 +27,31 @@ class CellSide:
     Attributes:
         cell: The cell.
         agreed: What its fit uses, and where it stands.
-        effects: All effects but lenses and boards.
+        arms: The robots' arms, and which of their errors were found.
+        effects: All effects but lenses, boards and arms.
+        freely: Whether all errors that were found are free, and not those of known links alone.
     """
 
     cell: Cell
     agreed: Agreed
+    arms: Mapping[str, RobotArm]
     effects: Sequence[Effect]
+    freely: bool = False
 
-    # Boards' scales are free from the start: arms' errors are no reason to hold them.
-    has_errors = has_links = False
+    @property
+    def errors(self) -> tuple[ArmErrors, ...]:
+        """The errors of arms that were found."""
+        return tuple(it.errors for it in self.arms.values() if it.errors is not None)
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether errors of an arm are free."""
+        return any(it.effects(freely=self.freely) for it in self.arms.values())
+
+    @property
+    def has_links(self) -> bool:
+        """Whether those of an arm's own links are."""
+        return self.has_errors and any(it.of_links for it in self.errors)
 
     @property
     def noise(self) -> Noise:
@@ -59,8 +78,22 @@ class CellSide:
         )
         measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
         observed = replace(problem.observations, measured=measured, covariance=spread)
-        effects = [seen.effect(rows), *self.effects]
+        arms = effects_of(self.arms, freely=self.freely)
+        effects = [seen.effect(rows), *self.effects, *arms]
         return replace(problem, observations=observed).with_effects(effects)
+
+    def with_errors(self, fitted: Fitted) -> Self:
+        """Looks for errors of the arms; see `joint.Side`."""
+        free = {name for name, it in self.arms.items() if it.effects(freely=self.freely)}
+        arms = {
+            name: it if name in free else it.with_errors(fitted.problem, fitted.fit)
+            for name, it in self.arms.items()
+        }
+        return replace(self, arms=arms)
+
+    def freed(self, *, freely: bool) -> Self:
+        """Frees errors of the arms; see `joint.Side`."""
+        return replace(self, freely=freely)
 
     def settled(self, fitted: Fitted) -> tuple[Agreed, Seen]:
         """Takes over a fit."""
@@ -73,12 +106,14 @@ def with_looks(
     looked: Observed,
     views: Sequence[ViewPoses],
     agreed: Agreed,
+    arms: Mapping[str, RobotArm],
     others: Sequence[Effect],
-) -> tuple[Agreed, Seen]:
-    """Fits lenses and boards with the rest, and with other effects."""
-    side = CellSide(cell, agreed, others)
+) -> tuple[Agreed, Seen, Mapping[str, RobotArm]]:
+    """Fits lenses and boards with the rest, with errors of the arms and with other effects."""
     looks = _looks(looked, views, _shares(cell, agreed))
-    return side.settled(chosen(side, settle(looks, side, looks.first, side.frames)))
+    side = CellSide(cell, agreed, arms, others)
+    fitted, side = refined(side, looks, side.frames)
+    return *side.settled(fitted), side.arms
 
 
 def _shares(cell: Cell, agreed: Agreed) -> dict[int, float]:
@@ -110,8 +145,12 @@ def _looks(looked: Observed, views: Sequence[ViewPoses], shares: Mapping[int, fl
 
 
 def settled_looks(
-    cell: Cell, looks: Looks, moving: IntArray, agreed: Agreed, others: Sequence[Effect]
+    cell: Cell,
+    seen: Seen,
+    agreed: Agreed,
+    arms: Mapping[str, RobotArm],
+    others: Sequence[Effect],
 ) -> tuple[Agreed, Seen]:
     """Linearises corners and fits the cell in turn, until lenses and boards stay."""
-    side = CellSide(cell, agreed, others)
-    return side.settled(settle(looks, side, moving, side.frames))
+    side = CellSide(cell, agreed, arms, others)
+    return side.settled(settle(seen.looks, side, seen.moving, side.frames))

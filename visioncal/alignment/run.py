@@ -28,7 +28,6 @@ from visioncal.alignment.faults import (
     residuals,
     versions,
 )
-from visioncal.alignment.found import found_of_looks
 from visioncal.alignment.judging import (
     check_cell,
     findings_of,
@@ -145,7 +144,7 @@ def alignment_of(
     held_out = left_out(solved)
     sights = _sights(cell, solved, held_out, faults)
     budget = {named[key].name: mm for key, mm in budget_mm(solved, parts).items()}
-    of_looks = [*found_of_looks(solved, spread)]
+    of_looks = [*solved.found_of_looks()]
     findings = findings_of(
         solved,
         sights,

@@ -1,6 +1,6 @@
 """From what was seen to the fit of the whole cell: start, agreement, lenses and boards."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,16 +8,18 @@ import numpy as np
 from visioncal.alignment.arms import arms_of, check_arms, with_errors
 from visioncal.alignment.cell import Cell
 from visioncal.alignment.clocks import Clocks
-from visioncal.alignment.lenses import settled_looks, with_looks
+from visioncal.alignment.lenses import CellSide, settled_looks, with_looks
 from visioncal.alignment.priors import most_contradicted
 from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
+from visioncal.estimation.joint import Fitted
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.stages.arms import RobotArm, effects_of
 from visioncal.stages.choose import chosen
+from visioncal.stages.found import found_of_looks
 from visioncal.stages.observed import Observed
 from visioncal.stages.pairwise import Candidates
 from visioncal.stages.pnp import ViewPoses
@@ -43,6 +45,7 @@ class Solved:
         untied: Frames that nothing ties to the rest.
         arms: The robots' arms, as far as they were calibrated.
         asked: How far that was to be.
+        late: The errors of clocks, as effects.
     """
 
     cell: Cell
@@ -52,6 +55,14 @@ class Solved:
     untied: tuple[str, ...]
     arms: Mapping[str, RobotArm]
     asked: str
+    late: tuple[Effect, ...]
+
+    def found_of_looks(self) -> Iterator[tuple[str, bool]]:
+        """Says what was found of lenses and boards; see `stages.found`."""
+        if self.seen is not None:
+            part = self.agreed.problem.subset(self.agreed.used)
+            side = CellSide(self.cell, self.agreed, self.arms, self.late)
+            yield from found_of_looks(side, Fitted(self.seen, part, self.agreed.fit))
 
     @property
     def looks(self) -> Looks | None:
@@ -97,20 +108,20 @@ def solve(cell: Cell, looked: Observed, clocks: Clocks, asked: str = "auto") -> 
     agreed = _levelled(cell, views, agreed)
     arms: Mapping[str, RobotArm] = arms_of(cell)
     check_arms(arms, asked)
-    arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
     seen, late = None, clocks.effects(cell)
-    others = (*late, *effects_of(arms))
     if looked.scenes:
-        agreed, seen = with_looks(cell, looked, views, agreed, others)
-    elif others:
-        agreed = _with_effects(agreed, others)
+        agreed, seen, arms = with_looks(cell, looked, views, agreed, arms, late)
+    else:
+        arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
+        others = (*late, *effects_of(arms))
+        agreed = _with_effects(agreed, others) if others else agreed
     if asked != "hand-eye":
         arms = _levels(agreed, arms, asked)
         agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
     agreed = _without_contradicted(settle(agreed, _movable(agreed.problem)))
     agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
     agreed = _with_repeats(agreed)
-    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked)
+    return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
 
 
 def _levels(agreed: Agreed, arms: Mapping[str, RobotArm], asked: str) -> dict[str, RobotArm]:
@@ -136,11 +147,10 @@ def _at_rest(
     for _ in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
         poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
         agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
-        effects = (*late, *effects_of(arms))
         if seen is None:
-            agreed = _with_effects(agreed, effects)
+            agreed = _with_effects(agreed, (*late, *effects_of(arms)))
         else:
-            agreed, seen = settled_looks(cell, seen.looks, seen.moving, agreed, effects)
+            agreed, seen = settled_looks(cell, seen, agreed, arms, late)
         moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
         arms = {name: arm for name, (arm, _) in moved.items()}
         if max(step for _, step in moved.values()) < _AT_REST_RAD:

@@ -6,14 +6,14 @@ the answer, until it stays, is Gauss-Newton's method on the whole problem.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
 import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.errors import ConvergenceError
-from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.arm import ArmErrors, find_arm_errors
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import Looks, Seen
@@ -40,6 +40,8 @@ _CONTRADICTION = 3.0
 # Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
 # may well be so much larger.
 _UNEVEN = 2.0
+# A motion that tells so little of a size, beside what is stated, tells nothing: it is rounding.
+_UNMEASURED = 1e-6
 
 
 class Side(Protocol):
@@ -48,6 +50,10 @@ class Side(Protocol):
     @property
     def noise(self) -> Noise | None:
         """Levels to start from; None for those from above."""
+
+    @property
+    def errors(self) -> tuple[ArmErrors, ...]:
+        """The errors of arms that were found."""
 
     @property
     def has_links(self) -> bool:
@@ -59,6 +65,12 @@ class Side(Protocol):
 
     def problem(self, seen: Seen) -> Problem:
         """The problem of what the fit uses, with lenses and boards as its first effect."""
+
+    def with_errors(self, fitted: "Fitted") -> Self:
+        """The side with those errors of its arms that a fit shows in which they are not free."""
+
+    def freed(self, *, freely: bool) -> Self:
+        """The side with all errors of arms that were found free, or those alone of known links."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +84,8 @@ class Arm:
         targets: (m,) the frame of the target that each view shows.
         basis: (s, 6, p) how its errors move the flange at each stop.
         of_links: Whether these are errors of its own links.
-        errors: Their size, where they are free.
+        found: Its errors, where they are likely.
+        freely: Whether they are free whatever they are of.
         priors: What was measured of frames by hand.
     """
 
@@ -82,7 +95,8 @@ class Arm:
     targets: tuple[str, ...]
     basis: FloatArray
     of_links: bool
-    errors: ArmErrors | None = None
+    found: ArmErrors | None = None
+    freely: bool = False
     priors: tuple[FramePrior, ...] = ()
 
     @property
@@ -90,9 +104,14 @@ class Arm:
         """Levels are sought from above."""
 
     @property
+    def errors(self) -> tuple[ArmErrors, ...]:
+        """Its errors, where they were found."""
+        return () if self.found is None else (self.found,)
+
+    @property
     def has_errors(self) -> bool:
         """Whether its errors are free."""
-        return self.errors is not None
+        return self.found is not None and (self.freely or self.found.is_estimated)
 
     @property
     def has_links(self) -> bool:
@@ -102,8 +121,8 @@ class Arm:
     def problem(self, seen: Seen) -> Problem:
         """The chain of frames at its stops; see `Side`."""
         effects = [seen.effect(np.arange(len(self.stops)))]
-        if self.errors is not None:
-            effects.append(self.errors.effect(ROBOT))
+        if self.found is not None and self.has_errors:
+            effects.append(self.found.effect(ROBOT))
         return chain(
             self.mount,
             self.poses,
@@ -114,6 +133,18 @@ class Arm:
             effects=effects,
             priors=self.priors,
         )
+
+    def with_errors(self, fitted: "Fitted") -> Self:
+        """Looks for its errors; see `Side`."""
+        fit = fitted.fit
+        found = find_arm_errors(
+            fitted.problem, fit.state, fit.noise, ROBOT, self.basis, of_links=self.of_links
+        )
+        return replace(self, found=found, freely=False)
+
+    def freed(self, *, freely: bool) -> Self:
+        """Frees its errors; see `Side`."""
+        return replace(self, freely=freely)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,20 +294,24 @@ class MeasuredScale:
 
 
 def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
-    """Measures a board's size by the robot's motion."""
+    """Measures a board's size by the robots' motion; its sigma is infinite where that cannot."""
     looks = fitted.seen.looks
     (place,) = looks.scale_of(board)
-    seen = fitted.seen.freed(np.union1d(fitted.moving, place), looks.without_prior([place]))
-    problem, there = _at(side, fitted, seen)
+    stated, known = looks.stated_scale_sigma(board), float(looks.prior_sigma[place] ** -2.0)
+    problem, there = _at(side, fitted, fitted.seen.freed(np.union1d(fitted.moving, place)))
     information, gradient = normal_equations(problem, there, fitted.fit.noise)
     spread = covariance_among(information, problem.moving)
-    at = fitted.columns.start + int(np.searchsorted(seen.free, place))
-    now = float(fitted.looks.values[place])
+    at = fitted.columns.start + int(np.searchsorted(fitted.seen.free, place))
+    # What was stated is taken away again: without it the rest may leave the size open.
+    measured = 1.0 / float(spread[at, at]) - known
+    if measured <= _UNMEASURED * known:
+        return MeasuredScale(board, 0.0, np.inf, stated)
+    with_stated = float(fitted.looks.values[place]) - float(spread[at] @ gradient)
     return MeasuredScale(
         board,
-        now - float(spread[at] @ gradient),
-        (_UNEVEN if side.has_links else 1.0) * float(np.sqrt(spread[at, at])),
-        looks.stated_scale_sigma(board),
+        with_stated * (1.0 + known / measured),
+        (_UNEVEN if side.has_links else 1.0) * measured**-0.5,
+        stated,
     )
 
 

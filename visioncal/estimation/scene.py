@@ -17,6 +17,8 @@ from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.targets import first_corners, numbered_positions
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Target
 
+# The frame of the only camera, where there is one.
+ONLY_CAMERA = "cam"
 # Corners must be left over to judge by: so many residuals for each unknown.
 _SPARE = 10
 # Given intrinsics that are set free are known to so much without the session: the focal length and

@@ -97,9 +97,9 @@ class RobotArm:
         poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
         return poses
 
-    def effects(self) -> tuple[Effect, ...]:
-        """Its errors as unknowns, where the stops determine them."""
-        if self.errors is None or not self.errors.is_estimated:
+    def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
+        """Its errors as unknowns: those that are estimated, or freely all that were found."""
+        if self.errors is None or not (freely or self.errors.is_estimated):
             return ()
         values = None if self.model is None else self.model.values
         return (self.errors.effect(self.robot, values=values),)
@@ -279,7 +279,7 @@ def _anywhere(model: ArmModel, name: str) -> tuple[FloatArray, FloatArray]:
     return frames.reshape(-1, 12), columns.reshape(-1, columns.shape[2])
 
 
-def effects_of(arms: Mapping[str, RobotArm]) -> Iterator[Effect]:
-    """The errors of all arms that are unknowns."""
+def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
+    """The errors of all arms that are unknowns; see `RobotArm.effects`."""
     for arm in arms.values():
-        yield from arm.effects()
+        yield from arm.effects(freely=freely)

@@ -1,4 +1,4 @@
-"""What the joint fit found of board and lens, in sentences for the user."""
+"""What the joint fit found of lenses and boards, in sentences for the user."""
 
 from collections.abc import Iterator
 
@@ -8,15 +8,15 @@ from visioncal.chance import chi2_limit
 from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (
-    Arm,
     Fitted,
     MeasuredScale,
+    Side,
     chance_limit,
     contradicted_lens,
     measured_scale,
     moved_surprise,
 )
-from visioncal.estimation.scene import CornerProblem, Scene
+from visioncal.estimation.scene import ONLY_CAMERA, Scene
 from visioncal.estimation.solve import held_shift
 from visioncal.figures import figure
 from visioncal.types import FloatArray, IntArray, Target
@@ -25,41 +25,36 @@ from visioncal.types import FloatArray, IntArray, Target
 _FALSE_ALARM = 1e-4
 
 
-def findings(arm: Arm, fitted: Fitted) -> Iterator[str]:
-    """Says what was found that is a reason for doubt, and what the user can do about it.
+def found_of_looks(side: Side, fitted: Fitted) -> Iterator[tuple[str, bool]]:
+    """Says what a joint fit found of lenses and boards, and whether each is a reason for doubt.
 
     Args:
-        arm: The robot's side.
-        fitted: The answer, of one camera.
+        side: The frames' side of the fit.
+        fitted: The answer.
     """
-    problem, looks = _problem(fitted), fitted.looks
-    words, is_doubt = _noise_words(fitted)
-    if is_doubt:
-        yield words
-    for board in problem.printed:
-        words, is_doubt = _scale_finding(arm, fitted, board)
-        if is_doubt:
-            yield words
+    looks = fitted.looks
+    cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
+    for (camera, problem), it in cameras:
+        moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
+        found = noise_words(problem.stack, it.residuals, problem.unknowns(it, moving))
+        for words, is_doubt in (found, *_lens_words(fitted, camera)):
+            if words:
+                yield _of(camera, words), is_doubt
+    scene = next(iter(looks.problems.values())).scene
+    for board, target in enumerate(scene.targets):
+        if board not in looks.printed:
+            yield from ((it, True) for it in points_words(target, looks.moved_points(board)))
+            continue
+        called = f"board {scene.names[board]}".strip()
+        if _moves(fitted, looks.scale_of(board)):
+            yield scale_words(called, target.square_m, measured_scale(side, fitted, board))
         if _moved(fitted, looks.shape_of(board)):
-            shift = looks.corners[board] - problem.positions[problem.corners_of(board)]
-            yield bend_words(_board(problem, board), 1e3 * float(np.ptp(shift[:, 2])))
-    for rig, target in enumerate(problem.scene.targets):
-        yield from points_words(target, looks.moved_points(rig))
-    yield from _lens_finding(fitted)
+            yield bend_words(called, 1e3 * float(np.ptp(looks.corners[board][:, 2]))), True
 
 
-def remarks(arm: Arm, fitted: Fitted) -> Iterator[str]:
-    """Says what was found that is no reason for doubt; as `findings`."""
-    words, is_doubt = _noise_words(fitted)
-    if words and not is_doubt:
-        yield words
-    for board in fitted.looks.printed:
-        words, is_doubt = _scale_finding(arm, fitted, board)
-        if words and not is_doubt:
-            yield words
-    words, is_doubt = _moved_lens(fitted)
-    if words and not is_doubt:
-        yield words
+def _of(camera: str, words: str) -> str:
+    """Names the camera, where it is not the only one."""
+    return words if camera == ONLY_CAMERA else f"{camera}: {words[0].lower()}{words[1:]}"
 
 
 def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tuple[str, bool]:
@@ -90,25 +85,6 @@ def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tup
     )
 
 
-def _noise_words(fitted: Fitted) -> tuple[str, bool]:
-    problem, (seen,) = _problem(fitted), fitted.seen.compressed
-    return noise_words(problem.stack, seen.residuals, problem.unknowns(seen, fitted.moving))
-
-
-def _problem(fitted: Fitted) -> CornerProblem:
-    """The only camera's corners."""
-    (problem,) = fitted.seen.looks.problems.values()
-    return problem
-
-
-def _scale_finding(arm: Arm, fitted: Fitted, board: int) -> tuple[str, bool]:
-    """What the robot measures of a board's size, where the fit has taken it up."""
-    if not _moves(fitted, fitted.looks.scale_of(board)):
-        return "", False
-    measured, problem = measured_scale(arm, fitted, board), _problem(fitted)
-    return scale_words(_board(problem, board), problem.scene.targets[board].square_m, measured)
-
-
 def scale_words(board: str, square_m: float, measured: MeasuredScale) -> tuple[str, bool]:
     """Words another size than the file states, and whether it is a reason for doubt.
 
@@ -134,11 +110,6 @@ def scale_words(board: str, square_m: float, measured: MeasuredScale) -> tuple[s
         "the arm's model is off by as much.",
         True,
     )
-
-
-def _board(problem: CornerProblem, board: int) -> str:
-    """What a board is called: by its name where there are several."""
-    return f"board {problem.scene.names[board]}".strip()
 
 
 def bend_words(board: str, bend_mm: float) -> str:
@@ -177,30 +148,24 @@ def points_words(target: Target, moved_m: FloatArray) -> Iterator[str]:
         )
 
 
-def _lens_finding(fitted: Fitted) -> Iterator[str]:
-    problem = _problem(fitted)
+def _lens_words(fitted: Fitted, camera: str) -> Iterator[tuple[str, bool]]:
+    looks = fitted.looks
+    problem, lens = looks.problems[camera], looks.lens_of(camera)
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
-        yield (
+        words = (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
             f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
             "more corners, or more views."
         )
-    words, is_doubt = _moved_lens(fitted)
-    if is_doubt:
-        yield words
+        yield words, True
+    if not problem.scene.estimated and _moved(fitted, lens):
+        is_exact = problem.scene.matrix_sigma_px is None
+        steps = (looks.values - looks.stated)[lens[:4]]
+        yield lens_words(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
     if problem.contested:
         shift = held_shift(fitted.problem, fitted.fit)[fitted.columns]
-        moves = shift[np.searchsorted(fitted.seen.free, problem.lens[:4])]
-        yield contest_words(problem.scene, moves)
-
-
-def _moved_lens(fitted: Fitted) -> tuple[str, bool]:
-    looks, ((camera, problem),) = fitted.looks, fitted.seen.looks.problems.items()
-    if problem.scene.estimated or not _moved(fitted, problem.lens):
-        return "", False
-    steps = (looks.values - looks.stated)[problem.lens]
-    is_exact = problem.scene.matrix_sigma_px is None
-    return lens_words(steps[:4], is_doubtful=is_exact or contradicted_lens(fitted, camera))
+        moves = shift[np.searchsorted(fitted.seen.free, lens[:4])]
+        yield contest_words(problem.scene, moves), True
 
 
 def lens_words(steps_px: FloatArray, *, is_doubtful: bool) -> tuple[str, bool]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,16 +31,15 @@ from visioncal.estimation.joint import (
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import ROBOT, Problem, State
-from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
+from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem, Scene, repeat_shares
 from visioncal.estimation.solve import covariance_of, fit_problem, left_out_residuals
-from visioncal.stages.found import findings, remarks
+from visioncal.stages.found import found_of_looks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, IntArray
 
-# The only camera, where there is one.
-_ONLY = "cam"
+AnySide = TypeVar("AnySide", bound=Side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +78,15 @@ def look(
         The views with how they move when lens and board do.
     """
     with one_blas_thread():
-        problem, looks = _looks(scene, views, stops)
-        seen = looks.seen(problem.lens[:0] if closed_form else problem.first)
+        looks = _looks(scene, views, stops)
+        seen = looks.seen(looks.first[:0] if closed_form else looks.first)
     return _told(seen, views, None)
 
 
 def refine(
     scene: Scene, views: Sequence[ViewPoses], arm: Arm, frames: Mapping[str, FloatArray]
 ) -> Refined:
-    """Fits lens, board and edges to all corners together; see `chosen`.
+    """Fits lens, board and edges to all corners together; see `refined`.
 
     Args:
         scene: What is looked at, and with what.
@@ -95,19 +95,49 @@ def refine(
         frames: Where the unknown frames are thought to be.
     """
     with one_blas_thread():
-        problem, looks = _looks(scene, views, arm.stops)
-        answer = chosen(arm, settle(looks, arm, problem.first, frames))
-        errors = arm_errors(arm, answer.problem, answer.frames)
-        if errors is not None and errors.is_significant:
-            stated = settle(looks, arm, problem.first, frames)
-            answer, arm, errors = _with_arm(arm, stated, errors)
-        doubts, notes = tuple(findings(arm, answer)), tuple(remarks(arm, answer))
-    return replace(_told(answer.seen, views, errors), warnings=doubts, notes=notes)
+        answer, arm = refined(arm, _looks(scene, views, arm.stops), frames)
+        found = [*found_of_looks(arm, answer)]
+    return replace(
+        _told(answer.seen, views, arm.found),
+        warnings=tuple(words for words, is_doubt in found if is_doubt),
+        notes=tuple(words for words, is_doubt in found if not is_doubt),
+    )
 
 
-def _looks(
-    scene: Scene, views: Sequence[ViewPoses], stops: IntArray
-) -> tuple[CornerProblem, Looks]:
+def refined(
+    side: AnySide, looks: Looks, frames: Mapping[str, FloatArray]
+) -> tuple[Fitted, AnySide]:
+    """Fits lenses, boards and frames to all corners together; see `chosen`.
+
+    Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
+    passed for another lens or board: all is then chosen once more with them free. Errors of any
+    arm's shape tell which values are free, but are not estimated. Their size is that under the
+    stated lenses and boards: a board that changes its size with the arm hides a part of it.
+
+    Args:
+        side: The frames' side.
+        looks: The corners, and lenses and boards as they are stated.
+        frames: Where the unknown frames are thought to be.
+
+    Returns:
+        The fit, and the side with the errors of its arms.
+    """
+    stated = settle(looks, side, looks.first, frames)
+    answer = chosen(side, stated)
+    found = side.with_errors(answer)
+    if not any(it.is_significant for it in found.errors):
+        return answer, found
+    under_stated = side.with_errors(stated)
+    erring = (under_stated if under_stated.errors else found).freed(freely=True)
+    answer = chosen(erring, settle(stated.looks, erring, stated.moving, stated.frames))
+    if all(it.of_links for it in erring.errors):
+        return answer, erring
+    linked = erring.freed(freely=False)
+    fitted = settle(answer.looks, linked, answer.moving, answer.frames)
+    return fitted, linked.with_errors(fitted)
+
+
+def _looks(scene: Scene, views: Sequence[ViewPoses], stops: IntArray) -> Looks:
     """The corners of one camera, and lens and board as they are stated.
 
     Corners of one stop and one board count as one view.
@@ -115,22 +145,7 @@ def _looks(
     shown = {it.view: (stop, it.board) for it, stop in zip(views, stops.tolist(), strict=True)}
     problem = CornerProblem.of(scene, _corners(views), repeat_shares(shown))
     poses = np.array([view.cam_from_target[0] for view in views])
-    return problem, Looks.of({_ONLY: problem}, {_ONLY: poses})
-
-
-def _with_arm(arm: Arm, stated: Fitted, errors: ArmErrors) -> tuple[Fitted, Arm, ArmErrors | None]:
-    """Fits again with errors of the arm, which may have passed for another lens or board.
-
-    Errors of any arm's shape tell which values are free, but are not estimated. Their size is that
-    under the stated lens and board: a board that changes its size with the arm hides a part of it.
-    """
-    errors = arm_errors(arm, stated.problem, stated.frames) or errors
-    erring = replace(arm, errors=errors)
-    answer = chosen(erring, settle(stated.looks, erring, stated.moving, stated.frames))
-    if arm.of_links:
-        return answer, erring, errors
-    fitted = settle(answer.looks, arm, answer.moving, answer.frames)
-    return fitted, arm, arm_errors(arm, fitted.problem, fitted.frames)
+    return Looks.of({ONLY_CAMERA: problem}, {ONLY_CAMERA: poses})
 
 
 def arm_errors(arm: Arm, problem: Problem, frames: Mapping[str, FloatArray]) -> ArmErrors | None:

@@ -72,11 +72,6 @@ class Looks:
         """Which boards are printed; see `CornerProblem.printed`."""
         return self._one.printed
 
-    @property
-    def sized(self) -> IntArray:
-        """Places of the boards' scales, and of rigs' points that are not exact."""
-        return self._here(np.union1d(self._one.scale, self._one.points))
-
     def scale_of(self, board: int) -> IntArray:
         """Place (1,) of one printed board's scale."""
         return self._here(self._one.scale_of(board))
@@ -118,17 +113,9 @@ class Looks:
 
     @property
     def first(self) -> IntArray:
-        """What is free from the start: sizes, lenses that were estimated or are to be refined."""
-        free = [self.sized]
-        for name, problem in self.problems.items():
-            scene, lens = problem.scene, self.lenses[name]
-            known = scene.matrix_sigma_px is not None and scene.mode != "hold"
-            refined = scene.mode == "refine" and problem.has_spare_corners
-            if scene.estimated or refined:
-                free.append(np.arange(lens.start, lens.stop))
-            elif known:
-                free.append(np.arange(lens.start, lens.start + 4))
-        return np.unique(np.concatenate(free))
+        """What is free from the start."""
+        found = (self.places(name)[it.first] for name, it in self.problems.items())
+        return np.unique(np.concatenate([*found]))
 
     @property
     def counted(self) -> IntArray:
