@@ -47,9 +47,9 @@ def postures_in_view(options: CellOptions, count: int) -> FloatArray:
     return simulate(replace(free, cut_views=0.0)).joints
 
 
-def so_far_of(cell: Cell) -> SoFar:
+def so_far_of(cell: Cell, **changes) -> SoFar:
     """What is known of a cell's views, as far as they tell it."""
-    known = known_of(cell, level="hand-eye")
+    known = known_of(cell, level="hand-eye", **changes)
     for stage in STAGES:
         if stage.name in ("robot", "detect"):
             continue

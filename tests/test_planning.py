@@ -20,6 +20,7 @@ from visioncal.planning.information import stop_factors, worlds_of
 from visioncal.planning.purposes import PURPOSES, purpose_of
 from visioncal.planning.recorded import Guess, begin
 from visioncal.planning.selection import CRITERIA
+from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, exact, fine_camera, simulate
 from visioncal.simulation.options import Second
 from visioncal.targets import corner_positions
@@ -292,6 +293,38 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
     three = world.covariance(range(3))
     assert np.trace(three[3:6, 3:6]) < np.trace(world.covariance([])[3:6, 3:6])
+
+
+ERRING = replace(CELL, views=30, seed=5, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
+
+
+@pytest.mark.parametrize("case", ["estimated", "taken for noise", "neighbours alike"])
+def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
+    cell = simulate(ERRING)
+    if case == "neighbours alike":
+        cell = simulate(replace(CELL, views=30, seed=1))
+        off = np.random.default_rng(0).standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3)
+        alike = cell.base_from_flange @ exp(np.repeat(off, 3, axis=0))
+        cell = replace(cell, base_from_flange=alike)
+    poses = {} if case == "estimated" else {"joints": False, "robot": load_robot("ur5e")}
+    found = so_far_of(cell, **poses)
+    known = found.known
+    assert (known.arm is None) == (case == "neighbours alike")
+    assert known.arm is None or known.arm.is_estimated == (case == "estimated")
+    assert (known.diagnosis.inflation > 1.5) == (case == "neighbours alike")
+    begun, q = begin(found), postures_in_view(CELL, 40)
+    design = next_best(begun, HAND_EYE, q, 3).design
+    held = known.diagnosis.inflation * np.outer(known.solved.held, known.solved.held)
+    spread = known.solved.covariance - held
+    obtained = 1e3 * np.sqrt(np.trace(spread[3:6, 3:6]))
+    world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
+    # A result holds the board's size; in the plan it is open, and takes up errors of the arm.
+    assert mm(world, []) == pytest.approx(obtained, rel=0.01)
+    assert design.before.mm == pytest.approx(obtained, rel=0.1)
+    assert design.predicted.mm == pytest.approx(mm(world, design.rows), rel=0.1)
+    wish = Wish(mm=1.0)
+    short = shortfall(next_best(begun, HAND_EYE, q, 3, wish=wish).design, wish, 3)
+    assert ("record joint angles" in short) == (case == "taken for noise")
 
 
 def test_stops_for_the_arm_say_what_of_it_they_tell():

@@ -27,6 +27,7 @@ class Design:
         history: What is predicted without any of them, and after each in the order of `rows`.
         best: What all candidates together could give.
         best_look: The same if lens and board were known exactly.
+        best_arm: The same without errors of the arm that a fit takes for noise.
         met: Whether that is as good as was wished; None where nothing was.
     """
 
@@ -36,6 +37,7 @@ class Design:
     history: tuple[Accuracy, ...]
     best: Accuracy
     best_look: Accuracy
+    best_arm: Accuracy
     met: bool | None
 
     @property
@@ -83,8 +85,9 @@ def chosen(
         rows = _ranked(state)
         history, best = _history(worlds, rows)
         sure = _all_of([it.with_known_looks() for it in worlds]).accuracy
+        exact = _all_of([it.without_misfit() for it in worlds]).accuracy
     met = None if wish is None else history[-1].meets(wish)
-    return Design(rows, criterion, state.figure, history, best, sure, met)
+    return Design(rows, criterion, state.figure, history, best, sure, exact, met)
 
 
 def shortfall(design: Design, wish: Wish, count: int) -> str:
@@ -108,6 +111,11 @@ def shortfall(design: Design, wish: Wish, count: int) -> str:
         cause = (
             "What is open about the board's size and the lens is in the way: measure the print, "
             "and state its square_sigma_m."
+        )
+    elif design.best_arm.meets(wish):
+        cause = (
+            "Errors of the arm that go with its posture are in the way: record joint angles "
+            "(q1_rad ...) with all views, and they are calibrated."
         )
     return (
         f"The wished {_wished(wish)} cannot be reached from these candidates: all of them together "
@@ -186,7 +194,9 @@ def _thinned(state: Selection, wish: Wish) -> Selection:
 def _ranked(state: Selection) -> IntArray:
     """The chosen rows, the most telling first."""
     rows = np.array(state.rows, dtype=np.int64)
-    few = tuple(replace(it, factors=it.factors[rows]) for it in state.problem)
+    few = tuple(
+        replace(it, factors=it.factors[rows], misfit=it.misfit[rows]) for it in state.problem
+    )
     now = Selection.of(few, state.criterion)
     for _ in rows:
         now = now.with_one(now.best_to_add())

@@ -5,7 +5,7 @@ what comes out is the information that the joint fit would have of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -20,12 +20,12 @@ from visioncal.estimation.appearance import (
     compress,
     shape_basis,
 )
-from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.linalg import covariance, gram
 from visioncal.estimation.problem import ROBOT, Effect, Noise, Problem, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
@@ -64,6 +64,8 @@ class Recorded:
         q: (s, n) joint angles of the stops [rad]; None where they are not known.
         noise: Of the robot at the stops.
         first_corner: The number of the first corner of the board that is planned for.
+        arm: Errors that follow the arm's posture, at the stops; None where the stops show none.
+        inflation: By how much larger their noise's variance counts than they show alone.
     """
 
     problem: Problem
@@ -73,6 +75,8 @@ class Recorded:
     q: FloatArray | None
     noise: Noise
     first_corner: int = 0
+    arm: ArmErrors | None = None
+    inflation: float = 1.0
 
     @property
     def shared(self) -> FloatArray:
@@ -101,6 +105,9 @@ class World:
         turn: (p, p) the same for the rotation [rad^2].
         units: (p,) what one unit of each unknown is where different ones are compared.
         looks: How many of the unknowns are of lens and boards; they stand behind the edges.
+        misfit: (k, 6, a) how residuals at each stop move, in sigmas of noise, with errors of the
+            arm that a fit takes for noise, in sigmas of theirs.
+        pull: (p, a) how the recorded stops' gradient moves with them.
     """
 
     factors: FloatArray
@@ -111,6 +118,8 @@ class World:
     turn: FloatArray
     units: FloatArray
     looks: int
+    misfit: FloatArray
+    pull: FloatArray
 
     def with_known_looks(self) -> "World":
         """Returns the world as it is where lens and board are known exactly."""
@@ -125,12 +134,20 @@ class World:
             self.turn[block],
             self.units[kept],
             0,
+            self.misfit,
+            self.pull[kept],
         )
+
+    def without_misfit(self) -> "World":
+        """Returns the world as it is where a fit takes no errors of the arm for noise."""
+        return replace(self, misfit=self.misfit[:, :, :0], pull=self.pull[:, :0])
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
         """Covariance (p, p) of the unknowns from some candidates and what is recorded."""
-        taken = self.factors[rows].reshape(-1, len(self.prior))
-        return covariance(self.prior + self.recorded + taken.T @ taken)
+        taken = self.factors[rows]
+        fitted = covariance(self.prior + self.recorded + gram(taken, taken))
+        off = fitted @ (self.pull + gram(taken, self.misfit[rows]))
+        return np.asarray(fitted + off @ off.T)
 
 
 def worlds_of(
@@ -172,7 +189,8 @@ def stop_factors(
             being open by as much as is stated.
 
     Returns:
-        (k, 6, p) whose squares are the information of each stop; zero where the board is not seen.
+        (k, 6, p + a) whose squares are the information of each stop; zero where the board is not
+        seen. Errors of the arm that a fit takes for noise come last.
     """
     free = stated(cell) if recorded is None else recorded.free
     poses = cell.cam_from_target(q)
@@ -180,18 +198,22 @@ def stop_factors(
     known = free.information if recorded is None else recorded.shared
     # Nothing else of what is shared moves a stop that stands still.
     elsewhere = np.zeros((int(seen.sum()), 6, len(known) - len(free.columns)))
-    size = 12 + len(known) + sum(_arm_sizes(cell.robot, purpose))
-    factors = np.zeros((len(q), 6, size))
+    factors = np.zeros((len(q), 6, 12 + len(known) + _arm_size(cell.robot, purpose, recorded)))
     if seen.any():
         found = compress(stack, free.basis, free.appearance, poses[seen])
+        flange = cell.robot.base_from_flange(q[seen])
         problem = chain(
             cell.mount,
-            cell.robot.base_from_flange(q[seen]),
+            flange,
             poses[seen],
             floored_sigma_px(cell.pixel_px) ** 2 * covariance(found.information),
             effects=[_effect(known, [found.by_shared[:, :, free.columns], elsewhere])],
         )
-        problem = _erring(cell, purpose, problem, q[seen])
+        arm = None if recorded is None else recorded.arm
+        if arm is not None:
+            basis = link_basis(cell.robot, q[seen]) if arm.of_links else pose_basis(flange)
+            arm = replace(arm, basis=basis)
+        problem = _erring(cell, purpose, problem, q[seen], arm)
         state = State(np.stack([cell.x, cell.z]), problem.start_values)
         linear = problem.linear(state, ideal=True)
         root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
@@ -250,25 +272,45 @@ def _world(
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
-    looks, arm = len(shared), sum(_arm_sizes(cell.robot, purpose))
-    sigma = _sigma(purpose)
+    looks, sigma, arm = len(shared), _sigma(purpose), _arm_size(cell.robot, purpose, recorded)
+    inflation = 1.0
+    if recorded is not None and not purpose.blocks:
+        inflation = recorded.inflation
+        if recorded.arm is not None:
+            # Those that a fit takes for noise are no unknowns.
+            arm *= recorded.arm.is_estimated
     weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
-    prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm))
-    known = np.zeros_like(prior)
+    prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm)) / inflation
+    size, every = len(prior), factors.shape[2]
+    known = np.zeros((every, every))
     if recorded is not None:
         known = _recorded_information(cell, purpose, recorded)
+    scale = np.ones(every)
+    scale[:size] = inflation**-0.5
+    factors, known = scale * factors, np.outer(scale, scale) * known
     of_looks = np.sqrt(np.diag(covariance(shared))) if looks else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
-        judged = _of_sight(cell, purpose, q)
+        judged = _of_sight(cell, arm, q)
     else:
         judged = _of_workspace(cell, purpose, workspace)
     counted, place, turn = (_widened(it, looks) for it in judged)
-    return World(factors, prior, known, counted, place, turn, units, looks)
+    return World(
+        factors[:, :, :size],
+        prior,
+        known[:size, :size],
+        counted,
+        place,
+        turn,
+        units,
+        looks,
+        factors[:, :, size:],
+        known[:size, size:],
+    )
 
 
 def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> FloatArray:
-    """(p, p) of the stops and of what was measured by hand, what is known of effects aside."""
+    """(p + a, p + a) of the stops and of what was measured by hand, known effects aside."""
     q = recorded.q
     if q is None and purpose.blocks:
         raise DataError(
@@ -278,7 +320,7 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) 
         )
     stops = len(recorded.problem.poses[ROBOT])
     at = np.zeros((stops, cell.robot.joint_count)) if q is None else q
-    problem = _erring(cell, purpose, recorded.problem, at)
+    problem = _erring(cell, purpose, recorded.problem, at, recorded.arm)
     state = State(recorded.edges_in(cell), problem.start_values)
     found = fisher_information(problem, state, recorded.noise)
     edges, every = 6 * len(problem.unknown), np.arange(problem.size)
@@ -291,13 +333,16 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) 
     return np.asarray(found[np.ix_(kept, kept)] - taken)
 
 
-def _erring(cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray) -> Problem:
-    """The problem with the errors of the arm that a purpose is about."""
-    if not purpose.blocks:
-        return problem
-    basis = _model(cell.robot, purpose).basis(q)
-    errors = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True).effect(ROBOT)
-    return problem.with_effects([*problem.effects, errors])
+def _erring(
+    cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray, arm: ArmErrors | None
+) -> Problem:
+    """The problem with errors of the arm: those that a purpose is about, or that stops show."""
+    if purpose.blocks:
+        basis = _model(cell.robot, purpose).basis(q)
+        arm = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True)
+    elif arm is not None:
+        arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
+    return problem if arm is None else problem.with_effects([*problem.effects, arm.effect(ROBOT)])
 
 
 def _of_effects(problem: Problem) -> FloatArray:
@@ -314,7 +359,7 @@ def _effect(known: FloatArray, moved: list[FloatArray]) -> Effect:
 def _model(robot: Robot, purpose: Purpose) -> ArmModel:
     sigma = _sigma(purpose)
     weights = {name: it / sigma for name, it in purpose.blocks.items()}
-    model = ArmModel(robot, np.eye(4), weights, np.zeros(sum(_arm_sizes(robot, purpose))))
+    model = ArmModel(robot, np.eye(4), weights, np.zeros(_arm_size(robot, purpose)))
     if COMPLIANCE not in weights:
         return model
     if robot.masses is None:
@@ -332,8 +377,11 @@ def _sigma(purpose: Purpose) -> float:
     return next(iter(purpose.blocks.values()), 1.0)
 
 
-def _arm_sizes(robot: Robot, purpose: Purpose) -> tuple[int, ...]:
-    return tuple(block_size(name, robot.joint_count) for name in purpose.blocks)
+def _arm_size(robot: Robot, purpose: Purpose, recorded: Recorded | None = None) -> int:
+    """How many errors of the arm `_erring` adds."""
+    if purpose.blocks or recorded is None or recorded.arm is None:
+        return sum(block_size(name, robot.joint_count) for name in purpose.blocks)
+    return int(recorded.arm.basis.shape[2])
 
 
 def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[CornerStack, Mask]:
@@ -359,9 +407,7 @@ def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[Co
     return stack, seen
 
 
-def _of_sight(
-    cell: PlanCell, purpose: Purpose, q: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _of_sight(cell: PlanCell, arm: int, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What counts of x: the camera's own place, and as much the places that it looks at.
 
     A point that it sees comes out wrong by the offset's error and by the rotation's at the point's
@@ -369,8 +415,7 @@ def _of_sight(
     """
     middle = corner_positions(cell.target).mean(axis=0)
     looked_at = cell.cam_from_target(q) @ [*middle, 1.0]
-    size = 12 + sum(_arm_sizes(cell.robot, purpose))
-    place, turn, there = (np.zeros((len(q), 3, size)) for _ in range(3))
+    place, turn, there = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
     place[:, :, 3:6] = there[:, :, 3:6] = turn[:, :, :3] = np.eye(3)
     there[:, :, :3] = -skew(looked_at[:, :3])
     return (_mean_square(place) + _mean_square(there)) / 2, _mean_square(place), _mean_square(turn)

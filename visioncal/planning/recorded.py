@@ -124,7 +124,6 @@ def begin(
     if robot is None or free is None or not targets or known.pixel_px is None:
         raise _lacking(known)
     first = known.first_of_stops(known.used)
-    arm = _arm(known, robot)
     # The arm's own errors are the purpose's business: they are put in again with its priors.
     problem = replace(known, arm=None).problem(known.used)
     problem = problem.merged(problem.of_one_stop)
@@ -137,7 +136,7 @@ def begin(
         raise _too_vague(known)
     cell = PlanCell(
         known.session.mount,
-        arm,
+        _arm(known, robot),
         free.appearance.camera,
         targets[known.boards[0]],
         edges[0],
@@ -152,7 +151,17 @@ def begin(
     )
     q = None if known.joints_rad is None else known.joints(first)
     corner = int(first_corners(targets)[known.boards[0]])
-    recorded = Recorded(problem, edges, board, free, q, noise, corner)
+    recorded = Recorded(
+        problem,
+        edges,
+        board,
+        free,
+        q,
+        noise,
+        corner,
+        None if known.arm is None else replace(known.arm, basis=known.arm_basis(first)),
+        1.0 if known.diagnosis is None else known.diagnosis.inflation,
+    )
     return Begun(cell, recorded, found.refusal, tuple(first))
 
 

@@ -20,7 +20,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from visioncal.estimation.linalg import covariance_root
+from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.planning.accuracy import Accuracy
 from visioncal.planning.information import World
 from visioncal.types import FloatArray
@@ -70,6 +70,8 @@ class Reduced:
         told: (r, t) directions that the candidates tell well enough to count for O1.
         watched: (r, r) of edges and arm in their units, as far as the candidates tell them well;
             the largest variance among them counts for E.
+        misfit: (k, 6, a) and
+        pull: (r, a) by errors of the arm that a fit takes for noise; see `World`.
     """
 
     factors: FloatArray
@@ -79,6 +81,8 @@ class Reduced:
     turn: Variance
     told: FloatArray
     watched: FloatArray
+    misfit: FloatArray
+    pull: FloatArray
 
 
 def reduced(world: World, criterion: Criterion) -> Reduced:
@@ -113,6 +117,8 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
         seen(world.turn),
         np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
         watched,
+        world.misfit,
+        basis.T @ (out.T @ world.pull),
     )
 
 
@@ -132,21 +138,24 @@ class Selection:
         criterion: What makes stops good.
         rows: The chosen ones.
         information: (r, r) by world.
+        pulls: (r, a) by world, how the gradient moves with errors that a fit takes for noise.
     """
 
     problem: tuple[Reduced, ...]
     criterion: Criterion
     rows: tuple[int, ...]
     information: tuple[FloatArray, ...]
+    pulls: tuple[FloatArray, ...]
 
     @classmethod
     def of(cls, problem: tuple[Reduced, ...], criterion: Criterion) -> "Selection":
         """No candidates, but what is recorded."""
-        return cls(problem, criterion, (), tuple(it.start for it in problem))
+        starts, pulls = ((it.start for it in problem), (it.pull for it in problem))
+        return cls(problem, criterion, (), tuple(starts), tuple(pulls))
 
     @cached_property
     def spreads(self) -> tuple[FloatArray, ...]:
-        """(r, r) covariance by world."""
+        """(r, r) covariance by world, of noise alone."""
         return tuple(np.asarray(np.linalg.inv(it), dtype=float) for it in self.information)
 
     def with_one(self, row: int) -> "Selection":
@@ -169,12 +178,16 @@ class Selection:
         return [it for it in range(len(self.problem[0].factors)) if it not in taken]
 
     def _changed(self, rows: tuple[int, ...], by: list[int], sign: float) -> "Selection":
-        added = (it.factors[by].reshape(-1, it.factors.shape[2]) for it in self.problem)
+        added = [(it.factors[by], it.misfit[by]) for it in self.problem]
         information = tuple(
-            np.asarray(before + sign * it.T @ it)
-            for before, it in zip(self.information, added, strict=True)
+            before + sign * gram(factors, factors)
+            for before, (factors, _) in zip(self.information, added, strict=True)
         )
-        return Selection(self.problem, self.criterion, rows, information)
+        pulls = tuple(
+            before + sign * gram(factors, misfit)
+            for before, (factors, misfit) in zip(self.pulls, added, strict=True)
+        )
+        return Selection(self.problem, self.criterion, rows, information, pulls)
 
     @cached_property
     def value(self) -> float:
@@ -189,7 +202,9 @@ class Selection:
         return float(np.exp(np.linalg.slogdet(spread)[1] / max(len(spread), 1)))
 
     def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
-        return zip(self.problem, self.spreads, strict=True)
+        answers = (it @ pull for it, pull in zip(self.spreads, self.pulls, strict=True))
+        totals = (it + off @ off.T for it, off in zip(self.spreads, answers, strict=True))
+        return zip(self.problem, totals, strict=True)
 
     @property
     def figure(self) -> float:
@@ -225,7 +240,10 @@ class Selection:
         return self._best(list(self.rows), -1.0)
 
     def _best(self, rows: list[int], sign: float) -> int:
-        gains: FloatArray = np.mean([self._gains(*it, rows, sign) for it in self._worlds()], axis=0)
+        gains: FloatArray = np.mean(
+            [self._gains(*it, rows, sign) for it in zip(self.problem, self.spreads, strict=True)],
+            axis=0,
+        )
         if self.criterion != "E":
             return rows[int(np.argmax(gains))]
         promising: list[int] = [rows[it] for it in np.argsort(-gains)[:_TRIED].tolist()]
