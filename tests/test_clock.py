@@ -30,7 +30,8 @@ from visioncal.simulation import (
     truth_path,
     write_sweep,
 )
-from visioncal.stages.clock import set_clock, sweep_of
+from visioncal.stages.clocks import set_clocks
+from visioncal.stages.observed import Observed
 from visioncal.stages.pnp import given_poses
 from visioncal.transforms import exp, invert, log
 from visioncal.verification import verify
@@ -38,6 +39,12 @@ from visioncal.verification import verify
 AHEAD_S = 0.0372
 # 7 s at 30 Hz; a PnP's noise of some tenths of a millimetre.
 SHORT = SweepOptions(stops=5, camera_minus_robot_s=AHEAD_S)
+
+
+def clocked_of(session):
+    """What its stream gives the views of a session of measured poses."""
+    (clocked,) = set_clocks(Observed(session, poses=given_poses(session))).clocks.values()
+    return clocked
 
 
 def swept(seed=0, mount="eye-in-hand", how=SHORT, **options) -> Sweep:
@@ -107,7 +114,7 @@ def test_stamps_that_jitter_are_told_worse(moved):
     noise_s = 3e-3 * np.random.default_rng(6).standard_normal(len(moved.frames_s))
     jittered = replace(moved, frames_s=moved.frames_s + noise_s)
     timed = sweep_session(jittered, "jittered")
-    sigma_s = set_clock(sweep_of(timed, None), given_poses(timed)).clock.sigma_s
+    sigma_s = clocked_of(timed).clock.sigma_s
     # 3 ms of noise at some 200 frames make 0.2 ms, give or take how evenly they tell it.
     assert 1e-4 < sigma_s < 6e-4
 
@@ -220,7 +227,7 @@ def test_views_in_motion_are_left_out_where_nothing_tells_the_offset():
     session = dwelling(0.0, at_rest=14)
     # Views that no fit may use tell nothing of the clocks either.
     held = [replace(view, holdout=view.number >= 14) for view in session.views]
-    clocked = set_clock(sweep_of(replace(session, views=tuple(held)), None), given_poses(session))
+    clocked = clocked_of(replace(session, views=tuple(held)))
     assert sorted(it.view for it in clocked.rejections) == list(range(14, 20))
     assert all("taken in motion" in it.reason for it in clocked.rejections)
     assert [view.number for view in clocked.views] == list(range(14))
@@ -272,7 +279,7 @@ def test_motion_that_repeats_itself_is_told_by_what_is_stated():
     with pytest.raises(DegenerateError, match=r"the motion repeats itself: offsets of .* ms"):
         calibrate(periodic())
     again = stating(periodic(), 2.05)
-    clock = set_clock(sweep_of(again, None), given_poses(again)).clock
+    clock = clocked_of(again).clock
     # A period off, which is for whoever stated it to know.
     assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
 
@@ -284,14 +291,14 @@ def test_a_stream_of_another_time_is_named(session):
         calibrate(session.with_streams({"robot": late}))
     # Whoever states about how far they are apart is told the rest.
     stated = stating(session.with_streams({"robot": late}), 1.0 - 1e6)
-    clocked = set_clock(sweep_of(stated, None), given_poses(stated))
+    clocked = clocked_of(stated)
     # Stamps of a million seconds have digits of a tenth of a nanosecond.
     assert abs(clocked.clock.camera_minus_robot_s + 1e6 - AHEAD_S) < 1e-4
 
 
 def test_a_stated_offset_stands_where_motion_does_not_tell_it():
     even = stating(screwed(), 0.02)
-    clocked = set_clock(sweep_of(even, None), given_poses(even))
+    clocked = clocked_of(even)
     assert (clocked.clock.method, clocked.clock.sigma_s) == ("stated", 1e-3)
     assert "is taken as stated, +20 ms, to 1 ms" in clocked.warnings[0]
     view = clocked.views[0]
@@ -307,7 +314,9 @@ def test_what_is_open_about_the_clocks_counts(session):
         known = stage.run(known)
     spreads = []
     for sigma_s in (1e-6, 5e-3):
-        later = replace(known, clock=replace(known.clock, sigma_s=sigma_s))
+        clock = replace(known.clock, sigma_s=sigma_s)
+        clocks = {pair: replace(it, clock=clock) for pair, it in known.clocks.items()}
+        later = replace(known, clocks=clocks)
         for stage in STAGES[[it.name for it in STAGES].index("clock") + 1 :]:
             later = stage.run(later)
         budget = result_of(later).stages["uncertainty"]["budget_mm"]

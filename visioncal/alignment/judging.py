@@ -23,7 +23,6 @@ from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
-from visioncal.stages.observed import HELD_BACK
 from visioncal.types import Mask, Rejection
 
 
@@ -50,7 +49,7 @@ def findings_of(
         budget_mm: What these are uncertain by, by source.
         noise: Estimated standard deviations, by frame or robot.
         workspace_mm: Of each calibrated arm, the predicted sigma of a tool's place, in the median.
-        spared: Views that are not needed.
+        spared: Views that are not needed, and those that are held back.
         warnings: Reasons for doubt that were found before.
         notes: What is good to know.
     """
@@ -108,9 +107,7 @@ def _sensors(
     for seer in seers:
         mine = [it for it in sights if it.seer == seer]
         lost = [
-            Rejection(it.view, it.reason)
-            for it in mine
-            if not it.used and it.view not in spared and it.reason != HELD_BACK
+            Rejection(it.view, it.reason) for it in mine if not it.used and it.view not in spared
         ]
         levels = noise.get(seer, {})
         found.append(

@@ -17,7 +17,6 @@ from visioncal.alignment.arms import (
     notes_on_arms,
 )
 from visioncal.alignment.cell import Cell, read_cell, robot_key
-from visioncal.alignment.clocks import Clocks, Pair, set_clocks
 from visioncal.alignment.faults import (
     PoseFault,
     Version,
@@ -46,6 +45,8 @@ from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.arms import ArmFound
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
+from visioncal.stages.clock import Pair
+from visioncal.stages.clocks import set_clocks
 from visioncal.stages.delays import FoundDelay
 from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
@@ -94,36 +95,31 @@ def align(
     if progress is not None:
         progress("align", 0, 1)
     with one_blas_thread():
-        clocks = set_clocks(loaded, looked)
-        looked = clocks.looked(looked)
-        cell = read_cell(clocks.session)
-        cell = replace(cell, reasons={**cell.reasons, **clocks.reasons})
-        solved = solve(cell, looked, clocks, level)
-        return alignment_of(loaded, cell, looked, clocks, solved, convention)
+        looked = set_clocks(looked)
+        cell = read_cell(looked.timed)
+        cell = replace(cell, reasons={**cell.reasons, **looked.reasons, **looked.spared})
+        solved = solve(cell, looked, level)
+        return alignment_of(cell, looked, solved, convention)
 
 
 def alignment_of(
-    session: Session,
     cell: Cell,
     looked: Observed,
-    clocks: Clocks,
     solved: Solved,
     convention: Convention | None = None,
 ) -> Alignment:
     """Puts the result together.
 
     Args:
-        session: The session.
         cell: The whole cell as it was read.
-        looked: What its cameras saw.
-        clocks: The offsets of clocks by which its rows have poses.
+        looked: What was observed in it.
         solved: The fit of what of it is tied.
         convention: Of the joint table in which calibrated arms' numbers are told.
 
     Raises:
         DegenerateError: The observations leave a frame open.
     """
-    agreed = solved.agreed
+    session, agreed = looked.session, solved.agreed
     problem = agreed.problem
     found = misfits(problem.subset(agreed.used), agreed.fit)
     parts = covariance_of_arms(problem.subset(agreed.used), agreed.fit, solved.arms, found)
@@ -157,9 +153,8 @@ def alignment_of(
             for robot, it in told.items()
             if it.telling is not None
         },
-        spared={view for it in clocks.found.values() for view in it.spared},
+        spared=looked.spared.keys() | looked.held_back,
         warnings=[
-            *clocks.warnings,
             *_warnings(solved, looked, spread, found),
             *(f"Robot {name}: {words}" for name, it in told.items() for words in it.doubts()),
             *(words for words, is_doubt in of_looks if is_doubt),
@@ -167,8 +162,8 @@ def alignment_of(
             *(f"{it.frame} is tied to nothing. {it.remedy}" for it in untied),
         ],
         notes=(
-            *clocks.notes,
-            *_clock_words(clocks, solved, spread),
+            *looked.notes,
+            *_clock_words(looked, solved, spread),
             *notes_on_arms(solved.arms, told),
             *(words for words, is_doubt in of_looks if not is_doubt),
         ),
@@ -190,7 +185,7 @@ def alignment_of(
         untied=untied,
         weakest=weakest_link(solved.cell, last),
         verdict=judge(findings),
-        details=_details(clocks, solved, spread),
+        details=_details(looked, solved, spread),
         arms=_arms(session, solved, told),
         targets={name or "target": target_document(it) for name, it in session.plates.items()},
         stages={
@@ -249,14 +244,14 @@ def _warnings(
     ]
 
 
-def _details(clocks: Clocks, solved: Solved, spread: FloatArray) -> dict[str, Any]:
+def _details(looked: Observed, solved: Solved, spread: FloatArray) -> dict[str, Any]:
     """What was found of clocks."""
-    if not clocks.found:
+    if not looked.clocks:
         return {}
     return {
         "clocks": {
             it.words: _fitted_clock(it, at.clock, solved, spread).document()
-            for it, at in clocks.found.items()
+            for it, at in looked.clocks.items()
         }
     }
 
@@ -287,9 +282,9 @@ def _fitted_delay(pair: Pair, delay: FoundDelay, solved: Solved, spread: FloatAr
     return replace(delay, time_s=delay.time_s + float(late_s), sigma_s=sigma_s)
 
 
-def _clock_words(clocks: Clocks, solved: Solved, spread: FloatArray) -> Iterator[str]:
+def _clock_words(looked: Observed, solved: Solved, spread: FloatArray) -> Iterator[str]:
     """Says what the fit of the whole cell makes of clocks that the motion told."""
-    for pair, it in clocks.found.items():
+    for pair, it in looked.clocks.items():
         clock = _fitted_clock(pair, it.clock, solved, spread)
         if clock is not it.clock:
             yield (

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.alignment.arms import arms_of, check_arms, with_errors
 from visioncal.alignment.cell import Cell
-from visioncal.alignment.clocks import Clocks
+from visioncal.alignment.clocks import clock_effects
 from visioncal.alignment.lenses import CellSide, settled_looks, with_looks
 from visioncal.alignment.priors import most_contradicted
 from visioncal.alignment.reading import nominal_spread, places_alone
@@ -83,13 +83,12 @@ class Solved:
         return np.asarray(first + np.searchsorted(free, places))
 
 
-def solve(cell: Cell, looked: Observed, clocks: Clocks, asked: str = "auto") -> Solved:
+def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     """Solves a whole cell.
 
     Args:
         cell: The cell.
-        looked: What its cameras saw.
-        clocks: The offsets of clocks by which its rows have poses.
+        looked: What was observed in it.
         asked: How far the robots' arms are to be calibrated, one of `arms.LEVELS`.
 
     Raises:
@@ -108,7 +107,7 @@ def solve(cell: Cell, looked: Observed, clocks: Clocks, asked: str = "auto") -> 
     agreed = _levelled(cell, views, agreed)
     arms: Mapping[str, RobotArm] = arms_of(cell)
     check_arms(arms, asked)
-    seen, late = None, clocks.effects(cell)
+    seen, late = None, clock_effects(cell, looked.clocks)
     if looked.scenes:
         agreed, seen, arms = with_looks(cell, looked, views, agreed, arms, late)
     else:

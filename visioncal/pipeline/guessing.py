@@ -16,9 +16,9 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.stages.choose import choose_poses
+from visioncal.stages.clocks import waits_for_clock
 from visioncal.stages.handeye import robot_part
 from visioncal.stages.judge import is_scattered
-from visioncal.stages.motion import waits_for_clock
 from visioncal.types import FloatArray, Progress
 
 # What the camera's poses need; the robot has no part in it, so that it can be wrong.

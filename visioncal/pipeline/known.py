@@ -55,8 +55,6 @@ class Known(Observed):
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         matched: The joints beside the reported poses; None without a robot.
         lost_zero: A joint whose zero is far from where the model has it.
-        clock: How the clocks of camera and robot go together; None where all poses were reported.
-        spared: Why views of a sweep are not needed, by view.
         readings: What an instrument read, where that is all that was observed.
         used: The views in the fit, in the session's order.
         candidates: The views that could be in the fit, if they agree.
@@ -76,7 +74,6 @@ class Known(Observed):
         held_out: Residuals of used views, left out of the fit.
         findings: What the verdict is made of.
         verdict: Whether to trust it all.
-        notes: What is good to know and no reason for doubt.
     """
 
     solver: SolverName = "joint"
@@ -88,8 +85,6 @@ class Known(Observed):
     compared_frames: Mapping[str, FloatArray] = field(default_factory=dict)
     matched: Matched | None = None
     lost_zero: JointReading | None = None
-    clock: Clock | None = None
-    spared: Mapping[int, str] = field(default_factory=dict)
     readings: Readings | None = None
     used: tuple[int, ...] = ()
     candidates: tuple[int, ...] = ()
@@ -109,7 +104,11 @@ class Known(Observed):
     held_out: HeldOut | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None
-    notes: tuple[str, ...] = ()
+
+    @property
+    def clock(self) -> Clock | None:
+        """How the clocks of camera and robot go together; None where all poses were reported."""
+        return next((it.clock for it in self.clocks.values()), None)
 
     @property
     def camera(self) -> CameraResult | None:

@@ -29,14 +29,14 @@ from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.stages.choose import choose_by
-from visioncal.stages.clock import set_clock, sweep_of
+from visioncal.stages.clocks import set_clocks, waits_for_clock
 from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import robot_part, solve_hand_eye
 from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked
 from visioncal.stages.measured import components
-from visioncal.stages.motion import waits_for_clock
+from visioncal.stages.motion import is_open
 from visioncal.stages.observed import all_held_back, nothing_seen
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses
@@ -115,19 +115,11 @@ def _reported(known: Known, session: Session) -> Known:
 
 def _clock(known: Known) -> Known:
     """Gives views that have a time alone the robot's poses out of its stream."""
-    session = known.session
-    if not waits_for_clock(session):
+    if not waits_for_clock(known.session):
         return known
-    camera = None if known.camera is None else known.camera.camera
-    clocked = set_clock(sweep_of(session, known.robot, camera), known.poses)
-    known = replace(
-        known,
-        clock=clocked.clock,
-        spared=clocked.spared,
-        poses={**known.poses, **clocked.poses},
-        notes=(*known.notes, *clocked.notes),
-    ).noting(clocked.rejections, clocked.warnings)
-    return _reported(known, replace(session, views=clocked.views))
+    known = set_clocks(known)
+    views = tuple(it for it in known.timed.views if not is_open(it))
+    return _reported(known, replace(known.timed, views=views))
 
 
 def _readings(known: Known) -> Known:

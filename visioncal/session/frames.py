@@ -31,10 +31,18 @@ def frame_name(kind: str, name: str) -> str:
     return f"{frame}_{name}" if name else frame
 
 
-def robots_of(declaration: Declaration, views: Sequence[View]) -> dict[str, RobotTable]:
-    """The robots by name; one without a name where poses are told and none is declared."""
+def robots_of(
+    declaration: Declaration, views: Sequence[View], *, in_streams: bool = False
+) -> dict[str, RobotTable]:
+    """The robots by name; one without a name where poses are told and none is declared.
+
+    Args:
+        declaration: What the session declares.
+        views: Its rows.
+        in_streams: Whether a stream tells poses or joints.
+    """
     found = declaration.named("robot")
-    if not found and any(tells_robot(view) for view in views):
+    if not found and (in_streams or any(tells_robot(view) for view in views)):
         return {"": RobotTable()}
     return {name: it for name, it in found.items() if isinstance(it, RobotTable)}
 
@@ -44,7 +52,9 @@ def point_name(view: View) -> str:
     return view.text.get("point", "").strip()
 
 
-def resolve_frames(declaration: Declaration, views: Sequence[View]) -> dict[str, str]:
+def resolve_frames(
+    declaration: Declaration, views: Sequence[View], robots: Iterable[str]
+) -> dict[str, str]:
     """Works out what each frame hangs on.
 
     What hangs on a fixture, or on another thing that does not move before it, is given as hanging
@@ -56,7 +66,7 @@ def resolve_frames(declaration: Declaration, views: Sequence[View]) -> dict[str,
     Raises:
         DataError: What is said contradicts itself, or something is neither said nor follows.
     """
-    return _Tree(declaration, tuple(views)).resolved()
+    return _Tree(declaration, tuple(views), tuple(robots)).resolved()
 
 
 def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
@@ -67,7 +77,7 @@ def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
             has it.
     """
     if declaration.frames:
-        _ = _Tree(declaration, tuple(views)).said
+        _ = _Tree(declaration, tuple(views), tuple(robots_of(declaration, views))).said
 
 
 def frames_of_kind(frames: Iterable[str], kind: str) -> tuple[str, ...]:
@@ -105,10 +115,7 @@ class _Tree:
 
     declaration: Declaration
     views: tuple[View, ...]
-
-    @cached_property
-    def robots(self) -> tuple[str, ...]:
-        return tuple(robots_of(self.declaration, self.views))
+    robots: tuple[str, ...]
 
     @cached_property
     def frames(self) -> dict[str, tuple[str, str]]:

@@ -290,7 +290,8 @@ class Session:
     @cached_property
     def robots(self) -> Mapping[str, RobotTable]:
         """The robots by name; that of `[robot]`, and of poses without a robot, is empty."""
-        return robots_of(self.declaration, self.views)
+        in_streams = any(it.tells_robot for it in self.streams.values())
+        return robots_of(self.declaration, self.views, in_streams=in_streams)
 
     @cached_property
     def instruments(self) -> Mapping[str, InstrumentTable]:
@@ -320,7 +321,7 @@ class Session:
         Raises:
             DataError: What is said contradicts itself, or something is neither said nor follows.
         """
-        return resolve_frames(self.declaration, self.views)
+        return resolve_frames(self.declaration, self.views, self.robots)
 
     @cached_property
     def observations(self) -> tuple[Observation, ...]:

@@ -72,6 +72,11 @@ class Stream:
         poses = RigidTransform.from_components(numbers[:, :3], rotations)
         return stamps_s, np.asarray(poses.as_matrix())
 
+    @property
+    def tells_robot(self) -> bool:
+        """Whether it has poses or joints of a robot."""
+        return known.POSE[0] in self or "q1_rad" in self
+
     def joints(self) -> tuple[FloatArray, FloatArray]:
         """The joint angles: (m,) times [s] and (m, n) [rad]."""
         return self.group(known.joint_columns(self.columns))

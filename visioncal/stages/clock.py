@@ -11,11 +11,11 @@ import numpy as np
 
 from visioncal.estimation.clock import ClockFit, DelayedFit, clear_fit, fit_offset
 from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.effects.delays import Delay
 from visioncal.estimation.turned import Frames, Match, turning_matches
-from visioncal.robot import Robot
-from visioncal.session import Session, View
+from visioncal.session import View
 from visioncal.stages.delays import find_delays, straighten
-from visioncal.stages.motion import Motion, at_rest, is_open, motion_of, slow_and_new
+from visioncal.stages.motion import Motion, at_rest, is_open, slow_and_new
 from visioncal.stages.offset import (
     FEWEST_VIEWS,
     LARGEST_SIGMA_S,
@@ -29,7 +29,6 @@ from visioncal.stages.offset import (
     why_untold,
 )
 from visioncal.stages.pnp import ViewPoses
-from visioncal.targets import numbered_positions
 from visioncal.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
 
 # A stated offset is taken to be known so well [s].
@@ -41,6 +40,28 @@ _IN_A_GAP = "no pose of the robot: samples of its stream are missing around that
 _IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
 # So many views are all used; of more, slow ones.
 _MANY_VIEWS = 60
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A camera's frame and the name of a robot that parts it from what it sees."""
+
+    camera: str
+    robot: str
+
+    @property
+    def words(self) -> str:
+        """Both, as messages and results name them."""
+        return f"{self.camera} and robot {self.robot or 'robot'}"
+
+    @property
+    def effect(self) -> str:
+        """The effect of their clocks' offset, by its name."""
+        return f"clock of {self.words}"
+
+    def delay(self, of: Delay) -> str:
+        """The effect of a time within the camera's images, by its name."""
+        return f"{of.name} of {self.words}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,24 +120,6 @@ class Sweep:
             np.array([it.covariance[0] for _, it in seen]) if measured else None,
             CornerStack.of(corners, self.positions) if stacked else None,
         )
-
-
-def sweep_of(session: Session, robot: Robot | None, camera: Camera | None = None) -> Sweep:
-    """The sweep of a session of one camera and one robot that `waits_for_clock`.
-
-    Args:
-        session: The session.
-        robot: Its nominal robot, where it names a known one.
-        camera: Its camera's intrinsics, where they are known.
-
-    Raises:
-        DataError: The stream has no poses, and no joints that the robot's model knows.
-    """
-    clock = session.declaration.clock
-    stated_s = clock.camera_minus_robot_s if clock.model_fields_set else None
-    positions = numbered_positions(tuple(session.boards.values()))
-    motion = motion_of(session, robot)
-    return Sweep(motion, session.mount, session.views, stated_s, camera, positions)
 
 
 def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.errors import DataError
 from visioncal.estimation.trajectory import Samples, Trajectory
 from visioncal.robot import Robot
-from visioncal.session import Session, Stream, View
+from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask
@@ -57,45 +57,35 @@ class Motion:
         return rows
 
 
-def waits_for_clock(session: Session) -> bool:
-    """Tells whether views have a time, and their robot's pose in a stream."""
-    return (
-        session.mount != "instrument"
-        and _stream_name(session) is not None
-        and any(is_open(view) for view in session.views)
-    )
-
-
 def is_open(view: View) -> bool:
     """Tells whether a view has a time and nothing of the robot."""
     return view.stamp_s is not None and view.base_from_flange() is None and view.joints_rad is None
 
 
-def _stream_name(session: Session) -> str | None:
-    """The stream of the robot: the one of that name, or the only one with poses or joints."""
-    moving = [name for name, it in session.streams.items() if has_motion(it)]
-    if ROBOT_STREAM in moving:
-        return ROBOT_STREAM
-    return moving[0] if len(moving) == 1 else None
+def stream_of(session: Session, robot: str) -> str:
+    """The name of a robot's stream; empty where it has none.
+
+    It is the one of the robot's name; of an only robot also `robot`, or the only one with poses or
+    joints.
+    """
+    moving = [name for name, it in session.streams.items() if it.tells_robot]
+    names = [robot or ROBOT_STREAM]
+    if len(session.robots) < 2:
+        names += [ROBOT_STREAM, *(moving if len(moving) == 1 else ())]
+    return next((it for it in names if it in moving), "")
 
 
-def has_motion(stream: Stream) -> bool:
-    """Whether a stream has poses or joints of a robot."""
-    return POSE[0] in stream or "q1_rad" in stream
-
-
-def motion_of(session: Session, robot: Robot | None, name: str = "") -> Motion:
+def motion_of(session: Session, robot: Robot | None, name: str) -> Motion:
     """Reads a robot's stream.
 
     Args:
-        session: One that `waits_for_clock`, or that has a stream of this name.
+        session: One that has a stream of this name.
         robot: The robot's model, where it is known.
-        name: The stream; that of the only robot where empty.
+        name: The stream's.
 
     Raises:
         DataError: It has no poses, and no joints that the robot's model knows.
     """
-    name = name or _stream_name(session) or ROBOT_STREAM
     stream = session.streams[name]
     reported_s, poses = stream.poses()
     joints_s, q = stream.joints()

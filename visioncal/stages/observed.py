@@ -12,6 +12,7 @@ from visioncal.estimation.scene import Scene
 from visioncal.files import some_of
 from visioncal.session import Session
 from visioncal.session.tables import CameraTable
+from visioncal.stages.clock import Clocked, Pair
 from visioncal.stages.pnp import ViewPoses
 from visioncal.types import Corners, Progress, Rejection
 
@@ -51,7 +52,9 @@ class Observed:
         cameras: What each camera with images gave, by its frame.
         poses: The target's pose by view; several candidates until they are chosen from.
         reasons: Why a view cannot be used, by view.
+        clocks: How the clocks of cameras and robots go together, where robots' streams are used.
         warnings: What the user should know, in sentences.
+        notes: What is good to know and no reason for doubt.
     """
 
     session: Session
@@ -59,7 +62,9 @@ class Observed:
     cameras: Mapping[str, CameraLook] = field(default_factory=dict)
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)
+    clocks: Mapping[Pair, Clocked] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[str] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
@@ -74,6 +79,20 @@ class Observed:
     def corners(self) -> Mapping[int, Corners]:
         """What was found in the images of all cameras, by view."""
         return {view: it for look in self.cameras.values() for view, it in look.corners.items()}
+
+    @cached_property
+    def timed(self) -> Session:
+        """The session with what robots' streams have at the times of rows that wait for them."""
+        if not self.clocks:
+            return self.session
+        found = {view.number: view for it in self.clocks.values() for view in it.views}
+        views = tuple(found.get(it.number, it) for it in self.session.views)
+        return replace(self.session, views=views)
+
+    @property
+    def spared(self) -> Mapping[int, str]:
+        """Why views of sweeps are not needed, by view."""
+        return {view: why for it in self.clocks.values() for view, why in it.spared.items()}
 
     @property
     def lenses(self) -> Mapping[str, CameraResult]:

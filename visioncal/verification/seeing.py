@@ -139,7 +139,7 @@ def seen_by(known: Known, footing: Footing) -> Seen:
         lens = CameraResult(calibration.camera.camera, estimated=False)
         known = known.with_camera(frame, replace(look, lens=lens))
     # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
-    known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clock=None)
+    known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clocks={})
     known = _with_arm(known, footing)
     known = _posed(known, footing)
     problem = known.problem(known.used)
