@@ -1,7 +1,7 @@
 """Finding a target's corners in an image: one module a kind of target."""
 
-from visioncal.finders.charuco import find_charuco, fitting_layouts
-from visioncal.finders.checkerboard import find_checkerboard
+from visioncal.finders.board import find_board
+from visioncal.finders.charuco import fitting_layouts
 from visioncal.finders.marker import find_marker
 from visioncal.finders.result import NotFound, Seen
 from visioncal.types import Image, Target
@@ -20,10 +20,8 @@ def find_target(image: Image, target: Target) -> Seen | NotFound:
         The corners, or why there are none.
     """
     match target.kind:
-        case "charuco":
-            return find_charuco(image, target)
-        case "checkerboard":
-            return find_checkerboard(image, target)
+        case "charuco" | "checkerboard":
+            return find_board(image, target)
         case "marker":
             return find_marker(image, target)
         case "points":

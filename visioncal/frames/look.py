@@ -123,7 +123,7 @@ def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
             f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
             culprits=[label],
         )
-    return Corners(0, seen.ids, seen.px, blur_at_corners(image, seen.px))
+    return Corners(0, seen.ids, seen.px, blur_at_corners(image, seen.px), seen.weights)
 
 
 def _check(corners: Corners, target: Target, label: str) -> None:

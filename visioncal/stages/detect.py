@@ -228,7 +228,7 @@ def look_for(
     trouble = _trouble(target, seen.ids, blur, options)
     if trouble:
         return Rejection(view, trouble), False
-    return Corners(view, seen.ids, seen.px, blur), False
+    return Corners(view, seen.ids, seen.px, blur, seen.weights), False
 
 
 def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners | Rejection:
