@@ -1,0 +1,230 @@
+"""Corners against the truth: visioncal's template and OpenCV's detectors on the same pictures.
+
+The pictures come from `tests/rendered.py`, whose edges are exact by area and which shares nothing
+with the template. On checkerboards the peers are `findChessboardCornersSB` and `cornerSubPix` from
+there on, the best of three windows in each row; on ChArUco boards what `CharucoDetector` gives.
+
+    PYTHONPATH=tests python tests/benchmarks/corners.py
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import cv2
+import numpy as np
+from boards import charuco, checkerboard
+from rendered import Shot, photograph
+from results import few, write_section
+
+from visioncal.finders.board import find_board
+from visioncal.finders.charuco import find_charuco
+from visioncal.finders.checkerboard import find_checkerboard
+from visioncal.finders.result import Seen
+from visioncal.finders.template import refine
+from visioncal.types import FloatArray, Image, Target
+
+PICTURES, REPEATS = few((2, 7), (1, 1))
+# Columns and rows of corners differ by an odd number: the checkerboard has one numbering.
+CHECKERBOARD, CHARUCO = checkerboard(8, 5), charuco(8, 6)
+WINDOWS = (3, 5, 9)
+# Farther off, a corner counts as an outlier [px].
+OUTLIER_PX = 0.1
+
+PLAIN = Shot(noise=2.0)
+CHANGES = {
+    "motion of 4 px": {"motion_px": 4.0},
+    "motion of 8 px": {"motion_px": 8.0},
+    "motion of 12 px": {"motion_px": 12.0},
+    "gamma 0.45": {"gamma": 0.45},
+    "JPEG 60": {"jpeg": 60},
+    "JPEG 75": {"jpeg": 75},
+    "JPEG 95": {"jpeg": 95},
+    "ink spread by 1 px": {"ink_px": 1.0},
+    "light falls by half": {"uneven": 0.5},
+    "colour mosaic": {"bayer": True},
+    "white beyond the scale": {"levels": (0.0, 330.0)},
+    "tilted by 60 deg": {"tilt_deg": 60.0},
+    "bent by 15 %": {"bend": 0.15},
+}
+
+
+def shots() -> Iterator[tuple[str, Shot]]:
+    """All rows: first squares, defocus and noise, then one change at a time."""
+    for side, disc, noise in product((8, 12, 20, 40, 80), (0, 2, 4, 6), (1, 4, 8)):
+        yield "", replace(PLAIN, square_px=side, disc_px=disc, noise=noise)
+    for words, change in CHANGES.items():
+        for side in (12, 20, 40):
+            yield words, replace(PLAIN, square_px=side, **change)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the tables.
+
+    Attributes:
+        corners: How many were found in all pictures.
+        peer_px: Rms of a coordinate, of the best of the peers.
+        core_px: That of the template.
+        bias_px: Rms of what the corners of a picture share, of peer and template.
+        outliers: Shares farther off than `OUTLIER_PX`, of peer and template.
+        left: Share of corners that the template does not fit.
+        nees: Mean squared error of the template over its variance.
+    """
+
+    words: str
+    shot: Shot
+    corners: int
+    peer_px: float
+    core_px: float
+    bias_px: tuple[float, float]
+    outliers: tuple[float, float]
+    left: float
+    nees: float
+
+    @property
+    def ratio(self) -> float:
+        """The template's rms by the peer's."""
+        return self.core_px / self.peer_px
+
+
+def compared(target: Target, words: str, shot: Shot) -> Row | None:
+    """One row; None where OpenCV finds no board."""
+    errors: dict[str, list[FloatArray]] = {}
+    core, left, scaled = [], [], []
+    for seed in range(PICTURES):
+        image, truth = photograph(target, shot, seed)
+        seen = detected(image, target)
+        if seen is None:
+            continue
+        truth = truth[seen.ids]
+        for name, px in peers(image, target, seen, shot.square_px):
+            errors.setdefault(name, []).append(px - truth)
+        refined = refine(image, target, seen.ids, seen.px)
+        fitted = np.array([not it for it in refined.reasons])
+        core.append(refined.px[fitted] - truth[fitted])
+        scaled.append(core[-1] / refined.sigma_px[fitted, None])
+        left.extend(~fitted)
+    if not core:
+        return None
+    best = min(errors.values(), key=lambda it: rms(np.concatenate(it)))
+    both = (best, core)
+    return Row(
+        words,
+        shot,
+        len(left),
+        *(rms(np.concatenate(it)) for it in both),
+        tuple(rms([each.mean(axis=0) for each in it]) for it in both),
+        tuple(far(np.concatenate(it)) for it in both),
+        float(np.mean(left)),
+        rms(np.concatenate(scaled)) ** 2,
+    )
+
+
+def detected(image: Image, target: Target) -> Seen | None:
+    """What OpenCV's detector gives."""
+    find = find_charuco if target.kind == "charuco" else find_checkerboard
+    seen = find(image, target)
+    return seen if isinstance(seen, Seen) else None
+
+
+def peers(
+    image: Image, target: Target, seen: Seen, side_px: float
+) -> Iterator[tuple[str, FloatArray]]:
+    """What else is made of the detected corners."""
+    yield "detector", seen.px
+    for reach in WINDOWS:
+        # A window that reaches a neighbour diverges by pixels.
+        if target.kind == "checkerboard" and (reach == WINDOWS[0] or reach < 0.4 * side_px):
+            start = seen.px.astype(np.float32)[:, None].copy()
+            ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+            yield f"{reach}", cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), ends)[:, 0]
+
+
+def rms(values: FloatArray | list[FloatArray]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def far(errors: FloatArray) -> float:
+    return float(np.mean(np.linalg.norm(errors, axis=1) > OUTLIER_PX))
+
+
+def table(rows: list[Row]) -> str:
+    head = "| squares px | disc px | noise | else | corners | OpenCV px | core px | ratio "
+    head += "| shared px | outliers | not fitted | NEES |"
+    lines = [head, "| ---: | ---: | ---: | --- |" + " ---: |" * 8]
+    for it in rows:
+        shot, (bias, own), (out, few_out) = it.shot, it.bias_px, it.outliers
+        lines.append(
+            f"| {shot.square_px:.0f} | {shot.disc_px:.0f} | {shot.noise:.0f} | {it.words} "
+            f"| {it.corners} | {it.peer_px:.4f} | {it.core_px:.4f} | {it.ratio:.2f} "
+            f"| {bias:.4f}, {own:.4f} | {out:.1%}, {few_out:.1%} | {it.left:.1%} | {it.nees:.2f} |"
+        )
+    ratios = [it.ratio for it in rows]
+    worst, median = max(ratios), statistics.median(ratios)
+    summary = f"{len(rows)} rows; ratio at most {worst:.2f}, median {median:.2f}."
+    return f"{summary}\n\n" + "\n".join(lines)
+
+
+def took_ms(work: Callable[[], object]) -> float:
+    """Milliseconds of this thread's processor, which a busy machine does not stretch."""
+    work()
+    taken = []
+    for _ in range(REPEATS):
+        start = time.thread_time()
+        work()
+        taken.append(time.thread_time() - start)
+    return 1e3 * statistics.median(taken)
+
+
+def speed() -> str:
+    """The times of five-megapixel images."""
+    lines = [
+        "| board | OpenCV in the image | in half of it | the template | all of visioncal |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for target, side in ((checkerboard(12, 7), 110.0), (charuco(12, 8), 110.0)):
+        image = np.full((2048, 2448), 200, np.uint8)
+        part, _ = photograph(target, replace(PLAIN, square_px=few(side, 60.0), tilt_deg=15.0), 3)
+        image[: len(part), : part.shape[1]] = part
+        small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        seen = detected(image, target)
+        times = [
+            took_ms(lambda: detected(image, target)),  # noqa: B023 - called at once
+            took_ms(lambda: detected(small, target)),  # noqa: B023
+            took_ms(lambda: refine(image, target, seen.ids, seen.px)),  # noqa: B023
+            took_ms(lambda: find_board(image, target)),  # noqa: B023
+        ]
+        name = f"{target.kind}, {len(seen.ids)} corners"
+        lines.append(f"| {name} | " + " | ".join(f"{it:.0f} ms" for it in times) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Prints the tables and keeps them."""
+    cv2.setNumThreads(1)
+    parts = []
+    for target in (CHECKERBOARD, CHARUCO):
+        rows = [compared(target, *it) for it in few(list(shots()), list(shots())[24:26])]
+        found = [it for it in rows if it is not None]
+        missing = len(rows) - len(found)
+        parts.append(
+            f"**{target.kind}**; in {missing} rows more OpenCV finds no board.\n\n{table(found)}"
+        )
+    text = (
+        f"{PICTURES} pictures a row, tilted by 25 deg in a lens that bends by 2 % unless the row "
+        "says otherwise. Px are rms of a coordinate, `shared` rms of what all corners of a picture "
+        "have in common, outliers those more than "
+        f"{OUTLIER_PX} px off: OpenCV's (the best peer's) first. The aim for checkerboards is a "
+        "ratio of 0.65 at most, for ChArUco boards of 1. NEES is the template's squared error over "
+        "the variance that it states.\n\n" + "\n\n".join(parts)
+    )
+    text += f"\n\nImages of 2448 x 2048 px, median processor time of one thread:\n\n{speed()}\n"
+    print(text)
+    write_section("Corners", "PYTHONPATH=tests python tests/benchmarks/corners.py", text)
+
+
+if __name__ == "__main__":
+    main()
