@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.estimation.boards import place
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.robot import load_robot
@@ -89,10 +88,7 @@ def calibrated_sweep(moved: Sweep) -> Known:
 
 def error_of(cell: Cell, known: Known) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
-    placed = place(known.shown(known.used), known.solved.edges)
-    # The chain ends at the board with the most views.
-    order = sorted(range(len(known.boards)), key=lambda it: known.boards[it])
-    found = [known.solved.edges.x, *placed.z[order]]
-    return np.concatenate(
-        [log(invert(it) @ ours) for it, ours in zip(cell.transforms.values(), found, strict=True)]
-    )
+    # The board with the most views comes first.
+    order = [0, *(1 + np.argsort(known.boards))]
+    true = np.array(list(cell.transforms.values()))
+    return log(invert(true) @ known.solved.state.edges[order]).ravel()

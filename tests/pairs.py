@@ -87,7 +87,7 @@ def calibration_of(known: Known, name: str = "cell") -> Calibration:
             edge: Edge(pose, spread[part, part])
             for edge, pose, part in zip(
                 names,
-                (result.edges.x, result.edges.z),
+                result.state.edges,
                 (slice(0, 6), slice(6, 12)),
                 strict=True,
             )

@@ -97,7 +97,7 @@ def test_a_flat_board_of_the_stated_size_stays_so(given):
         known = calibrated(simulate(replace(FINE, state_intrinsics=given, seed=seed)))
         moving = known.free.columns[~known.free.anchored]
         assert len(moving) == (0 if given else 9)
-        assert np.all(known.free.after(known.solved.edges.shared).board == 0.0)
+        assert np.all(known.free.after(known.solved.state.values).board == 0.0)
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
@@ -211,7 +211,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     told = replace(cell, stated_camera=wrong)
     known = calibrated(told)
     assert any("given intrinsics do not fit" in it for it in known.warnings)
-    refined = known.free.after(known.solved.edges.shared).camera
+    refined = known.free.after(known.solved.state.values).camera
     lens = 12 + np.flatnonzero(known.free.columns < known.free.lens_count)
     sigma = np.sqrt(np.diag(known.solved.covariance))[lens[:4]]
     assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.0 * sigma)
@@ -221,7 +221,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
         known_of(told).session, document=document | {"camera": document["camera"] | table}
     )
     held = calibrated(told, session=session)
-    assert held.free.after(held.solved.edges.shared).camera.matrix == pytest.approx(wrong.matrix)
+    assert held.free.after(held.solved.state.values).camera.matrix == pytest.approx(wrong.matrix)
 
 
 def test_too_few_corners_leave_the_lens_alone():

@@ -9,8 +9,6 @@ from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.boards import Boards, place
-from visioncal.estimation.closure import Noise, closure_information
 from visioncal.estimation.workspace import postures
 from visioncal.frames.sighting import sighting
 from visioncal.outputs import write_outputs
@@ -33,6 +31,7 @@ from visioncal.simulation.boards import corners_m
 from visioncal.simulation.optics import project
 from visioncal.stages.detect import detect
 from visioncal.transforms import exp, invert, log
+from visioncal.verification.footing import Footing
 
 # The second board is out of sight from where the first is looked at, unless it is turned less.
 NEAR = Second(turn_rad=0.6, tilt_rad=0.2)
@@ -108,35 +107,6 @@ def test_boards_have_names_and_a_common_covariance(mount):
         assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
 
 
-def test_edges_move_with_the_chain_as_their_slopes_say():
-    known = calibrated(simulate(replace(TWO, seed=1)))
-    edges, boards = known.solved.edges, known.shown(known.used)
-    placed, step = place(boards, edges), 1e-6
-    for at in (0, 4, 7, 11, *range(12 + boards.begin, 18 + boards.begin)):
-        change = np.zeros(12 + len(edges.shared))
-        change[at] = step
-        ends = [place(boards, edges.moved(it)).z for it in (change, -change)]
-        moved = log(invert(ends[1]) @ ends[0]).ravel() / (2 * step)
-        # Central differences of steps this small are exact to nine digits.
-        assert moved == pytest.approx(placed.slope[6:, at], abs=1e-7)
-
-
-def test_merging_what_one_stop_shows_of_two_boards_loses_nothing():
-    """Where the robot has no noise of its own, stops make no difference."""
-    cell = simulate(replace(TWO, second=NEAR, seed=2))
-    assert len(cell.corners) > cell.options.views
-    known = calibrated(cell)
-    data, edges = known.closure(known.used), known.solved.edges
-    noise = Noise(1e-9, 1e-9)
-    whole = closure_information(data, edges, noise)
-    merged = closure_information(data.merged(known.stops), edges, noise)
-    scale = np.sqrt(np.diag(whole))
-    # The chain does not close exactly, and slopes are taken where each of both closes.
-    assert merged / np.outer(scale, scale) == pytest.approx(
-        whole / np.outer(scale, scale), abs=1e-4
-    )
-
-
 def test_two_boards_tell_more_of_an_arm_than_one():
     """The same number of views, and the tool's place all over the workspace."""
     ratios = []
@@ -171,9 +141,9 @@ def error_m(cell, known):
     robot = known.arm_model.robot
     q = postures(robot)
     x, z, *_ = cell.transforms.values()
-    board = place(known.shown(known.used), known.solved.edges).z[known.boards.index(0)]
+    board = known.solved.state.edges[1 + known.boards.index(0)]
     true = invert(x) @ forward(cell.true_arm, q) @ z
-    ours = invert(known.solved.edges.x) @ robot.base_from_flange(q) @ board
+    ours = invert(known.solved.state.edges[0]) @ robot.base_from_flange(q) @ board
     return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
 
 
@@ -243,12 +213,6 @@ def test_too_few_views_of_any_board_are_refused():
     }
     with pytest.raises(DegenerateError, match="first in 2, second in 2"):
         calibrated(without(cell, set(range(len(cell.corners))) - kept))
-
-
-def test_an_only_board_is_brought_nowhere():
-    cell = simulate(replace(TWO, second=None, views=5))
-    data = known_before(cell, "agree").closure(range(5))
-    assert Boards.one(5).brought(data) is data
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -321,3 +285,16 @@ def test_every_output_shows_all_boards(tmp_path):
         assert any(it.startswith(f"/targets/{name}/") for it in placements)
     with pytest.raises(DataError, match=r"several targets \(first, second\)"):
         sighting(session, written.calibration, "base")
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+def test_what_is_written_of_the_fit_is_read_back(given):
+    """Further boards are written relative to the first."""
+    known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))
+    assert known.arm_model is not None
+    footing, solved = Footing.of(result_of(known)), known.solved
+    np.testing.assert_allclose(footing.edges, solved.state.edges, atol=1e-12)
+    sigmas = np.sqrt(np.diag(solved.covariance))
+    # Slopes there and back undo each other up to rounding.
+    scale = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(footing.covariance / scale, solved.covariance / scale, atol=1e-6)

@@ -9,40 +9,45 @@ from cells import calibrated, error_of
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.boards import Boards
-from visioncal.estimation.closure import (
-    Closure,
-    Edges,
-    Noise,
-    estimate_noise,
-    fit_closure,
-    solve_closure,
-)
+from visioncal.estimation.chain import FLANGE, chain, robot_part
 from visioncal.estimation.linalg import covariance, damped_step, spectrum
-from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.problem import ROBOT, Effect, Noise, State
+from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
 from visioncal.estimation.variance import Knowledge
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, exact, measured_poses, simulate
 from visioncal.solvers import SOLVERS
-from visioncal.stages.handeye import compare_solvers, robot_part, solve_hand_eye
+from visioncal.stages.handeye import compare_solvers, solve_hand_eye
 from visioncal.transforms import adjoint, compose, exp, invert, log
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-NOISE = Noise(1e-3, 5e-4)
-HELD = np.zeros(0)  # no change of the lens
+NOISE = Noise.of_robot(1e-3, 5e-4)
 
 
-def closure_of(cell, camera=None):
-    robot = robot_part(cell.base_from_flange, cell.options.mount)
-    return Closure(cell.options.mount, robot, cell.cam_from_target if camera is None else camera)
+def problem_of(cell, camera=None):
+    seen = cell.cam_from_target if camera is None else camera
+    return chain(cell.options.mount, cell.base_from_flange, seen)
+
+
+def state_of(*edges):
+    return State(np.array(edges), np.zeros(0))
+
+
+def solved(problem, solver="joint"):
+    return solve_hand_eye(problem, mount_of(problem), solver)
+
+
+def mount_of(problem):
+    carried = problem.tree.branches["cam"].parent == FLANGE
+    return "eye-in-hand" if carried else "eye-to-hand"
 
 
 def made_up(robot, x, z, noise=NOISE, seed=0, mount="eye-in-hand"):
-    """A closure whose residuals have just this noise."""
+    """A chain whose residuals have just this noise."""
     rng = np.random.default_rng(seed)
-    sigma = np.repeat([noise.sigma_rad, noise.sigma_m], 3)
+    sigma = np.repeat(noise.robots[0], 3)
     errors = exp(rng.standard_normal((len(robot), 6)) * sigma)
-    return Closure(mount, robot, invert(robot @ x) @ z @ errors)
+    return chain(mount, robot_part(robot, mount), invert(robot @ x) @ z @ errors)
 
 
 def some_edges(seed=0):
@@ -65,14 +70,14 @@ def test_jacobian_agrees_with_central_differences(mount):
     by_camera, by_flange = rng.normal(size=(2, 5, 6, 3))
     known = Knowledge(np.eye(3), np.zeros(3))
     effect = Effect.free("any", known, by_camera, {ROBOT: by_flange})
-    data = made_up(some_motion(5), x, z, Noise(0.05, 0.02), mount=mount).with_more(effect)
-    edges = Edges(x, z, np.zeros(3))
-    analytic, step = data.problem.linear(edges.state).jacobian, 1e-6
+    problem = made_up(some_motion(5), x, z, Noise.of_robot(0.05, 0.02), mount=mount)
+    problem, state = problem.with_effects([effect]), State(np.array([x, z]), np.zeros(3))
+    analytic, step = problem.linear(state).jacobian, 1e-6
     for axis in range(15):
         shift = np.zeros(15)
         shift[axis] = step
-        moved = [edges.moved(sign * shift) for sign in (1, -1)]
-        ahead, behind = (log(invert(it.z) @ data.under(it.shared).placed(it.x)) for it in moved)
+        moved = [state.moved(sign * shift) for sign in (1, -1)]
+        ahead, behind = (problem.linear(it).residuals for it in moved)
         # Truncation step^2, rounding 1e-16 / step = 1e-10, and the series' own cut of 1e-9.
         np.testing.assert_allclose(analytic[:, :, axis], (ahead - behind) / (2 * step), atol=5e-9)
 
@@ -81,22 +86,21 @@ def test_jacobian_agrees_with_central_differences(mount):
 @pytest.mark.parametrize("solver", ["joint", "tsai", "li"])
 def test_exact_data_give_the_exact_edges(mount, solver):
     cell = simulate(exact(CellOptions(mount=mount, seed=1)))
-    result = solve_hand_eye(closure_of(cell), solver)
-    for found, true in zip((result.edges.x, result.edges.z), cell.transforms.values(), strict=True):
+    result = solved(problem_of(cell), solver)
+    for found, true in zip(result.state.edges, cell.transforms.values(), strict=True):
         np.testing.assert_allclose(found, true, atol=1e-9)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_every_solver_is_shown_beside_the_answer(mount):
     cell = simulate(CellOptions(mount=mount, seed=2))
-    data = closure_of(cell, measured_poses(cell))
-    edges = solve_hand_eye(data).edges
-    found = compare_solvers(data, edges, "joint", Boards.one(len(data)))
+    problem = problem_of(cell, measured_poses(cell))
+    result = solved(problem)
+    found = compare_solvers(result, mount, "joint")
     closed_forms = ["tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"]
     assert list(found) == ["joint", *closed_forms]
-    np.testing.assert_array_equal(found["joint"].x, edges.x)
-    again = solve_hand_eye(data, "tsai").edges
-    assert list(compare_solvers(data, again, "tsai", Boards.one(len(data)))) == closed_forms
+    np.testing.assert_array_equal(found["joint"].edges, result.state.edges)
+    assert list(compare_solvers(solved(problem, "tsai"), mount, "tsai")) == closed_forms
 
 
 def test_rounds_of_a_calibration_solve_each_closed_form_once(monkeypatch):
@@ -116,8 +120,6 @@ def test_rounds_of_a_calibration_solve_each_closed_form_once(monkeypatch):
     known = calibrated(cell, joints=True)
     assert known.kinematics.errors
     result_of(known)
-    # The first round of each fit starts from Park's.
-    assert calls.pop("park") <= 3
     assert set(calls.values()) == {1}
 
 
@@ -127,14 +129,13 @@ def test_noise_and_errors_are_as_stated():
     surprises, sigmas = [], []
     for seed in range(100):
         data = made_up(robot, x, z, seed=seed)
-        fit = fit_closure(data, Edges(x, z, HELD))
-        sigmas.append([fit.noise.sigma_rad, fit.noise.sigma_m])
-        result = solve_hand_eye(data)
-        error = np.concatenate([log(invert(x) @ result.edges.x), log(invert(z) @ result.edges.z)])
+        sigmas.append(fit_problem(data, state_of(x, z)).noise.robots[0])
+        result = solved(data)
+        error = log(invert(np.array([x, z])) @ result.state.edges).ravel()
         surprises.append(error @ np.linalg.solve(result.covariance, error) / 12)
     # Variances, not deviations, are unbiased; 100 runs of 54 degrees of freedom: 2 %.
     variances = np.mean(np.square(sigmas), axis=0)
-    np.testing.assert_allclose(variances, [NOISE.sigma_rad**2, NOISE.sigma_m**2], rtol=0.08)
+    np.testing.assert_allclose(variances, NOISE.robots[0] ** 2, rtol=0.08)
     # Mean of 100 chi-square of 12: 0.04; the estimated noise adds 1 / 27 to the expectation
     # (F against chi-square).
     assert np.mean(surprises) == pytest.approx(1.04, abs=0.15)
@@ -143,17 +144,15 @@ def test_noise_and_errors_are_as_stated():
 def test_the_fit_is_the_least_squares_solution_from_far_starts_too():
     x, z = some_edges(2)
     data = made_up(some_motion(15, 2), x, z)
-    near, rested = solve_closure(data, Edges(x, z, HELD), NOISE)
+    near, rested = solve_problem(data, state_of(x, z), NOISE)
     assert rested
     push = exp(np.array([0.15, -0.1, 0.1, 0.05, -0.03, 0.04]))
-    far, _ = solve_closure(data, Edges(x @ push, z @ push, HELD), NOISE)
+    far, _ = solve_problem(data, state_of(x @ push, z @ push), NOISE)
     # The cost is settled to 1e-10 of itself, the edges to 1e-5 of their sigma of about 1e-4.
-    np.testing.assert_allclose(far.x, near.x, atol=1e-8)
-    np.testing.assert_allclose(far.z, near.z, atol=1e-8)
-    jacobian = data.problem.linear(near.state).jacobian
-    residuals = log(invert(near.z) @ data.placed(near.x))
-    weights = np.repeat(NOISE.sigmas**-2.0, 3)
-    gradient = np.einsum("mij,i,mi->j", jacobian, weights, residuals)
+    np.testing.assert_allclose(far.edges, near.edges, atol=1e-8)
+    linear = data.linear(near)
+    jacobian, weights = linear.jacobian, np.repeat(NOISE.robots[0] ** -2.0, 3)
+    gradient = np.einsum("mij,i,mi->j", jacobian, weights, linear.residuals)
     information = np.einsum("mij,i,mik->jk", jacobian, weights, jacobian)
     # In units of the edges' sigma the gradient of a settled fit is nothing.
     assert np.abs(gradient * np.sqrt(np.diag(np.linalg.inv(information)))).max() < 1e-4
@@ -179,13 +178,13 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
         known = calibrated(cell)
         error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
         surprises.append(error @ np.linalg.solve(spread, error) / 12)
-        noises.append([known.solved.noise.sigma_m, known.solved.noise.sigma_rad])
+        noises.append(known.solved.noise.robots[0])
         assert known.pixel_px == pytest.approx(0.1, rel=0.1)
     # The mean of 8 chi-square of 12 has the standard deviation 0.144: four of it. The estimated
     # noise raises the expectation by some percent (F against chi-square).
     assert np.mean(surprises) == pytest.approx(1.05, abs=0.58)
     # A level has some 67 degrees of freedom over 8 cells at the worst: 9 %; four of it.
-    level_m, level_rad = np.sqrt(np.mean(np.square(noises), axis=0))
+    level_rad, level_m = np.sqrt(np.mean(np.square(noises), axis=0))
     assert level_m == pytest.approx(robot_m, rel=0.36)
     # Beside a fixed camera's 0.5 mrad a view, a robot's 0.05 mrad hardly shows.
     if mount == "eye-in-hand" or coarse > 1.0:
@@ -194,17 +193,23 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
 
 def test_a_stop_counts_once_however_often_it_is_looked_at():
     cell = simulate(CellOptions(seed=4, views=12, pixel_sigma_px=0.1))
-    data = replace(calibrated(cell).closure(range(12)), effects=())
-    once = solve_hand_eye(data)
+    problem = calibrated(cell).problem(range(12)).with_effects([])
+    once = solved(problem)
     again = np.repeat(np.arange(12), 3)
-    thrice = Closure(
-        data.mount, data.robot[again], data.camera[again], 3.0 * data.camera_covariance[again]
-    )
-    merged = solve_hand_eye(thrice.merged(again))
+    looks = problem.observations.take(again)
+    looks = replace(looks, covariance=3.0 * looks.covariance)
+    thrice = replace(problem, observations=looks)
     # Three looks of three times the variance are one look.
-    np.testing.assert_allclose(merged.edges.x, once.edges.x, atol=1e-9)
-    np.testing.assert_allclose(merged.covariance, once.covariance, rtol=1e-5, atol=1e-14)
-    unmerged = solve_hand_eye(thrice)
+    for it in (thrice, thrice.merged()):
+        np.testing.assert_allclose(solved(it).state.edges, once.state.edges, atol=1e-9)
+        np.testing.assert_allclose(solved(it).covariance, once.covariance, rtol=1e-5, atol=1e-14)
+    unmerged = solved(
+        replace(
+            thrice,
+            poses={ROBOT: problem.poses[ROBOT][again]},
+            observations=replace(looks, stops=np.arange(len(again))),
+        )
+    )
     assert np.trace(unmerged.covariance) < 0.6 * np.trace(once.covariance)
 
 
@@ -213,12 +218,11 @@ def test_three_views_do_not_pass_for_exact(mount):
     for seed in range(20):
         cell = simulate(CellOptions(mount=mount, views=3, seed=seed, pixel_sigma_px=0.1))
         try:
-            result = solve_hand_eye(closure_of(cell, measured_poses(cell)))
+            result = solved(problem_of(cell, measured_poses(cell)))
         except DegenerateError:
             continue
         # Nine equations of translation can be fitted away by nine unknowns; the noise stays.
-        assert result.noise.sigma_m > 1e-6
-        assert result.noise.sigma_rad > 1e-6
+        assert np.all(result.noise.robots > 1e-6)
 
 
 def one_axis(count, seed, wobble_rad):
@@ -235,7 +239,7 @@ def test_turns_about_one_axis_are_refused_with_that_axis(wobble_rad):
         x, z = some_edges(seed)
         data = made_up(one_axis(12, seed, wobble_rad), x, z, seed=seed)
         with pytest.raises(DegenerateError, match="camera's offset along the tool's"):
-            solve_hand_eye(data)
+            solved(data)
 
 
 def test_thousands_of_views_about_one_axis_are_refused_by_the_farthest_of_them():
@@ -245,7 +249,7 @@ def test_thousands_of_views_about_one_axis_are_refused_by_the_farthest_of_them()
     robot = compose(Rotation.from_rotvec(turns).as_matrix(), some_motion(2000)[:, :3, 3])
     # All other views, and any even choice of them, differ by 0.1 deg only: in position alone.
     with pytest.raises(DegenerateError, match="all 2000 used views turn about the tool's z"):
-        solve_hand_eye(made_up(robot, x, z))
+        solved(made_up(robot, x, z))
 
 
 def test_the_axis_has_its_name():
@@ -253,7 +257,7 @@ def test_the_axis_has_its_name():
     turns = np.outer(np.linspace(-1, 1, 8), [0.0, 0.0, 1.0])
     robot = compose(Rotation.from_rotvec(turns).as_matrix(), some_motion(8)[:, :3, 3])
     with pytest.raises(DegenerateError, match=r"along the base's z .* turn about the base's z"):
-        solve_hand_eye(made_up(robot, x, z, mount="eye-to-hand"))
+        solved(made_up(robot, x, z, mount="eye-to-hand"))
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -263,21 +267,21 @@ def test_translation_alone_is_refused(mount):
         robot = compose(np.tile(np.eye(3), (10, 1, 1)), some_motion(10, seed)[:, :3, 3])
         data = made_up(robot, x, z, seed=seed, mount=mount)
         with pytest.raises(DegenerateError, match="differ in position only"):
-            solve_hand_eye(data)
+            solved(data)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_fewer_than_three_views_are_refused(count):
     x, z = some_edges()
     with pytest.raises(DegenerateError, match=f"{count} usable stops of the robot, at least 3"):
-        solve_hand_eye(made_up(some_motion(count), x, z))
+        solved(made_up(some_motion(count), x, z))
 
 
 def test_one_pose_again_and_again_is_refused():
     x, z = some_edges()
     data = made_up(np.repeat(some_motion(1), 12, axis=0), x, z)
     with pytest.raises(DegenerateError, match="all from one pose of the robot"):
-        solve_hand_eye(data)
+        solved(data)
 
 
 def test_healthy_motion_is_never_refused_small_tilts_included():
@@ -285,18 +289,20 @@ def test_healthy_motion_is_never_refused_small_tilts_included():
         rng = np.random.default_rng(seed)
         x, z = some_edges(seed)
         tilt = np.deg2rad(rng.uniform(5, 40))
-        data = made_up(some_motion(int(rng.integers(8, 30)), seed, tilt), x, z, Noise(3e-4, 2e-4))
-        result = solve_hand_eye(data)
+        data = made_up(
+            some_motion(int(rng.integers(8, 30)), seed, tilt), x, z, Noise.of_robot(3e-4, 2e-4)
+        )
+        result = solved(data)
         sigma = np.sqrt(np.diag(result.covariance))
         # 5.5 sigma of six components over 150 sets: once in thousands of runs of this test.
-        assert np.all(np.abs(log(invert(x) @ result.edges.x)) < 5.5 * sigma[:6])
+        assert np.all(np.abs(log(invert(x) @ result.state.edges[0])) < 5.5 * sigma[:6])
 
 
 def test_weak_motion_is_answered_and_its_direction_told():
     x, z = some_edges(3)
     # Turns mostly about one axis: the offset along it hangs on tilts of two degrees.
-    data = made_up(one_axis(15, 3, np.deg2rad(2.0)), x, z, Noise(3e-4, 2e-4))
-    result = solve_hand_eye(data)
+    data = made_up(one_axis(15, 3, np.deg2rad(2.0)), x, z, Noise.of_robot(3e-4, 2e-4))
+    result = solved(data)
     worst = result.worst[0]
     assert worst.words.startswith("the camera's offset along the tool's")
     assert 1e-3 < worst.sigma < worst.limit
@@ -304,30 +310,29 @@ def test_weak_motion_is_answered_and_its_direction_told():
 
 def test_views_of_a_moved_target_frame_give_the_same_camera():
     cell = simulate(CellOptions(seed=5))
-    data = closure_of(cell, measured_poses(cell))
+    poses = measured_poses(cell)
     turned = compose(Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.zeros(3))
-    moved = Closure(data.mount, data.robot, data.camera @ turned)
     # Turning the target's frame about its origin leaves lengths and angles of residuals alone.
-    first, second = (solve_hand_eye(it) for it in (data, moved))
-    np.testing.assert_allclose(second.edges.x, first.edges.x, atol=1e-7)
-    np.testing.assert_allclose(second.edges.z, first.edges.z @ turned, atol=1e-7)
+    first, second = (solved(problem_of(cell, it)).state.edges for it in (poses, poses @ turned))
+    np.testing.assert_allclose(second[0], first[0], atol=1e-7)
+    np.testing.assert_allclose(second[1], first[1] @ turned, atol=1e-7)
 
 
 def test_covariance_moves_with_its_frame():
     """The information of z is that of x carried over by the adjoint of the mean chain."""
     cell = simulate(exact(CellOptions(seed=6, views=4)))
-    data = closure_of(cell)
-    x, z = cell.transforms.values()
-    jacobian = data.problem.linear(Edges(x, z, HELD).state).jacobian
-    np.testing.assert_allclose(jacobian[:, :, :6], adjoint(invert(data.camera)), atol=1e-9)
+    jacobian = problem_of(cell).linear(state_of(*cell.transforms.values())).jacobian
+    of_camera = adjoint(invert(cell.cam_from_target))
+    np.testing.assert_allclose(jacobian[:, :, :6], of_camera, atol=1e-9)
     np.testing.assert_allclose(jacobian[:, :, 6:], np.tile(-np.eye(6), (4, 1, 1)), atol=1e-9)
 
 
 def test_noise_of_exact_data_is_nil_and_nothing_divides_by_it():
     cell = simulate(exact(CellOptions(seed=7)))
-    noise = estimate_noise(closure_of(cell), Edges(*cell.transforms.values(), HELD))
-    assert noise.sigma_m < 1e-9
-    result = solve_hand_eye(closure_of(cell))
+    problem, state = problem_of(cell), state_of(*cell.transforms.values())
+    noise = estimate_noise(problem, state, starting_noise(problem), from_above=True)
+    assert noise.robots[0, 1] < 1e-9
+    result = solved(problem)
     assert np.all(np.isfinite(result.covariance))
 
 

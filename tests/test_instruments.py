@@ -85,10 +85,10 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options)
     assert known.kinematics.level == "geometry"
     assert known.verdict.status == "good"
     q = postures(known.robot)
-    edges, size = known.solved.edges, len(known.arm_model.values)
+    (x, z), size = known.solved.state.edges, len(known.arm_model.values)
 
     def place(robot):
-        return (invert(edges.x) @ robot.base_from_flange(q) @ edges.z)[:, :3, 3]
+        return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
 
     true = invert(shop.base_from_instrument) @ forward(shop.true_arm, q) @ shop.flange_from_probe
     away = 1e3 * np.linalg.norm(place(known.arm_model.robot) - true[:, :3, 3], axis=1)

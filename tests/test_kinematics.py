@@ -45,10 +45,10 @@ def error_m(cell, known, robot):
     middle seen from the camera. `robot` may be an `ArmModel`, which bends under its own weight.
     """
     q = postures(getattr(robot, "nominal", robot))
-    mount, edges = cell.options.mount, known.solved.edges
+    mount, edges = cell.options.mount, known.solved.state.edges
     true = target_in_camera(mount, *cell.transforms.values(), cell.flange_at(q))
     true = true @ told_frame(cell.sheet)
-    ours = target_in_camera(mount, edges.x, edges.z, robot.base_from_flange(q))
+    ours = target_in_camera(mount, *edges, robot.base_from_flange(q))
     if mount == "eye-in-hand":
         away = (invert(true) - invert(ours))[:, :3, 3]
     else:
@@ -167,11 +167,11 @@ def test_without_joints_no_level_can_be_asked_for():
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_predictions_move_as_their_derivatives_say(mount):
     known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
-    model, edges, q = known.arm_model, known.solved.edges, known.joints(known.used)[:3]
+    model, edges, q = known.arm_model, known.solved.state.edges, known.joints(known.used)[:3]
     size, step = 12 + len(model.values), 1e-6
-    middle = target_in_camera(mount, edges.x, edges.z, model.robot.base_from_flange(q))
-    problem = known.closure(known.used).problem.with_effects([])
-    pair = ArmPair.of(problem, State(np.stack([edges.x, edges.z]), np.zeros(0)), ROBOT)
+    middle = target_in_camera(mount, *edges, model.robot.base_from_flange(q))
+    problem = known.solved.problem.with_effects([])
+    pair = ArmPair.of(problem, State(edges, np.zeros(0)), ROBOT)
     slopes = pair.slopes(model.base_from_flange(q), model.basis(q))[1]
     for at in range(size):
         change = np.zeros(size)
@@ -181,8 +181,7 @@ def test_predictions_move_as_their_derivatives_say(mount):
                 invert(middle)
                 @ target_in_camera(
                     mount,
-                    edges.x @ exp(it[:6]),
-                    edges.z @ exp(it[6:12]),
+                    *(edges @ exp(it[:12].reshape(2, 6))),
                     model.moved(it[12:]).robot.base_from_flange(q),
                 )
             )

@@ -106,7 +106,7 @@ def test_a_measurement_that_good_data_contradict_is_told_and_hardly_moves_the_an
     assert "is contradicted by the views" in told
     assert f"{1e3 * true + 5.0:g} mm" in told
     sigma = np.sqrt(free.solved.covariance[5, 5])
-    moved = np.linalg.norm(wrong.solved.edges.x[:3, 3] - free.solved.edges.x[:3, 3])
+    moved = np.linalg.norm(wrong.solved.state.edges[0][:3, 3] - free.solved.state.edges[0][:3, 3])
     # By what the prior weighs against the data, and twice that for noise that is estimated anew.
     assert moved < 2.0 * 0.005 * (sigma / SIGMA_M) ** 2 + 1e-5
     right = run(cell, {"flange_from_cam": {"z_m": true + 2e-4, "sigma_m": SIGMA_M}})

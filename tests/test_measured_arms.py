@@ -17,8 +17,8 @@ def test_an_irb_120_by_a_measuring_arm(real_data):
         ("TestJointAngles2", "TestPosition2", 0.26),
     ):
         q, places = thirdparty.irb120_set(real_data, joints, read)
-        flange, edges = known.arm_model.base_from_flange(q), known.solved.edges
-        in_base = places @ edges.x[:3, :3].T + edges.x[:3, 3]
+        flange, (x, _) = known.arm_model.base_from_flange(q), known.solved.state.edges
+        in_base = places @ x[:3, :3].T + x[:3, 3]
         on_flange = np.einsum("mji,mj->mi", flange[:, :3, :3], in_base - flange[:, :3, 3])
         # The sets have another tool: its point is what the first five configurations say.
         away = 1e3 * np.linalg.norm(on_flange - on_flange[:5].mean(axis=0), axis=1)

@@ -7,10 +7,10 @@ import pytest
 from cells import calibrated, error_of
 
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
-from visioncal.estimation.closure import ROBOT, closure_information
 from visioncal.estimation.intervals import noise_intervals
-from visioncal.estimation.linalg import covariance
 from visioncal.estimation.misfit import drift, neighbours
+from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.solve import covariance_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.transforms import exp
 
@@ -26,12 +26,11 @@ def with_moving_base(cell, twist):
 
 def answered(cell):
     known = calibrated(cell, joints=False)
-    data = known.closure(known.used).merged(known.stops)
-    return data, known.solved, known
+    return known.solved, known
 
 
-def told(data, result):
-    return data.problem, result.edges.state, result.noise.levels
+def told(result):
+    return result.problem, result.state, result.noise
 
 
 def sources(**shared):
@@ -39,19 +38,19 @@ def sources(**shared):
     return Sources({"cam": "pixels"}, {ROBOT: "robot"}, columns)
 
 
-def of_fit(test, data, result):
-    return test(*told(data, result), ROBOT)
+def of_fit(test, result):
+    return test(*told(result), ROBOT)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_creeping_base_is_noticed_and_its_way_told(mount):
     for seed in range(4):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
-        data, result, _ = answered(cell)
-        assert of_fit(drift, data, result) is None
+        result, _ = answered(cell)
+        assert of_fit(drift, result) is None
         moved = with_moving_base(cell, np.array([0, 0, 0, 0.0, 3e-4, 0]))
-        data, result, known = answered(moved)
-        found = of_fit(drift, data, result)
+        result, known = answered(moved)
+        found = of_fit(drift, result)
         # A turn of the base by its sigma of some 0.1 mrad moves the place of work by 0.1 mm.
         assert found.moved_m == pytest.approx(3e-4, abs=2.5e-4)
         assert any("drift with time" in it for it in known.warnings)
@@ -61,10 +60,10 @@ def test_a_creeping_base_is_noticed_and_its_way_told(mount):
 def test_a_turning_base_moves_the_target_by_its_distance(mount):
     cell = simulate(replace(FINE, mount=mount, seed=0))
     turn = np.array([2e-3, 0, 0, 0, 0, 0.0])
-    data, result, _ = answered(with_moving_base(cell, turn))
+    result, _ = answered(with_moving_base(cell, turn))
     z = cell.transforms["base_from_target" if mount == "eye-in-hand" else "flange_from_target"]
     target = z if mount == "eye-in-hand" else (cell.base_from_flange @ z).mean(axis=0)
-    found = of_fit(drift, data, result)
+    found = of_fit(drift, result)
     moved = np.linalg.norm(np.cross(turn[:3], target[:3, 3]))
     # Where the target is, noise leaves some 0.03 mm; the flange moves by 0.2 mm more or less.
     assert found.moved_m == pytest.approx(moved, abs=8e-5)
@@ -86,8 +85,8 @@ def test_a_closed_form_is_not_taken_for_a_misfit(changes):
 def test_independent_noise_gives_neighbours_no_more_than_their_share(mount):
     factors = []
     for seed in range(12):
-        data, result, _ = answered(simulate(replace(FINE, mount=mount, seed=seed)))
-        found = of_fit(neighbours, data, result)
+        result, _ = answered(simulate(replace(FINE, mount=mount, seed=seed)))
+        found = of_fit(neighbours, result)
         assert not found.is_significant
         factors.append(found.factor)
     # One on average; a single one scatters by 0.16.
@@ -99,8 +98,8 @@ def test_stops_that_err_in_groups_are_noticed():
     cell = simulate(replace(FINE, views=30, seed=1))
     group = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 3, axis=0)
     together = replace(cell, base_from_flange=cell.base_from_flange @ exp(group))
-    data, result, known = answered(together)
-    found = of_fit(neighbours, data, result)
+    result, known = answered(together)
+    found = of_fit(neighbours, result)
     assert found.is_significant
     # The diagnosis comes to rest anew, which the fit does to 1e-4.
     assert known.diagnosis.inflation == pytest.approx(found.factor, rel=1e-3)
@@ -112,10 +111,10 @@ def test_intervals_of_the_noise_hold_the_truth():
     inside, count = np.zeros(2), 20
     truth = np.array([5e-5, 3e-5])
     for seed in range(count):
-        data, result, _ = answered(simulate(replace(FINE, seed=seed, views=12)))
-        low, high = noise_intervals(*told(data, result))[0].T
-        assert np.all(low <= result.noise.sigmas)
-        assert np.all(result.noise.sigmas <= high)
+        result, _ = answered(simulate(replace(FINE, seed=seed, views=12)))
+        low, high = noise_intervals(*told(result))[0].T
+        assert np.all(low <= result.noise.robots[0])
+        assert np.all(result.noise.robots[0] <= high)
         inside += (low <= truth) & (truth <= high)
     # 95 % of 20 are 19; under 16 comes in one run of four hundred.
     assert np.all(inside >= 16)
@@ -123,25 +122,25 @@ def test_intervals_of_the_noise_hold_the_truth():
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
 def test_the_budget_adds_up(given):
-    data, result, known = answered(simulate(replace(FINE, state_intrinsics=given, seed=2)))
-    rows = np.arange(len(result.edges.shared))
-    parts = covariance_by_source(*told(data, result), sources(shared=rows))
-    whole = covariance(closure_information(data, result.edges, result.noise))[:12, :12]
+    result, known = answered(simulate(replace(FINE, state_intrinsics=given, seed=2)))
+    rows = np.arange(len(result.state.values))
+    parts = covariance_by_source(*told(result), sources(shared=rows))
+    whole = covariance_of(result.problem, result.fit)[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
     budget, spread = known.diagnosis.budget_mm, result.covariance[:6, :6]
-    at_work = point_covariance(result.edges.x, spread, known.diagnosis.point_cam)
+    at_work = point_covariance(result.state.edges[0], spread, known.diagnosis.point_cam)
     assert budget["total"] == pytest.approx(1e3 * np.sqrt(np.trace(at_work)), rel=1e-4)
     assert ("intrinsics" in budget) == (not given)
 
 
 def test_sources_that_are_known_together_add_up_as_well():
     bent = replace(FINE, state_intrinsics=False, board_bow_m=5e-4, seed=2)
-    data, result, known = answered(simulate(bent))
+    result, known = answered(simulate(bent))
     is_lens = known.free.columns < known.free.lens_count
     owners = {"intrinsics": np.flatnonzero(is_lens), "board": np.flatnonzero(~is_lens)}
-    parts = covariance_by_source(*told(data, result), sources(**owners))
-    whole = covariance(closure_information(data, result.edges, result.noise))[:12, :12]
+    parts = covariance_by_source(*told(result), sources(**owners))
+    whole = covariance_of(result.problem, result.fit)[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
 
@@ -169,7 +168,7 @@ def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
     surprises = []
     for seed in range(12):
         cell = simulate(replace(FINE, seed=seed, robot_sigma_m=3e-4, robot_sigma_rad=5e-4))
-        _, result, known = answered(cell)
+        result, known = answered(cell)
         error = error_of(cell, known)
         surprises.append(error @ np.linalg.solve(result.covariance[:12, :12], error) / 12)
     # Mean of 12 chi-square of 12: 0.12; the board's scale, held at the truth, takes one of them.

@@ -91,7 +91,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     assert any("--joint-unit deg" in it for it in known.verdict.reasons)
     alone = finished(replace(told, robot=None))
     # What is done with the poses is what would be done if there were no joints.
-    assert np.array_equal(known.solved.edges.x, alone.solved.edges.x)
+    assert np.array_equal(known.solved.state.edges[0], alone.solved.state.edges[0])
 
 
 def test_an_arm_asked_for_is_refused_where_its_joints_are_misread():

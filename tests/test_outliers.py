@@ -9,7 +9,7 @@ from cells import calibrated, error_of
 from visioncal.errors import DegenerateError
 from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances, inliers
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.problem import ROBOT, State
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 from visioncal.stages.agree import agree, whole_units
@@ -135,8 +135,9 @@ def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
 def test_a_square_is_the_distance_from_what_the_others_predict():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
     problem = known.problem(known.used).with_effects([])
+    state = State(known.solved.state.edges, np.zeros(0))
     everything = np.ones(12, dtype=bool)
-    fit = fit_problem(problem, replace(known.solved.edges, shared=np.zeros(0)).state)
+    fit = fit_problem(problem, state)
     inside = distances(problem, everything, fit)
     for view in (0, 7):
         others = everything.copy()

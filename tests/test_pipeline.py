@@ -52,7 +52,7 @@ def test_intrinsics_are_refined_where_they_are_asked_to_be():
         cell = simulate(replace(FINE, seed=seed))
         known = calibrated(cell, session=with_camera(cell, off, intrinsics="refine"))
         assert known.free.lens_is_free
-        refined = known.free.after(known.solved.edges.shared).camera
+        refined = known.free.after(known.solved.state.values).camera
         sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
         # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
         assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.5 * sigma)
@@ -140,7 +140,7 @@ def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
     told = CellOptions(robot="ur3e", mount=mount, views=24, camera=camera, pixel_sigma_px=0.03)
     cell = simulate(replace(told, robot_sigma_m=1e-4))
     known = calibrated(cell, session=with_camera(cell, matrix))
-    refined = known.free.after(known.solved.edges.shared).camera
+    refined = known.free.after(known.solved.state.values).camera
     sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
     # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
     assert np.all(np.abs(refined.matrix - matrix) < 4.5 * sigma)

@@ -38,7 +38,7 @@ def swept(seed: int, how: SweepOptions = HURRIED, **options) -> Sweep:
 
 def x_error(moved: Sweep, known: Known) -> np.ndarray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
-    return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.edges.x)
+    return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.state.edges[0])
 
 
 def distance(error: np.ndarray, covariance: np.ndarray) -> float:

@@ -26,13 +26,8 @@ def known_of(session: Session, **changes) -> Known:
 
 def errors_of(shop: Shop, known: Known) -> FloatArray:
     """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
-    edges = known.solved.edges
-    return np.concatenate(
-        [
-            log(invert(shop.base_from_instrument) @ edges.x),
-            log(invert(shop.flange_from_probe) @ edges.z),
-        ]
-    )
+    true = np.array([shop.base_from_instrument, shop.flange_from_probe])
+    return log(invert(true) @ known.solved.state.edges).ravel()
 
 
 def solved_of(session: Session, **changes) -> Known:

@@ -249,7 +249,7 @@ def irb120() -> str:
     ):
         q, places_m = thirdparty.irb120_set(DATA, joints, read)
         rest, everything = tool_errors_mm(
-            known.arm_model.robot.base_from_flange(q), known.solved.edges.x, places_m
+            known.arm_model.robot.base_from_flange(q), known.solved.state.edges[0], places_m
         )
         before = tool_errors_mm(known.robot.base_from_flange(q), nominal, places_m)[1]
         lines.append(

@@ -227,7 +227,7 @@ def sigmas(spread: FloatArray) -> tuple[float, float]:
 
 def at_noise(begun: Begun, added: FloatArray, known: Known) -> tuple[float, float]:
     """The prediction at the noise that the whole session shows."""
-    noise = known.solved.noise.levels
+    noise = known.solved.noise
     scale = (known.pixel_px / begun.cell.pixel_px) ** 2
     problem = begun.recorded.problem
     seen = replace(problem.observations, covariance=scale * problem.observations.covariance)

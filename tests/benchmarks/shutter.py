@@ -90,7 +90,7 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
 
 def x_error(moved: Sweep, known: Known) -> FloatArray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
-    return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.edges.x)
+    return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.state.edges[0])
 
 
 def row(world: World, found: list[Outcome]) -> str:

@@ -11,8 +11,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from visioncal.estimation.problem import ROBOT, Effect, FramePrior, Observations, Problem
+from visioncal.estimation.problem import (
+    ROBOT,
+    Effect,
+    FramePrior,
+    Observations,
+    Problem,
+    State,
+)
 from visioncal.estimation.tree import Branch, Tree
+from visioncal.transforms import distances, invert, mean_transform
 from visioncal.types import FloatArray, IntArray, Mount
 
 BASE, FLANGE = "base", "flange"
@@ -25,6 +33,35 @@ def edge_names(mount: Mount) -> tuple[str, str]:
     if mount == "eye-in-hand":
         return "flange_from_cam", "base_from_target"
     return "base_from_cam", "flange_from_target"
+
+
+def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
+    """The robot's part (m, 4, 4) of the chain `robot * x * camera = z`."""
+    return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
+
+
+def scatter(problem: Problem, others: Problem, state: State) -> tuple[FloatArray, FloatArray]:
+    """How far observations place their targets from where others do on average.
+
+    Args:
+        problem: The n observations.
+        others: Those that they are compared with, of the same targets.
+        state: The unknowns of both.
+
+    Returns:
+        (n,) distances [m], and (n,) [rad].
+    """
+    placed, among = _placed(others, state), np.array(others.observations.observed)
+    mean = {it: mean_transform(placed[among == it]) for it in dict.fromkeys(among.tolist())}
+    return distances(
+        _placed(problem, state), np.array([mean[it] for it in problem.observations.observed])
+    )
+
+
+def _placed(problem: Problem, state: State) -> FloatArray:
+    """(n, 4, 4) where each observation places its target, in the frame that this hangs on."""
+    edges = state.edges[[problem.unknown[it] for it in problem.observations.observed]]
+    return np.asarray(edges @ invert(problem.predicted(state)) @ problem.measured(state))
 
 
 def chain(

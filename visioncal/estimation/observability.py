@@ -1,18 +1,15 @@
 """What the motion can tell about the two unknown edges, and what it leaves open, in words."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.boards import Boards, place
-from visioncal.estimation.chain import edge_names
-from visioncal.estimation.closure import Closure, Edges, Noise, closure_information
-from visioncal.estimation.linalg import covariance, covariance_among, spectrum
-from visioncal.estimation.problem import Noise as Levels
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.chain import edge_names, robot_part
+from visioncal.estimation.linalg import covariance_among, spectrum
+from visioncal.estimation.problem import ROBOT, Noise, Problem, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.figures import figure
 from visioncal.transforms import invert, rotation_angle
@@ -71,7 +68,7 @@ def title(mount: Mount) -> str:
 
 
 def check_observability(
-    data: Closure, edges: Edges, noise: Noise, boards: Boards, looks: int = 0
+    problem: Problem, state: State, noise: Noise, mount: Mount, *, looks: bool = False
 ) -> None:
     """Refuses motion that leaves a direction open.
 
@@ -80,42 +77,24 @@ def check_observability(
     noise of at most the limits themselves; what is beyond is the verdict's business.
 
     Args:
-        data: The used views.
-        edges: The answer.
+        problem: What the used views measured.
+        state: The answer.
         noise: Of the residuals.
-        boards: The boards, where there are several.
-        looks: How many of the unknowns that the views share are of lens and board, where these have
-            to be told, too; they come first.
+        mount: Where the camera is.
+        looks: Whether the first effect has to be determined, too: lens and board, or points.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    refuse_too_few(data)
-    held, still = replace(data, effects=()), replace(edges, shared=np.zeros(0))
-    if data.effects and boards.unknowns:
-        held = data.only(boards.places)
-        still = replace(edges, shared=edges.shared[boards.places])
-    check_determined(held.problem, still.state, noise.levels, _scene(data))
-    plausible = Noise(min(noise.sigma_rad, SIGMA_LIMIT_RAD), min(noise.sigma_m, SIGMA_LIMIT_M))
-    worst = worst_directions(held, still, plausible, replace(boards, begin=0))
-    for board, name in enumerate(boards.names[1:], start=1):
-        _refuse(
-            data.mount,
-            worst[2 + 2 * board : 4 + 2 * board],
-            "the views that show it are too few or too poor",
-            f"Add views of target {name}, or take it out of the session.",
-        )
-    if looks:
-        first = looks + boards.unknowns
-        _refuse(
-            data.mount,
-            worst_directions(
-                data.with_first(first),
-                replace(edges, shared=edges.shared[:first]),
-                plausible,
-                boards,
-            ),
-            *_UNTOLD["instrument" if data.mount == "instrument" else "camera"],
+    scene = _scene(problem, mount)
+    check_determined(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
+    if looks and problem.effects:
+        cause, advice = _UNTOLD["instrument" if mount == "instrument" else "camera"]
+        _refuse_vague(
+            problem.with_effects(problem.effects[:1]),
+            State(state.edges, state.values[: len(problem.effects[0])]),
+            noise,
+            replace(scene, motion=lambda _: cause, advice=lambda *_: advice),
         )
 
 
@@ -137,7 +116,7 @@ class Scene:
     advice: Callable[[str, str], str]
 
 
-def check_determined(problem: Problem, state: State, noise: Levels, scene: Scene) -> None:
+def check_determined(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
     """Refuses motion that leaves a direction of an unknown frame open.
 
     Args:
@@ -162,9 +141,14 @@ def check_determined(problem: Problem, state: State, noise: Levels, scene: Scene
             culprits=[culprit],
             next_step=scene.advice(frame, culprit),
         )
+    _refuse_vague(problem, state, noise, scene)
+
+
+def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
+    """Refuses frames whose predicted sigmas are over the limit."""
     most = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
     plausible = replace(noise, robots=np.minimum(noise.robots, most))
-    spread = covariance_among(fisher_information(problem, state, plausible), counted)
+    spread = covariance_among(fisher_information(problem, state, plausible), problem.counted)
     beyond = [
         (frame, it)
         for frame in problem.unknown
@@ -199,62 +183,42 @@ def frame_directions(
     return found[:1] if frame in problem.points else found
 
 
-def _scene(data: Closure) -> Scene:
+def _scene(problem: Problem, mount: Mount) -> Scene:
     """How messages speak of one camera and one robot."""
-    things = (_names(edge, data.mount, Boards.one(0)) for edge in (0, 1))
+    stops = np.unique(problem.observations.stops)
+    flange = problem.poses[ROBOT][stops]
+    views, names = f"{len(stops)} used views", _names(problem, mount)
+    further = tuple(names)[2:]
 
-    def advice(_frame: str, open_part: str) -> str:
-        return f"{_or_measured(data.mount, open_part)}{_advice(data.mount)}"
+    def motion(frame: str) -> str:
+        if frame in further:
+            return "the views that show it are too few or too poor"
+        return motion_words(robot_part(flange, mount), flange, views, f"the {_frame(mount)}")
 
-    return Scene(
-        title(data.mount),
-        {
-            name: (f"the {thing}", f"the {frame}")
-            for name, (thing, frame) in zip(data.problem.unknown, things, strict=True)
-        },
-        lambda _: _motion(data),
-        advice,
-    )
+    def advice(frame: str, open_part: str) -> str:
+        if frame in further:
+            return f"Add views of {names[frame][0][4:]}, or take it out of the session."
+        return f"{_or_measured(mount, open_part)}{_advice(mount)}"
 
-
-def _refuse(mount: Mount, worst: Sequence[Direction], cause: str, next_step: str) -> None:
-    beyond = [it for it in worst if it.sigma > it.limit]
-    if beyond:
-        raise DegenerateError(
-            f"{title(mount)}: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
-            f"{cause}.",
-            culprits=[it.words for it in beyond],
-            next_step=next_step,
-        )
-
-
-def worst_directions(
-    data: Closure, edges: Edges, noise: Noise, boards: Boards
-) -> tuple[Direction, ...]:
-    """The worst directions of a fit; see `directions`."""
-    spread = covariance(closure_information(data, edges, noise))
-    return directions(spread, edges, data.mount, boards)
+    return Scene(title(mount), names, motion, advice)
 
 
 def directions(
-    spread: FloatArray, edges: Edges, mount: Mount, boards: Boards
+    problem: Problem, state: State, spread: FloatArray, mount: Mount
 ) -> tuple[Direction, ...]:
-    """The worst direction of each edge, first x's and then each board's, offset before rotation.
+    """The worst directions of the camera's edge and then of each target's, offset before rotation.
 
     Args:
-        spread: (12 + k, 12 + k) covariance of x, z and others.
-        edges: The answer.
+        problem: What the views measured.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
         mount: Where the camera is.
-        boards: The boards, where there are several.
     """
-    found: list[Direction] = []
-    placed = place(boards, edges)
-    spread = placed.covariance(spread)
-    for edge, transform in enumerate((edges.x, *placed.z)):
-        block = spread[6 * edge : 6 * edge + 6, 6 * edge : 6 * edge + 6]
-        thing, frame = _names(edge, mount, boards)
-        found += edge_directions(transform, block, f"the {thing}", f"the {frame}")
-    return tuple(found)
+    return tuple(
+        it
+        for frame, names in _names(problem, mount).items()
+        for it in frame_directions(problem, state, spread, frame, names)
+    )
 
 
 def edge_directions(
@@ -279,31 +243,34 @@ def edge_directions(
     return found[0], found[1]
 
 
-def refuse_too_few(data: Closure, views: int = 1) -> None:
+def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
     """Refuses stops that cannot tell anything, however they lie.
 
     Args:
-        data: The used views, one a stop.
-        views: How many they were before those of one stop became one.
+        problem: What the used views measured.
+        mount: Where the camera is.
+        views: How many these are.
 
     Raises:
-        DegenerateError: There are fewer than three.
+        DegenerateError: There are fewer than three stops.
     """
-    if len(data) >= FEWEST_VIEWS:
+    stops = np.unique(problem.observations.stops)
+    if len(stops) >= FEWEST_VIEWS:
         return
-    culprit = f"the {_sensor(data.mount)}'s offset from the {_frame(data.mount)}"
+    culprit = f"the {_sensor(mount)}'s offset from the {_frame(mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
-    if len(data) == 2:
-        culprit += f" along the {_frame(data.mount)}'s {axis_words(_main_axis(_turns(data.robot)))}"
+    if len(stops) == 2:
+        axis = _main_axis(_turns(robot_part(problem.poses[ROBOT][stops], mount)))
+        culprit += f" along the {_frame(mount)}'s {axis_words(axis)}"
         cause = f"two views share that axis of rotation, and {cause}"
-    stops = f"{len(data)} usable stops of the robot"
-    if len(data) == 1 < views:
-        stops = f"all {views} used views are from one pose of the robot"
+    found = f"{len(stops)} usable stops of the robot"
+    if len(stops) == 1 < views:
+        found = f"all {views} used views are from one pose of the robot"
     raise DegenerateError(
-        f"{title(data.mount)}: {stops}, at least {FEWEST_VIEWS} are needed; {culprit} is not "
+        f"{title(mount)}: {found}, at least {FEWEST_VIEWS} are needed; {culprit} is not "
         f"determined: {cause}.",
         culprits=[culprit],
-        next_step=_advice(data.mount),
+        next_step=_advice(mount),
     )
 
 
@@ -342,15 +309,14 @@ def _words(thing: str, frame: str, direction: FloatArray, is_rotation: bool) -> 
     return f"{thing}'s {quantity} {frame}'s {axis_words(direction)}"
 
 
-def _names(edge: int, mount: Mount, boards: Boards) -> tuple[str, str]:
-    """What an edge places, and the frame that it hangs on."""
-    if edge == 0:
-        return _sensor(mount), _frame(mount)
-    name = f"target {boards.names[edge - 1]}".strip()
-    return (
-        "probe" if mount == "instrument" else name,
-        "base" if mount == "eye-in-hand" else "tool",
-    )
+def _names(problem: Problem, mount: Mount) -> dict[str, tuple[str, str]]:
+    """What each edge places, the camera's first, and the frame that it hangs on."""
+    camera, *targets = problem.unknown
+    hangs = "the base" if mount == "eye-in-hand" else "the tool"
+    return {
+        camera: (f"the {_sensor(mount)}", f"the {_frame(mount)}"),
+        **{it: (f"the {it.replace('_', ' ', 1)}", hangs) for it in targets},
+    }
 
 
 def _sensor(mount: Mount) -> str:
@@ -385,13 +351,6 @@ def _turns(robot: FloatArray) -> FloatArray:
 
 def _main_axis(turns: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(turns, full_matrices=False)[2][0])
-
-
-def _motion(data: Closure) -> str:
-    """Says what is wrong with the motion of one robot."""
-    # The flange's own positions: the robot's part is inverted where the camera stands still.
-    flange = data.robot if data.mount == "eye-in-hand" else invert(data.robot)
-    return motion_words(data.robot, flange, f"{len(data)} used views", f"the {_frame(data.mount)}")
 
 
 def _lone_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:

@@ -28,27 +28,24 @@ def arm_data(known: Known) -> ArmData | None:
     found, model = known.kinematics, known.arm_model
     if found is None or model is None:
         return None
-    targets, boards = tuple(known.session.boards.values()), known.shown(known.used)
-    first = np.unique(known.stops, return_index=True)[1]
-    data = known.closure(known.used).merged(known.stops)
-    further = np.arange(boards.begin, boards.begin + boards.unknowns)
+    targets, result = tuple(known.session.boards.values()), known.solved
+    first, problem = known.first_of_stops(known.used), result.problem
     # Readings of one point show its place and no rotation; several points make a frame.
-    shows_pose = bool((data.told > 3).any())
-    size, result = data.problem.size, known.solved
+    shows_pose = bool((problem.observations.directions > 3).any())
     return ArmData(
-        data.problem,
-        result.edges.state,
-        result.noise.levels,
+        problem,
+        result.state,
+        result.noise,
         result.covariance,
         ROBOT,
         model,
-        np.arange(size - len(model.values), size),
+        np.arange(problem.size - len(model.values), problem.size),
         next(iter(found.errors.values())).sigma,
-        np.arange(len(data)),
-        known.joints(known.used)[first],
-        known.loads(known.used).chosen(first),
+        np.arange(len(first)),
+        known.joints(first),
+        known.loads(first),
         corner_positions(targets[known.boards[0]]).mean(axis=0) if targets else np.zeros(3),
-        np.concatenate([np.arange(12), 12 + further]),
+        np.arange(6 * len(problem.unknown)),
         measured=np.repeat([shows_pose, True], 3),
     )
 
@@ -68,15 +65,9 @@ def kinematics_document(known: Known) -> dict[str, Any] | None:
     if telling is None:
         return document
     return document | {
-        **telling.document(model.nominal, first_views(known), known.lost_zero),
+        **telling.document(model.nominal, known.first_of_stops(known.used), known.lost_zero),
         **unseen_views(known, found),
     }
-
-
-def first_views(known: Known) -> list[int]:
-    """The first view of each stop."""
-    first = np.unique(known.stops, return_index=True)[1]
-    return [known.used[at] for at in first.tolist()]
 
 
 def _backlash(known: Known) -> dict[str, list[dict[str, Any]]]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel, blocks_of
-from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.problem import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.layout import without_lost_boards
 from visioncal.stages.agree import agree
@@ -59,17 +59,10 @@ def arm_told(known: Known) -> Known:
     model = ArmModel.of(robot, q, stated.flange_poses(known.used)).loaded(q, loads)
     loads = loads.chosen(first)
     bases = {name: model.columns(name, q[first], loads) for name in blocks_of(robot, loads)}
-    data = stated.closure(known.used).merged(known.stops)
-    # What is open about the drift comes last, and is held at any level.
-    data = data.with_first(len(data.unchanged) - known.drift_size)
-    lost = stated.stated_closure(known.used)
-    told = (
-        None if lost is None else lost.merged(known.stops).with_first(len(data.unchanged)).problem
-    )
-    start = State(known.edges[:2], data.unchanged)
-    found = choose_level(data.problem, start, ROBOT, bases, known.level, told)
+    problem, lost = stated.problem(known.used).merged(), stated.stated_problem(known.used)
+    start, told = problem.start(known.frames), None if lost is None else lost.merged()
+    found = choose_level(problem, start, ROBOT, bases, known.level, told)
     known = replace(known, kinematics=found, notes=(*known.notes, *findings(found)))
-    known = replace(known, compared_frames=known.frames)
     known = known.noting((), doubts(found))
     if not found.errors:
         return known

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from visioncal.pipeline.arm import arm_data, first_views
+from visioncal.pipeline.arm import arm_data
 from visioncal.pipeline.known import Known
 from visioncal.stages import backlash, elastic
 from visioncal.stages.backlash import plays_of
@@ -44,4 +44,6 @@ def _springs(known: Known) -> Elastic | None:
 
 def elastic_document(known: Known) -> dict[str, Any] | None:
     """Writes the springs; None where the level is a rigid one."""
-    return None if known.elastic is None else known.elastic.document(first_views(known))
+    return (
+        None if known.elastic is None else known.elastic.document(known.first_of_stops(known.used))
+    )

@@ -1,16 +1,17 @@
 """What a later look at the same cell has to know of the joint fit, as calibration.json has it."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from visioncal.estimation.appearance import LENS_AND_BOARD
 from visioncal.estimation.arm import misfit_slopes
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.problem import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
-from visioncal.types import FloatArray, IntArray
+from visioncal.transforms import adjoint, invert
+from visioncal.types import FloatArray
 
 # Columns of views.csv that say under which conditions a view was taken.
 CONDITIONS = ("ambient_c", "payload_kg")
@@ -53,7 +54,7 @@ def _arm(known: Known) -> dict[str, Any] | None:
         return None
     count = errors.basis.shape[2]
     # Errors that only count are where they were stated; those of a model are in its arm already.
-    values = known.solved.edges.shared[-count:] if errors.is_estimated else np.zeros(count)
+    values = known.solved.state.values[-count:] if errors.is_estimated else np.zeros(count)
     if model is None:
         of = "links" if known.joints_rad is not None and known.robot is not None else "poses"
         return {"of": of, "values": values.tolist()}
@@ -83,26 +84,30 @@ def _by_stop(model: ArmModel) -> dict[str, Any]:
 
 def _covariance(known: Known) -> FloatArray:
     """The fit's own, and beside it what it has in common with errors that only count in it."""
-    result, errors, diagnosis = known.solved, known.arm, known.diagnosis
-    kept = _written(known)
+    result, errors, diagnosis = known.solved, known.arm_by_stop, known.diagnosis
+    written = _written(known)
+    own = written @ result.covariance @ written.T
     if errors is None or errors.is_estimated or diagnosis is None:
-        return result.covariance[np.ix_(kept, kept)]
-    data = known.closure(known.used).merged(known.stops)
-    first = np.unique(known.stops, return_index=True)[1]
-    by_stop = replace(errors, basis=known.arm_basis(known.used)[first])
-    edges, noise = result.edges.state, result.noise.levels
-    slopes = misfit_slopes(data.problem, edges, noise, ROBOT, by_stop)[kept]
+        return own
+    slopes = written @ misfit_slopes(result.problem, result.state, result.noise, ROBOT, errors)
     size, variance = slopes.shape[1], diagnosis.inflation * errors.sigma**2
     # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
     between = -variance * slopes
-    own = result.covariance[np.ix_(kept, kept)]
     return np.block([[own, between], [between.T, variance * np.eye(size)]])
 
 
-def _written(known: Known) -> IntArray:
-    """Which of the chain's unknowns are written: those of clocks and of drift are left out."""
-    size, boards = len(known.solved.covariance), known.shown(known.used)
-    before, behind = 12 + boards.begin + boards.unknowns, size
-    if known.arm is not None and known.arm.is_estimated:
-        behind -= known.arm.basis.shape[2]
-    return np.concatenate([np.arange(before), np.arange(behind, size)])
+def _written(known: Known) -> FloatArray:
+    """(w, p) how what is written moves with the fit's unknowns.
+
+    Further boards are written relative to the first; clocks and drift are left out.
+    """
+    problem, rows = known.solved.problem, np.eye(known.solved.problem.size)
+    placed = known.solved.state.edges[1:]
+    # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k
+    further = [
+        rows[6:12] - adjoint(invert(placed[0]) @ placed[at]) @ rows[6 * at + 6 : 6 * at + 12]
+        for at in range(1, len(placed))
+    ]
+    nothing, arm = slice(0, 0), f"arm of {ROBOT}"
+    looks, errors = (problem.effect_columns.get(it, nothing) for it in (LENS_AND_BOARD, arm))
+    return np.concatenate([rows[:12], rows[looks], *further, rows[errors]])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.conventions import PoseNumbers, Reading
 from visioncal.errors import VisioncalError
+from visioncal.estimation.chain import robot_part
 from visioncal.guess import Guess, guess_reading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -17,7 +18,6 @@ from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.stages.choose import choose_poses
 from visioncal.stages.clocks import waits_for_clock
-from visioncal.stages.handeye import robot_part
 from visioncal.stages.judge import is_scattered
 from visioncal.types import FloatArray, Progress
 

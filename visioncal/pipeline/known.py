@@ -12,8 +12,8 @@ from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.boards import Boards
-from visioncal.estimation.chain import chain, edge_names
-from visioncal.estimation.closure import Closure, Noise
+from visioncal.estimation.chain import chain, edge_names, robot_part
+from visioncal.estimation.closure import Closure
 from visioncal.estimation.problem import ROBOT, FramePrior, Problem
 from visioncal.estimation.scene import Scene
 from visioncal.guess.joints import JointReading
@@ -24,7 +24,7 @@ from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.elastic import Elastic
-from visioncal.stages.handeye import HandEyeResult, robot_part
+from visioncal.stages.handeye import HandEyeResult
 from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
@@ -51,7 +51,6 @@ class Known(Observed):
         base_from_flange: (4, 4) by view, as the robot reported it.
         boards: Which of the session's boards the chain holds: the one it ends at, and others.
         frames: (4, 4) where the camera and the boards are, by the frame; empty at first.
-        compared_frames: The same when levels of the arm's errors were compared.
         joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
         matched: The joints beside the reported poses; None without a robot.
         lost_zero: A joint whose zero is far from where the model has it.
@@ -82,7 +81,6 @@ class Known(Observed):
     joints_rad: Mapping[int, FloatArray] | None = None
     boards: tuple[int, ...] = (0,)
     frames: Mapping[str, FloatArray] = field(default_factory=dict)
-    compared_frames: Mapping[str, FloatArray] = field(default_factory=dict)
     matched: Matched | None = None
     lost_zero: JointReading | None = None
     readings: Readings | None = None
@@ -188,13 +186,14 @@ class Known(Observed):
             return self.robot
         return with_zeros(self.robot, self.lost_zero.zeros)
 
-    def stated_closure(self, views: Sequence[int]) -> Closure | None:
-        """What `closure` gives with a lost zero where the model has it; None where none is lost."""
+    def stated_problem(self, views: Sequence[int]) -> Problem | None:
+        """What `problem` gives with a lost zero where the model has it; None where none is lost."""
         robot, zeroed = self.robot, self.zeroed_robot
         if self.lost_zero is None or robot is None or zeroed is None:
             return None
-        poses = _moved(self.flange_poses(views), self.joints(views), zeroed, robot)
-        return replace(self.closure(views), robot=robot_part(poses, self.session.mount))
+        first = self.first_of_stops(views)
+        poses = _moved(self.flange_poses(first), self.joints(first), zeroed, robot)
+        return replace(self.problem(views), poses={ROBOT: poses})
 
     @property
     def scene(self) -> Scene | None:
@@ -351,11 +350,6 @@ class Known(Observed):
         at_s = np.array([stamps[it] for it in views])
         return Stops(ROBOT, np.arange(len(views)), self.joints(views), at_s)
 
-    @property
-    def drift_size(self) -> int:
-        """How many values of the drift are held; they come before the arm's errors."""
-        return 0 if self.thermal is None else len(self.thermal.values)
-
     def joints(self, views: Sequence[int]) -> FloatArray:
         """(m, n) joint angles of some views, where all have them [rad]."""
         joints = {} if self.joints_rad is None else self.joints_rad
@@ -398,21 +392,28 @@ class Known(Observed):
         return self.solved.covariance[first:, first:]
 
     @property
+    def arm_by_stop(self) -> ArmErrors | None:
+        """Errors that follow the arm's posture, at the stops of the used views; None for none."""
+        if self.arm is None:
+            return None
+        return replace(self.arm, basis=self.arm_basis(self.first_of_stops(self.used)))
+
+    @property
     def arm_values(self) -> FloatArray | None:
         """(p,) present values of the arm's errors; None for the nominal arm's."""
         return None if self.arm_model is None else self.arm_model.values
 
     @property
-    def estimated_looks(self) -> int:
-        """How many unknowns the views share that they have to tell.
+    def estimates_looks(self) -> bool:
+        """Whether the views have to tell the first effect.
 
-        Those of lens and board where the lens was estimated, or the places of further points on the
-        flange. They come before the arm's.
+        That is lens and board where the lens was estimated, or the places of further points on the
+        flange.
         """
-        if self.readings is not None and not self.readings.are_poses:
-            return 3 * (len(self.readings.names) - 1)
+        if self.readings is not None:
+            return not self.readings.are_poses and len(self.readings.names) > 1
         told = self.camera is not None and self.camera.estimated
-        return 0 if self.free is None or not told else len(self.free.columns)
+        return told and self.free is not None and len(self.free.columns) > 0
 
     def arm_basis(self, views: Sequence[int]) -> FloatArray:
         """How errors of the arm move each view's flange: of its links where these are known."""
@@ -464,10 +465,9 @@ class Known(Observed):
         return [self.poses[view].corners for view in views]
 
     @property
-    def robot_noise(self) -> Noise | None:
-        """Noise of the flange; None where it cannot be told from the camera's."""
-        separate = self.closure(self.used).camera_covariance is not None
-        return self.solved.noise if separate else None
+    def robot_noise(self) -> FloatArray | None:
+        """(2,) noise of the flange [rad, m]; None where it cannot be told from the camera's."""
+        return None if self.solved.problem.is_combined else self.solved.noise.robots[0]
 
     @property
     def solved(self) -> HandEyeResult:

@@ -40,11 +40,12 @@ def without_lost_boards(known: Known) -> Known:
 
 
 def middles(known: Known) -> FloatArray:
-    """(m, 3) middle of the board that each used view shows, in the frame of the first [m]."""
-    shown, targets = known.shown(known.used), tuple(known.session.boards.values())
-    if not targets:
-        return np.zeros((len(known.used), 3))
-    means = [corner_positions(targets[it]).mean(axis=0) for it in known.boards]
-    own = shown.first_from_own
-    points = np.array(means)[shown.shown]
-    return np.asarray((own[:, :3, :3] @ points[:, :, None])[:, :, 0] + own[:, :3, 3])
+    """(m, 3) middle of the target that each observation is of, in its frame [m]."""
+    targets = tuple(known.session.boards.values())
+    middle = {
+        known.frame_of(it): corner_positions(targets[it]).mean(axis=0)
+        for it in known.boards
+        if targets
+    }
+    observed = known.solved.problem.observations.observed
+    return np.array([middle.get(it, np.zeros(3)) for it in observed])

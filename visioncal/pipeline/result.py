@@ -9,9 +9,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult, Validation
 from visioncal.errors import DataError, VisioncalError
-from visioncal.estimation.appearance import BOARD_NAMES, Free, shape_slices
-from visioncal.estimation.boards import Placed, place
-from visioncal.estimation.chain import edge_names
+from visioncal.estimation.appearance import BOARD_NAMES, LENS_AND_BOARD, Free, shape_slices
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.arm import kinematics_document
 from visioncal.pipeline.elastic import elastic_document
@@ -24,13 +22,13 @@ from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
-from visioncal.stages.handeye import SOLVER_NAMES, Solution, compare_solvers
+from visioncal.stages.handeye import SOLVER_NAMES, compare_solvers
 from visioncal.stages.kinematics import ASKED
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
 from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, Mask, Progress, SolverName
+from visioncal.types import FloatArray, IntArray, Mask, Progress, SolverName
 
 _LEVELS = (*ASKED, "hand-eye")
 
@@ -122,28 +120,27 @@ def result_of(known: Known) -> Calibration:
     if held is None or findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
     session, result = known.session, known.solved
-    names, placed = _edges_in_order(known)
-    spread = placed.covariance(result.covariance)
-    if known.readings is not None and not known.readings.are_poses:
-        # The rotation of a point's frame is a matter of choice.
-        spread[6:9], spread[:, 6:9] = 0.0, 0.0
+    order, rows = _in_order(known), _rows(known)
+    spread = result.covariance[np.ix_(rows, rows)]
     return Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         mount=session.mount,
         edges={
-            name: Edge(edge, spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
-            for at, (name, edge) in enumerate(zip(names, [result.edges.x, *placed.z], strict=True))
+            name: Edge(
+                result.state.edges[it], result.covariance[6 * it : 6 * it + 6, 6 * it : 6 * it + 6]
+            )
+            for name, it in order.items()
         },
         joint_covariance=spread,
         solvers={
             name: SolverResult(
-                dict(zip(names, [it.x, *placed.seen_with(it.z)], strict=True)),
+                {edge: it.edges[at] for edge, at in order.items()},
                 1e3 * it.rms_m,
                 None if it.rms_rad is None else float(np.rad2deg(it.rms_rad)),
             )
-            for name, it in _solutions(known).items()
+            for name, it in compare_solvers(result, session.mount, known.solver).items()
         },
         noise=_noise(known),
         views=tuple(findings.pairs[0].views),
@@ -156,20 +153,18 @@ def result_of(known: Known) -> Calibration:
     )
 
 
-def _edges_in_order(known: Known) -> tuple[tuple[str, ...], Placed]:
-    """The edges' names, and all boards in the order in which the session names them."""
-    x_name, z_name = edge_names(known.session.mount)
-    placed = place(known.shown(known.used), known.solved.edges)
-    order = sorted(range(len(known.boards)), key=lambda it: known.boards[it])
-    names = [f"{z_name}_{placed.names[it]}" if placed.names[it] else z_name for it in order]
-    return (x_name, *names), placed.sorted(order)
+def _in_order(known: Known) -> dict[str, int]:
+    """The edges' places by their names, the boards in the order in which the session names them."""
+    problem, boards = known.solved.problem, known.boards
+    order = [0, *(1 + it for it in sorted(range(len(boards)), key=boards.__getitem__))]
+    frames = tuple(problem.unknown)
+    parents = [problem.tree.branches[it].parent for it in frames]
+    return {f"{parents[it]}_from_{frames[it]}": it for it in order}
 
 
-def _solutions(known: Known) -> dict[str, Solution]:
-    boards, first = known.shown(known.used), np.unique(known.stops, return_index=True)[1]
-    data = known.closure(known.used).merged(known.stops)
-    by_stop = replace(boards, shown=boards.shown[first])
-    return compare_solvers(data, known.solved.edges, known.solver, by_stop)
+def _rows(known: Known) -> IntArray:
+    """The unknowns of these edges."""
+    return np.concatenate([np.arange(6 * it, 6 * it + 6) for it in _in_order(known).values()])
 
 
 def _further(known: Known) -> dict[str, Any]:
@@ -218,7 +213,7 @@ def _instrument(known: Known, readings: Readings) -> dict[str, Any]:
     }
     document: dict[str, Any] = {"instrument": {k: v for k, v in stated.items() if v is not None}}
     if readings.mounting is not None:
-        on_flange = readings.mounting.moved(known.solved.edges.state).on_flange
+        on_flange = readings.mounting.moved(known.solved.state).on_flange
         document["points"] = [
             {"point": name or "probe", **dict(zip(("x_m", "y_m", "z_m"), place, strict=True))}
             | {"sigma_mm": _point_sigma_mm(known.solved.covariance, point)}
@@ -258,8 +253,13 @@ def _own(known: Known, free: Free, place: int) -> tuple[slice, Mask, FloatArray]
     """Where one target's shape stands, which free values are its, and their sigmas."""
     mine = shape_slices(tuple(known.session.boards.values()), free.lens_count)[place]
     columns = (free.columns >= mine.start) & (free.columns < mine.stop)
-    sigmas = np.sqrt(np.diag(known.solved.covariance))[12 : 12 + len(free.columns)][columns]
+    sigmas = np.sqrt(np.diag(known.solved.covariance))[_looks(known)][columns]
     return mine, columns, sigmas
+
+
+def _looks(known: Known) -> slice:
+    """The unknowns of lens and board."""
+    return known.solved.problem.effect_columns.get(LENS_AND_BOARD, slice(0, 0))
 
 
 def _rig(known: Known, free: Free, place: int) -> dict[str, Any]:
@@ -267,17 +267,17 @@ def _rig(known: Known, free: Free, place: int) -> dict[str, Any]:
     mine, columns, sigmas = _own(known, free, place)
     if not columns.any():
         return {}
-    moved = free.after(known.solved.edges.shared).values[mine]
+    moved = free.after(known.solved.state.values).values[mine]
     return {"shape": moved.reshape(-1, 3).tolist(), "sigma": sigmas.reshape(-1, 3).tolist()}
 
 
 def _board(known: Known, free: Free, place: int) -> dict[str, Any]:
     """A board as it was found to be, and how well that is known."""
     mine, board, sigmas = _own(known, free, place)
-    shape = free.after(known.solved.edges.shared).values[mine]
+    shape = free.after(known.solved.state.values).values[mine]
     starts = first_corners(tuple(known.session.boards.values()))
     ends = [*starts[1:].tolist(), len(free.positions)]
-    bend = free.corners_after(known.solved.edges.shared)[starts[place] : ends[place], 2]
+    bend = free.corners_after(known.solved.state.values)[starts[place] : ends[place], 2]
     names = [BOARD_NAMES[at - mine.start] for at in free.columns[board]]
     return {
         "shape": dict(zip(BOARD_NAMES, shape.tolist(), strict=True)),
@@ -319,13 +319,12 @@ def _camera(known: Known) -> CameraResult | None:
     columns = free.columns[free.columns < free.lens_count]
     if not len(columns):
         return known.camera
-    rows = 12 + np.searchsorted(free.columns, columns)
-    slope = _edges_in_order(known)[1].slope
-    spread, shared = np.zeros((free.lens_count,) * 2), np.zeros((free.lens_count, len(slope)))
+    rows, edges = _looks(known).start + np.searchsorted(free.columns, columns), _rows(known)
+    spread, shared = np.zeros((free.lens_count,) * 2), np.zeros((free.lens_count, len(edges)))
     spread[np.ix_(columns, columns)] = result.covariance[np.ix_(rows, rows)]
-    shared[columns] = result.covariance[rows] @ slope.T
+    shared[columns] = result.covariance[np.ix_(rows, edges)]
     return CameraResult(
-        free.after(result.edges.shared).camera,
+        free.after(result.state.values).camera,
         estimated=known.camera.estimated or free.lens_is_free,
         covariance=spread,
         edge_covariance=shared,
@@ -334,7 +333,7 @@ def _camera(known: Known) -> CameraResult | None:
 
 def _noise(known: Known) -> dict[str, float]:
     """Standard deviations per axis: of corners and flange, or of both as one without corners."""
-    noise = known.solved.noise
+    sigma_rad, sigma_m = known.solved.noise.robots[0].tolist()
     of = "combined" if known.robot_noise is None else "robot"
     seen = {} if known.pixel_px is None else {"pixel_px": known.pixel_px}
     if known.readings is not None:
@@ -342,6 +341,6 @@ def _noise(known: Known) -> dict[str, float]:
         if known.readings.are_poses:
             seen["instrument_deg"] = float(np.rad2deg(known.readings.instrument.sigma_rad or 0.0))
     return seen | {
-        f"{of}_translation_mm": 1e3 * noise.sigma_m,
-        f"{of}_rotation_deg": float(np.rad2deg(noise.sigma_rad)),
+        f"{of}_translation_mm": 1e3 * sigma_m,
+        f"{of}_rotation_deg": float(np.rad2deg(sigma_rad)),
     }

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.boards import place
+from visioncal.estimation.chain import robot_part
 from visioncal.estimation.joint import Arm
 from visioncal.estimation.observability import directions, refuse_too_few
 from visioncal.pipeline.arm import telling_of
@@ -31,7 +30,7 @@ from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_tar
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clocks import set_clocks, waits_for_clock
 from visioncal.stages.diagnose import diagnose
-from visioncal.stages.handeye import robot_part, solve_hand_eye
+from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked
@@ -211,12 +210,12 @@ def _look(known: Known) -> Known:
 
 
 def _agree(known: Known) -> Known:
-    data = known.closure(known.used)
-    refuse_too_few(data.merged(known.stops), len(data))
+    mount, problem = known.session.mount, known.problem(known.used)
+    refuse_too_few(problem, mount, len(known.used))
     frames = known.frames or None
     if known.readings is not None and known.readings.mounting is not None:
         frames = known.framed(known.readings.mounting.edges)
-    agreed = agree(known.problem(known.used), known.used, known.session.mount, frames)
+    agreed = agree(problem, known.used, mount, frames)
     known = without_lost_boards(replace(known, candidates=known.used).agreeing(agreed))
     return known.posed(_held_back_poses(known))
 
@@ -291,31 +290,32 @@ def _kinematics(known: Known) -> Known:
 
 
 def _hand_eye(known: Known) -> Known:
-    """Solves for both edges, with arm and further boards linearised anew until they stay.
+    """Solves for all edges, with the arm linearised anew until it stays.
 
-    With them go the rotations that were supplied to readings of points.
+    With it go the rotations that were supplied to readings of points.
     """
     for _ in range(_ROUNDS):
         known = known.with_arm_errors()
-        boards = known.shown(known.used)
-        data, arm = known.closure(known.used).merged(known.stops), _arm_by_stop(known)
-        first = np.unique(known.stops, return_index=True)[1]
-        by_stop = replace(boards, shown=boards.shown[first])
-        start = None if known.hand_eye is None else known.hand_eye.edges
-        looks = known.estimated_looks
-        result = solve_hand_eye(data, known.solver, arm, looks, by_stop, start)
-        known = replace(known, hand_eye=result)
-        model, readings, shared = known.arm_model, known.readings, result.edges.shared
-        step = np.concatenate([shared[len(shared) - known.arm_size :], shared[boards.places]])
+        problem = known.problem(known.used).merged()
+        result = solve_hand_eye(
+            problem,
+            known.session.mount,
+            known.solver,
+            known.arm_by_stop,
+            looks=known.estimates_looks,
+            start=problem.start(known.frames),
+        )
+        frames = dict(zip(problem.unknown, result.state.edges, strict=True))
+        known = replace(known, hand_eye=result, frames=frames)
+        model, readings, values = known.arm_model, known.readings, result.state.values
+        step = values[len(values) - known.arm_size :]
         if np.abs(step).max(initial=0.0) < _ARM_AT_REST_RAD and _is_aimed(known):
             break
-        placed = place(boards, result.edges)
-        known = replace(known, frames=known.framed(np.stack([result.edges.x, *placed.z])))
         if model is not None:
-            known = replace(known, arm_model=model.moved(step[: known.arm_size]))
+            known = replace(known, arm_model=model.moved(step))
         if readings is not None:
-            known = known.with_readings(readings.moved(result.edges.state))
-    found = components(data.problem, known.solved.edges.state, known.solved.covariance)
+            known = known.with_readings(readings.moved(result.state))
+    found = components(result.problem, result.state, result.covariance)
     notes = (it.remark for it in found if not it.is_contradicted)
     known = replace(known, notes=(*known.notes, *notes))
     return known.noting((), (it.doubt for it in found if it.is_contradicted))
@@ -325,33 +325,23 @@ def _is_aimed(known: Known) -> bool:
     """Whether rotations that were supplied are still those that the chain predicts."""
     if known.readings is None or known.readings.are_poses:
         return True
-    edges, data = known.solved.edges, known.closure(known.used)
-    turns = rotation_angle(invert(edges.z) @ data.under(edges.shared).placed(edges.x))
+    problem, state = known.problem(known.used), known.solved.state
+    turns = rotation_angle(invert(problem.predicted(state)) @ problem.measured(state))
     return bool(turns.max() < _TURN_AT_REST_RAD)
 
 
-def _arm_by_stop(known: Known) -> ArmErrors | None:
-    if known.arm is None:
-        return None
-    first = np.unique(known.stops, return_index=True)[1]
-    return replace(known.arm, basis=known.arm_basis(known.used)[first])
-
-
 def _diagnose(known: Known) -> Known:
-    data, result = known.closure(known.used).merged(known.stops), known.solved
-    first, boards = np.unique(known.stops, return_index=True)[1], known.shown(known.used)
+    result, mount = known.solved, known.session.mount
     diagnosis = diagnose(
-        data,
         result,
+        mount,
         known.free,
-        _arm_by_stop(known),
-        middles(known)[first],
-        boards,
-        drifting=known.drift_size,
+        known.arm_by_stop,
+        middles(known),
         calibrated=known.arm_model is not None,
     )
     spread = diagnosis.inflation * result.covariance
-    worst = directions(spread, result.edges, data.mount, boards)
+    worst = directions(result.problem, result.state, spread, mount)
     wider = replace(result, covariance=spread, worst=worst)
     known = replace(known, hand_eye=wider, diagnosis=diagnosis)
     return known.noting((), diagnosis.warnings)
@@ -385,8 +375,8 @@ def _judge(known: Known) -> Known:
     )
     arm = ArmFindings(
         len(np.unique(known.stops)),
-        None if noise is None else 1e3 * noise.sigma_m,
-        None if noise is None else float(np.rad2deg(noise.sigma_rad)),
+        None if noise is None else 1e3 * float(noise[1]),
+        None if noise is None else float(np.rad2deg(noise[0])),
         errs=diagnosis.arm is not None,
         workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
         modelled=known.robot is not None,

@@ -152,9 +152,10 @@ def _seen(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float
     robot = known.zeroed_robot
     there = np.abs(q - _typical(known, model.robot if robot is None else robot)).max(axis=1)
     chosen = np.flatnonzero(there < _SAME_RAD)
-    problem = known.closure(known.used).merged(known.stops).problem
-    linear = replace(problem, is_combined=False).linear(known.solved.edges.state)
-    left = -np.linalg.solve(linear.by_errors, linear.residuals[:, :, None])[chosen, 3:, 0]
+    problem = replace(known.solved.problem, is_combined=False)
+    linear = problem.linear(known.solved.state)
+    rows = np.unique(problem.observations.stops, return_index=True)[1][chosen]
+    left = -np.linalg.solve(linear.by_errors[rows], linear.residuals[rows, :, None])[:, 3:, 0]
     moved = model.motion(q[chosen], model.heating.links_c(inputs, stamps_s[chosen]))[:, :3, 3]
     # Where it has hardly moved it has no direction: that of the farthest stop serves them all.
     lengths = np.linalg.norm(moved, axis=1)

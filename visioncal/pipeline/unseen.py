@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.closure import Closure
 from visioncal.estimation.problem import State
 from visioncal.pipeline.known import Known
 from visioncal.stages.handeye import refit
@@ -18,39 +17,35 @@ from visioncal.types import FloatArray, IntArray, Mask
 
 def left_out(known: Known) -> HeldOut:
     """Residuals of the used views, each by a fit without its stop."""
-    data, result, stops = known.closure(known.used), known.solved, known.stops
-    problem, boards, seen = data.problem, known.shown(known.used), known.seen(known.used)
+    result, mount, seen = known.solved, known.session.mount, known.seen(known.used)
+    problem = known.problem(known.used)
 
     def again(kept: Mask) -> State:
-        numbered = np.unique(stops[kept], return_inverse=True)[1]
-        return refit(data.subset(kept).merged(numbered), result, known.solver).state
-
-    def own(state: State) -> FloatArray:
-        return boards.moved(state.values).first_from_own
+        return refit(problem.subset(kept).merged(), result, mount, known.solver)
 
     def pixels(rows: IntArray, state: State) -> FloatArray:
         chosen = np.isin(np.arange(len(problem)), rows)
-        poses = problem.subset(chosen).predicted(state) @ own(state)[rows]
+        poses = problem.subset(chosen).predicted(state)
         return chain_rms_px([seen[it] for it in rows], poses, known.free, state.values)
 
-    needs = [(boards.names[it],) for it in boards.shown]
-    found = validate(problem, stops, needs, again, pixels, own)
-    fit = "whole fit" if data.mount == "instrument" else "hand-eye fit"
+    needs = [(it,) for it in problem.observations.observed]
+    found = validate(problem, known.stops, needs, again, pixels)
+    fit = "whole fit" if mount == "instrument" else "hand-eye fit"
     unknown = np.full(len(problem), np.nan)
     return replace(
         found,
         method=f"{found.method}, of the {fit}",
-        away_rad=found.away_rad if data.guess is None else unknown,
+        away_rad=unknown if problem.points else found.away_rad,
     )
 
 
 def unseen_views(known: Known, found: Kinematics) -> dict[str, list[dict[str, Any]]]:
     """How far such views are off by both arms: left out in turn, and held back by the session.
 
-    A stop that was left out goes by its first view.
+    What one stop shows of a target goes by its first view.
     """
     before, after = (_lengths(fit.left_out) for fit in found.fits)
-    first = np.unique(known.stops, return_index=True)[1]
+    first = np.unique(known.problem(known.used).of_one_stop, return_index=True)[1]
     left_out = [known.used[int(at)] for at in first]
     rows = partial(_rows, turned=known.readings is None or known.readings.are_poses)
     documents = {"left_out": list(rows(left_out, before, after))}
@@ -69,23 +64,11 @@ def _held_back(
     Returns:
         Twice (m, 2) rotation [rad] and distance [m].
     """
-    stated = replace(known, arm=None, arm_model=None, frames=known.compared_frames)
-    lost = stated.stated_closure(views)
-    data = (stated.closure(views) if lost is None else lost, known.closure(views))
-    states = (found.fits[0].fit.state, known.solved.edges.state)
-    before, after = (
-        _apart(one, two, it, views)
-        for one, two, it in zip((stated, known), data, states, strict=True)
-    )
+    stated = replace(known, arm=None, arm_model=None)
+    lost = stated.stated_problem(views)
+    before = apart(stated.problem(views) if lost is None else lost, found.fits[0].fit.state)
+    after = apart(known.problem(views), known.solved.state)
     return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
-
-
-def _apart(
-    known: Known, data: Closure, state: State, views: Sequence[int]
-) -> tuple[FloatArray, FloatArray]:
-    """How far (m,) [m] and (m,) [rad] views place their boards from where the edges do."""
-    own = known.shown(views).moved(state.values).first_from_own
-    return apart(data.problem, state, own)
 
 
 def _lengths(twists: FloatArray) -> FloatArray:

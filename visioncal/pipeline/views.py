@@ -1,17 +1,16 @@
 """What became of each view: its figures for the result, and its evidence for people."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from visioncal.calibration import Rms, ViewResult
+from visioncal.estimation.chain import scatter
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import own_numbers
 from visioncal.stages.observed import HELD_BACK
 from visioncal.stages.validate import chain_rms_px, predict_corners
-from visioncal.transforms import distances, mean_transform
 from visioncal.types import Corners, FloatArray
 
 _NO_POSE = (
@@ -68,23 +67,10 @@ def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, 
 
     Each view's place of its board is compared with the mean of those that show the same one.
     """
-    edges, data, shown = known.solved.edges, known.closure(views), known.shown(views)
-    own = shown.moved(edges.shared).first_from_own
-    poses = data.problem.predicted(edges.state) @ own
-    rms_px = chain_rms_px(known.seen(views), poses, known.free, edges.shared)
-    means = np.array([mean_transform(it) for it in _placed_by_board(known)])
-    placed = data.under(edges.shared).placed(edges.x) @ own
-    away_m, away_rad = distances(placed, means[shown.shown])
-    return away_m, away_rad if data.guess is None else np.full(len(data), np.nan), rms_px
-
-
-def _placed_by_board(known: Known) -> Iterator[FloatArray]:
-    """Where the used views of each board place it, (k, 4, 4)."""
-    edges, shown = known.solved.edges, known.shown(known.used)
-    placed = known.closure(known.used).under(edges.shared).placed(edges.x)
-    placed = placed @ shown.moved(edges.shared).first_from_own
-    for board in range(len(known.boards)):
-        yield placed[shown.shown == board]
+    state, problem = known.solved.state, known.problem(views)
+    rms_px = chain_rms_px(known.seen(views), problem.predicted(state), known.free, state.values)
+    away_m, away_rad = scatter(problem, known.problem(known.used), state)
+    return away_m, np.full(len(views), np.nan) if problem.points else away_rad, rms_px
 
 
 def _reason(known: Known, view: int) -> str:
@@ -101,7 +87,7 @@ def _corners(known: Known, view: int) -> int | None:
 
 
 def _evidence(known: Known, view: int) -> ViewEvidence:
-    poses, edges = known.poses.get(view), known.solved.edges
+    poses, state = known.poses.get(view), known.solved.state
     corners = known.corners.get(view) if poses is None else poses.corners
     reported = known.base_from_flange.get(view)
     base_from_flange = None if reported is None else known.flange_poses([view])[0]
@@ -111,12 +97,10 @@ def _evidence(known: Known, view: int) -> ViewEvidence:
         # is known.
         cam_from_target = poses.cam_from_target[0]
     elif poses is not None and reported is not None and poses.board in known.boards:
-        data = known.closure([view]).under(edges.shared)
-        own = known.shown([view]).moved(edges.shared).first_from_own[0]
-        cam_from_target = data.camera[0] @ own
+        problem = known.problem([view])
+        cam_from_target = problem.measured(state)[0]
         if corners is not None:
-            where = data.predicted_camera(edges.x, edges.z)[0] @ own
-            predicted = _predicted(known, where, corners)
+            predicted = _predicted(known, problem.predicted(state)[0], corners)
     return ViewEvidence(
         view=view,
         corners=None if corners is None else own_numbers(known, corners),
@@ -129,6 +113,6 @@ def _evidence(known: Known, view: int) -> ViewEvidence:
 def _predicted(known: Known, cam_from_target: FloatArray, corners: Corners) -> FloatArray | None:
     if known.free is None:
         return None
-    change = known.solved.edges.shared
+    change = known.solved.state.values
     positions = known.free.corners_after(change)[corners.ids]
     return predict_corners(known.free.after(change).camera, cam_from_target, positions)

@@ -184,7 +184,7 @@ def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, 
     if known.agreed is None:
         return state, _TYPICAL
     if known.hand_eye is not None:
-        noise = known.hand_eye.noise.levels
+        noise = known.hand_eye.noise
     else:
         fit = fit_problem(problem, state)
         state, noise = State(fit.state.edges, state.values), fit.noise

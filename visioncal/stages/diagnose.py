@@ -5,21 +5,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.appearance import Free
+from visioncal.estimation.appearance import LENS_AND_BOARD, Free
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
-from visioncal.estimation.boards import Boards
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
-from visioncal.estimation.closure import Closure, fit_closure
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.problem import ROBOT, Problem
+from visioncal.estimation.solve import fit_problem
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, IntArray
+from visioncal.types import FloatArray, IntArray, Mount
 
 # Fewer stops than this leave no residuals to be tested.
 FEWEST_STOPS = 6
+# Whose effects' uncertainty is, by their names; that of all others is the clock's.
+_OF_EFFECTS = {
+    "points": "instrument",
+    "temperature": "temperature",
+    f"arm of {ROBOT}": "arm",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,52 +55,49 @@ class Diagnosis:
 
 
 def diagnose(
-    data: Closure,
     result: HandEyeResult,
+    mount: Mount,
     free: Free | None,
     arm: ArmErrors | None,
     middle: FloatArray,
-    boards: Boards,
     *,
-    drifting: int = 0,
     calibrated: bool = False,
 ) -> Diagnosis:
     """Looks for what noise does not explain, and splits the uncertainty by its sources.
 
     Args:
-        data: The views, one a stop, in the order of the session.
-        result: The answer.
+        result: The answer, its stops in the order of the session.
+        mount: Where the camera is.
         free: Lens and board, where there are corners.
-        arm: Errors that follow the arm's posture, at the same views.
-        middle: (3,) of the target, in its frame [m]; or (m, 3) of the one that each stop shows, in
-            the frame of the first.
-        boards: What the views show, where there are several boards.
-        drifting: How many of the unknowns are of the arm's drift with temperature.
+        arm: Errors that follow the arm's posture, at the same stops.
+        middle: (m, 3) of the target that each observation is of, in its frame [m].
         calibrated: Whether the arm's errors are part of the answer, and no reason for doubt.
     """
-    edges, noise = result.edges, result.noise
+    problem, state, noise = result.problem, result.state, result.noise
     with one_blas_thread():
         alike, moved = Neighbours(1.0, False), None
-        if len(data) >= FEWEST_STOPS:
+        if len(np.unique(problem.observations.stops)) >= FEWEST_STOPS:
             # A closed form is not at rest, and that would pass for a misfit.
-            rest = fit_closure(data, edges)
-            fitted = (data.problem, rest.edges.state, rest.noise.levels, ROBOT)
+            rest = fit_problem(problem, state)
+            fitted = (problem, rest.state, rest.noise, ROBOT)
             alike, moved = neighbours(*fitted), drift(*fitted)
-        told = data.problem, edges.state, noise.levels
-        parts = covariance_by_source(*told, _sources(data, free, arm, boards, drifting))
+        parts = covariance_by_source(problem, state, noise, _sources(problem, mount, free))
+        size = 6 * len(problem.unknown)
         if arm is not None and not arm.is_estimated:
-            of_arm = misfit_covariance(*told, ROBOT, arm)
-            parts["arm"] = of_arm[:12, :12]
+            of_arm = misfit_covariance(problem, state, noise, ROBOT, arm)
+            parts["arm"] = of_arm[:size, :size]
         if result.held.any():
-            parts["held_values"] = np.outer(result.held[:12], result.held[:12])
-        intervals = noise_intervals(*told)[0]
+            parts["held_values"] = np.outer(result.held[:size], result.held[:size])
+        intervals = noise_intervals(problem, state, noise)[0]
     inflation = alike.factor if alike.is_significant else 1.0
     if inflation > 1.0:
-        parts["misfit"] = (inflation - 1.0) * sum(parts.values(), np.zeros((12, 12)))
-    camera = data.under(edges.shared).camera
-    seen = (camera[:, :3, :3] @ np.atleast_2d(middle)[:, :, None])[:, :, 0] + camera[:, :3, 3]
+        parts["misfit"] = (inflation - 1.0) * sum(parts.values(), np.zeros((size, size)))
+    camera = problem.measured(state)
+    seen = (camera[:, :3, :3] @ middle[:, :, None])[:, :, 0] + camera[:, :3, 3]
     point = seen.mean(axis=0)
-    at_work = {name: point_covariance(edges.x, it[:6, :6], point) for name, it in parts.items()}
+    at_work = {
+        name: point_covariance(state.edges[0], it[:6, :6], point) for name, it in parts.items()
+    }
     at_work["total"] = sum(at_work.values(), np.zeros((3, 3)))
     return Diagnosis(
         point,
@@ -109,39 +111,23 @@ def diagnose(
     )
 
 
-def _sources(
-    data: Closure, free: Free | None, arm: ArmErrors | None, boards: Boards, drifting: int
-) -> Sources:
-    """What makes the result uncertain, and which of the unknowns that views share are whose.
-
-    The arm's errors come last, and before them its drift.
-    """
+def _sources(problem: Problem, mount: Mount, free: Free | None) -> Sources:
+    """What makes the result uncertain."""
     owners: dict[str, IntArray] = {}
-    shared = len(data.unchanged)
-    errors = 0 if arm is None or not arm.is_estimated else arm.basis.shape[2]
-    if data.mount == "instrument" and shared > errors + drifting:
-        # Places of points, of which an instrument's readings of one stop tell by themselves.
-        owners["instrument"] = np.arange(shared - errors - drifting)
-    if boards.unknowns and data.camera_covariance is not None:
-        # All that is known of where boards are beside the chain is from images that show several.
-        owners["pixels"] = np.arange(boards.begin, boards.begin + boards.unknowns)
-    if free is not None:
-        is_lens = free.columns < free.lens_count
-        for name, mask in (("intrinsics", is_lens), ("board", ~is_lens)):
-            if mask.any():
-                owners[name] = np.flatnonzero(mask)
-    behind, before = boards.begin + boards.unknowns, shared - errors - drifting
-    if data.mount != "instrument" and before > behind:
-        owners["clock"] = np.arange(behind, before)
-    if drifting:
-        owners["temperature"] = np.arange(before, before + drifting)
-    if arm is not None and arm.is_estimated:
-        owners["arm"] = np.arange(shared - errors, shared)
-    first, observers = 6 * len(data.problem.unknown), data.problem.observations.observers
+    for name, at in problem.effect_columns.items():
+        columns, of = np.arange(at.start, at.stop), _OF_EFFECTS.get(name, "clock")
+        if name == LENS_AND_BOARD and free is not None:
+            is_lens = free.columns < free.lens_count
+            parts = {"intrinsics": columns[is_lens], "board": columns[~is_lens]}
+            owners |= {it: part for it, part in parts.items() if len(part)}
+        else:
+            owners[of] = np.append(owners.get(of, columns[:0]), columns)
     return Sources(
-        dict.fromkeys(observers, "instrument" if data.mount == "instrument" else "pixels"),
-        {"robot": "poses" if data.camera_covariance is None else "robot"},
-        {name: first + places for name, places in owners.items()},
+        dict.fromkeys(
+            problem.observations.observers, "instrument" if mount == "instrument" else "pixels"
+        ),
+        {ROBOT: "poses" if problem.is_combined else "robot"},
+        owners,
     )
 
 

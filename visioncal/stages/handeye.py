@@ -1,4 +1,4 @@
-"""Stage 5: the two unknown edges, AX = XB and AX = ZB, by every solver."""
+"""Stage 5: the unknown edges, AX = XB and AX = ZB, by every solver."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -7,18 +7,7 @@ import numpy as np
 
 from visioncal.errors import ConvergenceError
 from visioncal.estimation.arm import ArmErrors, misfit_covariance
-from visioncal.estimation.boards import Boards
-from visioncal.estimation.closure import (
-    Closure,
-    ClosureFit,
-    Edges,
-    Noise,
-    closure_information,
-    estimate_noise,
-    fit_closure,
-    solve_closure,
-)
-from visioncal.estimation.linalg import covariance
+from visioncal.estimation.chain import robot_part, scatter
 from visioncal.estimation.observability import (
     Direction,
     check_observability,
@@ -26,9 +15,16 @@ from visioncal.estimation.observability import (
     refuse_too_few,
     title,
 )
-from visioncal.estimation.problem import ROBOT
-from visioncal.estimation.solve import Solution as Solved
-from visioncal.estimation.solve import held_shift
+from visioncal.estimation.problem import ROBOT, Noise, Problem, State
+from visioncal.estimation.solve import (
+    Solution,
+    covariance_of,
+    estimate_noise,
+    fit_problem,
+    held_shift,
+    solve_problem,
+    starting_noise,
+)
 from visioncal.solvers import SOLVERS
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert
@@ -41,14 +37,13 @@ _START = "park"
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """Both edges (4, 4) by one solver, and the scatter of the target that they leave.
+class Answer:
+    """All edges (1 + b, 4, 4) by one solver, and the scatter of the targets that they leave.
 
-    That of its rotation is None where places alone were read.
+    That of their rotation is None where places alone were read.
     """
 
-    x: FloatArray
-    z: FloatArray
+    edges: FloatArray
     rms_m: float
     rms_rad: float | None
 
@@ -58,49 +53,55 @@ class HandEyeResult:
     """The answer of one solver.
 
     Attributes:
-        edges: x is `flange_from_cam` or `base_from_cam`; z is `base_from_target` or
-            `flange_from_target`; with them the change of lens, board and links.
-        covariance: (12 + k, 12 + k) of x, z (right perturbations) and of what the views share.
-        noise: Of the flange, or of both together.
-        worst: The worst directions of each edge, those of further boards behind the others.
-        held: (12 + k,) how far the answer would move if what is held moved as well; its square is
-            in the covariance.
+        problem: What was measured; its unknowns are the camera's edge, the targets' and the values
+            of effects.
+        fit: The unknowns and the noise.
+        covariance: (p, p) of the unknowns.
+        worst: The worst directions of each edge.
+        held: (p,) how far the answer would move if what is held moved as well; its square is in
+            the covariance.
     """
 
-    edges: Edges
+    problem: Problem
+    fit: Solution
     covariance: FloatArray
-    noise: Noise
     worst: tuple[Direction, ...]
     held: FloatArray
 
+    @property
+    def state(self) -> State:
+        """The unknowns."""
+        return self.fit.state
 
-def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
-    """The robot's part (m, 4, 4) of the chain `robot * x * camera = z`."""
-    return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
+    @property
+    def noise(self) -> Noise:
+        """Of the flange, or of flange and camera as one."""
+        return self.fit.noise
 
 
 def solve_hand_eye(
-    data: Closure,
+    problem: Problem,
+    mount: Mount,
     solver: SolverName = "joint",
     arm: ArmErrors | None = None,
-    looks: int = 0,
-    boards: Boards | None = None,
-    start: Edges | None = None,
+    *,
+    looks: bool = False,
+    start: State | None = None,
 ) -> HandEyeResult:
-    """Solves for both unknown edges.
+    """Solves for all unknown edges.
 
     The covariance is that of the joint fit at the noise which the answer leaves. A closed form uses
     the views less well: for it, that is the least it can be.
 
     Args:
-        data: The used views.
-        solver: `joint` for the whitened fit of both edges, or a closed form's name.
-        arm: Errors that follow the arm's posture, at the same views. Those of its links are among
-            what the views share; others are noise to the fit and count in the covariance.
-        looks: How many of the unknowns that the views share are of lens and board; they come first.
-        boards: What the views show, where there are several boards; of a stop that shows several,
-            one of them.
-        start: Where the joint fit begins; a closed form's edges where none are given.
+        problem: What was measured, one observation of a target at a stop.
+        mount: Where the camera is.
+        solver: `joint` for the whitened fit of all edges, or a closed form's name.
+        arm: Errors that follow the arm's posture, at the same stops. Those of its links are among
+            the effects; others are noise to the fit and count in the covariance.
+        looks: Whether the views have to tell the first effect: lens and board, or further points.
+        start: Where the joint fit begins, and how several targets lie to each other for a closed
+            form; a closed form's edges where None.
 
     Returns:
         The answer with its covariance.
@@ -109,72 +110,67 @@ def solve_hand_eye(
         DegenerateError: The motion leaves a direction of an edge open.
         ConvergenceError: The joint fit does not come to rest on motion that should allow it.
     """
-    boards = boards or Boards.one(len(data))
     with one_blas_thread():
-        refuse_too_few(data)
+        refuse_too_few(problem, mount)
         if solver == "joint":
-            begin = data.guess or start or SOLVERS[_START](data.robot, data.camera)
-            fit = fit_closure(data, Edges(begin.x, begin.z, data.unchanged))
+            fit = fit_problem(problem, start or _closed_form(problem, mount, _START))
         else:
-            edges = _closed_form(data, solver)
-            fit = ClosureFit(edges, estimate_noise(data, edges))
-        check_observability(data, fit.edges, fit.noise, boards, looks)
+            found, noise = _closed_form(problem, mount, solver, start), starting_noise(problem)
+            fit = Solution(found, estimate_noise(problem, found, noise, from_above=True))
+        check_observability(problem, fit.state, fit.noise, mount, looks=looks)
         # Away from its rest a closed form is pulled by more than what is held.
-        rest = Solved(fit.edges.state, fit.noise.levels)
-        shift = held_shift(data.problem, rest) * float(solver == "joint")
-        spread = covariance(closure_information(data, fit.edges, fit.noise))
-        spread = spread + np.outer(shift, shift)
+        shift = held_shift(problem, fit) * float(solver == "joint")
+        spread = covariance_of(problem, fit) + np.outer(shift, shift)
         if arm is not None and not arm.is_estimated:
-            spread = spread + misfit_covariance(
-                data.problem, fit.edges.state, fit.noise.levels, ROBOT, arm
-            )
+            spread = spread + misfit_covariance(problem, fit.state, fit.noise, ROBOT, arm)
     if not fit.settled:
         raise ConvergenceError(
-            f"{title(data.mount)}: the joint fit of {len(data)} views does not come to rest.",
+            f"{title(mount)}: the joint fit of {len(problem)} views does not come to rest.",
             next_step="Take another solver with --solver, and look at the worst views.",
         )
-    worst = directions(spread, fit.edges, data.mount, boards)
-    return HandEyeResult(fit.edges, spread, fit.noise, worst, shift)
+    worst = directions(problem, fit.state, spread, mount)
+    return HandEyeResult(problem, fit, spread, worst, shift)
 
 
-def compare_solvers(
-    data: Closure, edges: Edges, solver: SolverName, boards: Boards
-) -> dict[str, Solution]:
+def compare_solvers(result: HandEyeResult, mount: Mount, solver: SolverName) -> dict[str, Answer]:
     """What every solver makes of the same views, by its name.
 
     Args:
-        data: The used views.
-        edges: The answer.
+        result: The answer.
+        mount: Where the camera is.
         solver: Whose it is.
-        boards: What the views show.
 
     Returns:
         The answer first where it is the joint fit's, then every closed form where poses were read.
     """
-    found = {"joint": edges} if solver == "joint" else {}
-    if data.guess is None:
-        found |= {name: _closed_form(data, name) for name in SOLVERS}
-    return {name: _solution(data, it, boards) for name, it in found.items()}
+    problem, found = result.problem, {"joint": result.state} if solver == "joint" else {}
+    if not problem.points:
+        found |= {it: _closed_form(problem, mount, it, result.state) for it in SOLVERS}
+    return {name: _answer(problem, it) for name, it in found.items()}
 
 
-def refit(data: Closure, result: HandEyeResult, solver: SolverName) -> Edges:
+def refit(problem: Problem, result: HandEyeResult, mount: Mount, solver: SolverName) -> State:
     """Solves again from fewer views, with the noise that is already known."""
     if solver == "joint":
-        return solve_closure(data, result.edges, result.noise)[0]
-    return _closed_form(data, solver)
+        return solve_problem(problem, result.state, result.noise)[0]
+    return _closed_form(problem, mount, solver, result.state)
 
 
-def _closed_form(data: Closure, solver: str) -> Edges:
-    found = SOLVERS[solver](data.robot, data.camera)
-    return Edges(found.x, found.z, data.unchanged)
+def _closed_form(problem: Problem, mount: Mount, solver: str, start: State | None = None) -> State:
+    """The edges by a closed form, which takes several targets for one; see `solve_hand_eye`."""
+    seen, from_first = problem.observations, np.eye(4)[None]
+    if start is not None:
+        from_first = invert(start.edges[1:]) @ start.edges[1]
+    shown = [problem.unknown[it] - 1 for it in seen.observed]
+    robot = robot_part(problem.poses[ROBOT][seen.stops], mount)
+    found = SOLVERS[solver](robot, seen.measured @ from_first[shown])
+    return State(np.stack([found.x, *(found.z @ invert(from_first))]), problem.start_values)
 
 
-def _solution(data: Closure, edges: Edges, boards: Boards) -> Solution:
-    placed = data.under(edges.shared).placed(edges.x)
-    away_m, away_rad = boards.deviations(placed, edges.shared)
-    return Solution(
-        edges.x,
-        edges.z,
+def _answer(problem: Problem, state: State) -> Answer:
+    away_m, away_rad = scatter(problem, problem, state)
+    return Answer(
+        state.edges,
         float(np.sqrt(np.mean(away_m**2))),
-        float(np.sqrt(np.mean(away_rad**2))) if data.guess is None else None,
+        None if problem.points else float(np.sqrt(np.mean(away_rad**2))),
     )

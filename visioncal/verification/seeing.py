@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.calibration import CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.chain import robot_part
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.problem import ROBOT, Problem, State
 from visioncal.frames.sighting import check_mount, check_resolution
@@ -18,7 +19,6 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.boards import COLUMN
 from visioncal.stages.choose import choose_by
-from visioncal.stages.handeye import robot_part
 from visioncal.targets import target_document
 from visioncal.transforms import invert, pose_difference
 from visioncal.types import FloatArray, IntArray, Progress, Target

@@ -8,17 +8,14 @@ from cells import calibrated
 
 from visioncal.errors import ConvergenceError
 from visioncal.estimation import joint
-from visioncal.estimation.closure import (
-    Closure,
-    fit_closure,
-    solve_closure,
-)
 from visioncal.estimation.problem import ROBOT, Effect
 from visioncal.estimation.solve import (
     RATIO_PRIOR,
+    fit_problem,
     left_out_residuals,
     normal_equations,
     robot_likelihood,
+    solve_problem,
 )
 from visioncal.estimation.variance import Components, Knowledge, _likelihood, estimate_sigmas
 from visioncal.simulation import CellOptions, fine_camera, simulate
@@ -29,82 +26,85 @@ LENS = pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens 
 
 def answered(given, **changes):
     known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
-    data = known.closure(known.used)
-    return data, fit_closure(data, known.solved.edges)
+    problem = known.problem(known.used)
+    return problem, fit_problem(problem, known.solved.state)
 
 
 @LENS
 def test_residuals_of_views_left_out_are_those_of_fits_without_them(given):
-    data, fit = answered(given, views=12, seed=3)
-    predicted = left_out_residuals(data.problem, fit.edges.state, fit.noise.levels)
-    linear = data.problem.linear(fit.edges.state)
-    spread = data.problem.total_covariance(linear, fit.noise.levels)
+    problem, fit = answered(given, views=12, seed=3)
+    predicted = left_out_residuals(problem, fit.state, fit.noise)
+    spread = problem.total_covariance(problem.linear(fit.state), fit.noise)
     for view in range(12):
         others = np.arange(12) != view
-        without, _ = solve_closure(data.subset(others), fit.edges, fit.noise)
-        refitted = data.problem.linear(without.state).residuals[view]
+        without, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
+        refitted = problem.linear(without).residuals[view]
         sigma = np.sqrt(np.diagonal(spread[view]))
         # To first order: what is left is the curvature over a step of the size of the noise.
         np.testing.assert_allclose(predicted[view], refitted, atol=0.01 * sigma.max())
 
 
-def doubled(data):
+def doubled(problem):
     """Every view twice, as two that know half as much each."""
-    again = np.repeat(np.arange(len(data)), 2)
-    return Closure(
-        data.mount,
-        data.robot[again],
-        data.camera[again],
-        2.0 * data.camera_covariance[again],
-        tuple(it.take(again).of_stops(again) for it in data.effects),
-    ), again
+    again = np.repeat(np.arange(len(problem)), 2)
+    seen = problem.observations.take(again)
+    return replace(
+        problem,
+        observations=replace(seen, covariance=2.0 * seen.covariance),
+        effects=tuple(it.take(again) for it in problem.effects),
+    )
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
-    data, fit = answered(False, views=8, seed=2, mount=mount)
+    problem, fit = answered(False, views=8, seed=2, mount=mount)
     arm = 1e-3 * np.random.default_rng(0).standard_normal((8, 6, 2))
     known = Knowledge(np.eye(2), np.zeros(2))
-    data = data.with_more(Effect.free("arm", known, by_flange={ROBOT: arm}))
-    once = replace(fit.edges, shared=data.unchanged)
-    twice, stops = doubled(data)
-    merged = twice.merged(stops)
-    for expected, seen in zip(
-        normal_equations(data.problem, once.state, fit.noise.levels),
-        normal_equations(merged.problem, once.state, fit.noise.levels),
-        strict=True,
-    ):
-        # The same sums in another order.
-        np.testing.assert_allclose(seen, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    errors = Effect.free("arm", known, by_flange={ROBOT: arm})
+    problem = problem.with_effects([*problem.effects, errors])
+    state = replace(fit.state, values=problem.start_values)
+    twice = doubled(problem)
+    assert len(twice.merged()) == 8
+    for other in (twice, twice.merged()):
+        for expected, seen in zip(
+            normal_equations(problem, state, fit.noise),
+            normal_equations(other, state, fit.noise),
+            strict=True,
+        ):
+            # The same sums in another order.
+            allowed = 1e-9 * np.abs(expected).max()
+            np.testing.assert_allclose(seen, expected, rtol=1e-6, atol=allowed)
 
 
 def test_views_of_a_stop_move_with_the_lens_by_their_information():
-    data, _ = answered(False, views=8, seed=2)
-    twice, stops = doubled(data)
+    problem, _ = answered(False, views=8, seed=2)
+    twice = doubled(problem)
     # The second view of each stop knows nothing to speak of, and says nonsense.
-    (effect,) = twice.effects
-    known, lens = twice.camera_covariance.copy(), effect.by_sensor.copy()
+    (effect,), seen = twice.effects, twice.observations
+    known, lens = seen.covariance.copy(), effect.by_sensor.copy()
     known[1::2] *= 1e12
     lens[1::2] *= -5.0
     lopsided = replace(
-        twice, camera_covariance=known, effects=(replace(effect, by_sensor=lens),)
-    ).merged(stops)
-    (seen,), (before,) = lopsided.effects, data.effects
-    np.testing.assert_allclose(seen.by_sensor, before.by_sensor, rtol=1e-6)
-    np.testing.assert_allclose(lopsided.camera_covariance, 2 * data.camera_covariance, rtol=1e-6)
+        twice,
+        observations=replace(seen, covariance=known),
+        effects=(replace(effect, by_sensor=lens),),
+    ).merged()
+    np.testing.assert_allclose(lopsided.by_sensor, problem.by_sensor, rtol=1e-6)
+    before = problem.observations.covariance
+    np.testing.assert_allclose(lopsided.observations.covariance, 2 * before, rtol=1e-6)
 
 
 @LENS
 def test_the_likelihood_slopes_as_its_differences_say(given):
-    data, fit = answered(given, views=10, seed=4)
-    edges = fit.edges.moved(np.full(12 + len(fit.edges.shared), 1e-5))
-    found = robot_likelihood(data.problem, edges.state, fit.noise.levels)
+    problem, fit = answered(given, views=10, seed=4)
+    state = fit.state.moved(np.full(problem.size, 1e-5))
+    found = robot_likelihood(problem, state, fit.noise)
     errors, slopes = found.reduced.errors, found.reduced.slopes[:, :, found.moving]
 
     def at(logs):
         return _likelihood(errors, slopes, found.components, found.known, logs, RATIO_PRIOR)
 
-    logs, step = np.log(2.0 * fit.noise.sigmas), 1e-4
+    logs, step = np.log(2.0 * fit.noise.robots[0]), 1e-4
     for level in range(2):
         shift = step * np.eye(2)[level]
         slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
