@@ -22,8 +22,10 @@ from test_kinematics import WRONG_LINKS, target_in_camera
 import visioncal
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.closure import ROBOT, Closure, Edges, Noise, solve_closure
+from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, fit_level
+from visioncal.estimation.problem import ROBOT, Noise, Problem, State
+from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
@@ -70,13 +72,13 @@ class World:
         """(m, 4, 4) what is on the flange in what stands still, as figaroh takes it."""
         return invert(self.poses) if self.in_hand else self.poses
 
-    def at(self, edges: Edges, flange: FloatArray) -> FloatArray:
+    def at(self, edges: FloatArray, flange: FloatArray) -> FloatArray:
         """(k, 4, 4) `cam_from_target` with (k, 4, 4) poses of the flange."""
-        return target_in_camera(self.cell.options.mount, edges.x, edges.z, flange)
+        return target_in_camera(self.cell.options.mount, *edges, flange)
 
     def truly(self, q: FloatArray) -> FloatArray:
         """(k, 4, 4) the true `cam_from_target` at (k, n) joint angles."""
-        edges = Edges(*self.cell.transforms.values(), np.zeros(0))
+        edges = np.array([*self.cell.transforms.values()])
         return self.at(edges, forward(self.cell.true_arm, q))
 
     def error_mm(self, predict: Predict) -> float:
@@ -90,7 +92,7 @@ class World:
         true, poses = self.truly(self.cell.joints), self.poses
         away = log(true @ invert(poses)) if inverted else log(invert(true) @ poses)
         square = np.mean(away**2, axis=0)
-        return Noise(float(np.sqrt(square[:3].mean())), float(np.sqrt(square[3:].mean())))
+        return Noise(np.sqrt(square.reshape(1, 2, 3).mean(axis=2)), np.zeros(0))
 
 
 def of_figaroh(world: World) -> dict[str, Found]:
@@ -103,7 +105,7 @@ def of_figaroh(world: World) -> dict[str, Found]:
     settings = {
         PLAIN: Settings(of_example, {"method": "structural"}),
         TOLD[0]: Settings(
-            (1.0 / noise.sigma_m, 1.0 / noise.sigma_rad),
+            tuple(1.0 / noise.robots[0, ::-1]),
             {"method": "map", "priors": told, "noise_std": 1.0},
         ),
         UNTOLD[0]: Settings(of_example, {"method": "map_cv"}),
@@ -135,37 +137,35 @@ def of_our_fit(world: World, *, told: bool) -> Found:
     return lambda q: world.at(edges, model.robot.base_from_flange(q)), min(seconds)
 
 
-def fitted(world: World, noise: Noise | None) -> tuple[Edges, ArmModel]:
+def fitted(world: World, noise: Noise | None) -> tuple[FloatArray, ArmModel]:
     """Both edges and the arm; noise and sizes are estimated where the noise is not told."""
     cell, q = world.cell, world.cell.joints
     model = ArmModel.of(load_robot(cell.options.robot), q, cell.base_from_flange)
     basis = model.columns("links", q)
-    start = SOLVERS["shah"](_chain(world, cell.base_from_flange).robot, world.poses)
-    edges = Edges(start.x, start.z, np.zeros(0))
+    start = SOLVERS["shah"](robot_part(cell.base_from_flange, cell.options.mount), world.poses)
+    edges = np.stack([start.x, start.z])
     errors = {"links": ArmErrors(basis, SIZE_RAD, 0.0, of_links=True)}
     if noise is None:
-        problem = _chain(world, cell.base_from_flange).problem
-        level = fit_level(
-            ArmTrials(problem, edges.state, ROBOT, {"links": basis}), LEVELS["geometry"]
-        )
+        state = State(edges, np.zeros(0))
+        trials = ArmTrials(_chain(world, cell.base_from_flange), state, ROBOT, {"links": basis})
+        level = fit_level(trials, LEVELS["geometry"])
         if level is None:
             raise RuntimeError("the arm's errors do not show")
-        errors, noise = dict(level.errors), Noise(*level.fit.noise.robots[0].tolist())
-        edges = Edges(*level.fit.state.edges, level.fit.state.values)
+        errors, noise, edges = dict(level.errors), level.fit.noise, level.fit.state.edges
     model = model.erring(errors)
     while True:
-        data = _chain(world, model.robot.base_from_flange(q))
-        arm = replace(errors["links"], basis=model.basis(q)).effect("robot", values=model.values)
-        still = replace(edges, shared=np.zeros_like(model.values))
-        edges, _ = solve_closure(data.with_more(arm), still, noise)
-        model = model.moved(edges.shared)
-        if np.abs(edges.shared).max() < AT_REST_RAD:
+        arm = replace(errors["links"], basis=model.basis(q)).effect(ROBOT, values=model.values)
+        still = np.zeros_like(model.values)
+        problem = _chain(world, model.robot.base_from_flange(q))
+        problem = problem.with_effects([replace(arm, values=still)])
+        state, _ = solve_problem(problem, State(edges, still), noise)
+        edges, model = state.edges, model.moved(state.values)
+        if np.abs(state.values).max() < AT_REST_RAD:
             return edges, model
 
 
-def _chain(world: World, flange: FloatArray) -> Closure:
-    robot = flange if world.in_hand else invert(flange)
-    return Closure(world.cell.options.mount, robot, world.poses)
+def _chain(world: World, flange: FloatArray) -> Problem:
+    return chain(world.cell.options.mount, flange, world.poses)
 
 
 def from_poses(world: World) -> Found:
@@ -175,7 +175,7 @@ def from_poses(world: World) -> Found:
     begun = process_time()
     result = visioncal.calibrate(session)
     seconds = process_time() - begun
-    edges = Edges(*(result.edges[name].matrix for name in world.cell.transforms), np.zeros(0))
+    edges = np.array([result.edges[name].matrix for name in world.cell.transforms])
     return lambda q: world.at(edges, result.base_from_flange(q).as_matrix()), seconds
 
 
@@ -186,7 +186,7 @@ def from_corners(world: World) -> Found:
     seconds = process_time() - begun
     if known.arm_model is None:
         raise RuntimeError("the arm stayed nominal")
-    edges, robot = known.solved.edges, known.arm_model.robot
+    edges, robot = known.solved.state.edges, known.arm_model.robot
     return lambda q: world.at(edges, robot.base_from_flange(q)), seconds
 
 

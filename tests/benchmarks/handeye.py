@@ -333,9 +333,8 @@ def real_folds(path: Path, repeats: int) -> tuple[float, float]:
             for stage in STAGES:
                 if stage.name in ("look", "agree", "refine", "hand-eye"):
                     fitted = stage.run(fitted)
-            edges = fitted.solved.edges
-            left = fitted.closure(views[fold].tolist()).under(edges.shared)
-            away.append(log(invert(edges.z) @ left.placed(edges.x)))
+            left = fitted.problem(views[fold].tolist())
+            away.append(log(left.change_of(left.observations.observed[0], fitted.solved.state)))
     error = np.concatenate(away)
     return (
         1e3 * float(np.sqrt(np.mean(np.sum(error[:, 3:] ** 2, axis=1)))),

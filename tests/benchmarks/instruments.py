@@ -21,8 +21,9 @@ from tracked import (
     solved_of,
 )
 
-from visioncal.estimation.closure import Edges, fit_closure
 from visioncal.estimation.positions import fit_mounting
+from visioncal.estimation.problem import State
+from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.workspace import postures
 from visioncal.pipeline.known import Known
 from visioncal.session import Session
@@ -185,10 +186,10 @@ def example(size: float, seed: int) -> Tracked:
 def before_mm(size: float, seed: int) -> float:
     """How far the nominal arm is off at its stops, frames fitted [mm]."""
     known = solved_of(session_of(tracked(example(size, seed))), level="hand-eye")
-    edges, nominal = known.solved.edges, replace(known.closure(known.used), effects=())
-    fit = fit_closure(nominal, Edges(edges.x, edges.z, np.zeros(0)))
-    away = nominal.placed(fit.edges.x)[:, :3, 3] - fit.edges.z[:3, 3]
-    return 1e3 * rms(np.linalg.norm(away, axis=1))
+    nominal = known.problem(known.used).with_effects([])
+    fit = fit_problem(nominal, State(known.solved.state.edges, np.zeros(0)))
+    place = nominal.change_of(nominal.observations.observed[0], fit.state)[:, :3, 3]
+    return 1e3 * rms(np.linalg.norm(place, axis=1))
 
 
 def parameter_conditions(shop: Shop) -> tuple[float, float, float, float]:

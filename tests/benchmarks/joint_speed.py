@@ -13,10 +13,12 @@ from dataclasses import replace
 import numpy as np
 from results import few, need, write_section
 
-from visioncal.estimation.closure import Closure, Edges, Noise, solve_closure
+from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.poses import fit_poses
+from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.solve import solve_problem
 from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
 from visioncal.targets import corner_positions
 from visioncal.threads import one_blas_thread
@@ -26,7 +28,7 @@ from visioncal.types import FloatArray
 need("pyceres", "pyceres")
 import pyceres  # noqa: E402
 
-PIXEL_PX, NOISE = 0.1, Noise(5e-5, 3e-5)
+PIXEL_PX, NOISE = 0.1, Noise.of_robot(5e-5, 3e-5)
 REPEATS = few(15, 1)
 
 
@@ -47,7 +49,7 @@ def cell_of(seed: int) -> Cell:
 class ViewCost(pyceres.CostFunction):
     """One view's corners: 2 n residuals by x, z and the flange's error, all as right steps."""
 
-    def __init__(self, stack: CornerStack, cell: Cell, robot: FloatArray, start: Edges) -> None:
+    def __init__(self, stack: CornerStack, cell: Cell, robot: FloatArray, start: State) -> None:
         pyceres.CostFunction.__init__(self)
         self.stack, self.camera, self.robot, self.start = stack, cell.options.camera, robot, start
         self.set_num_residuals(2 * len(stack.px))
@@ -57,8 +59,8 @@ class ViewCost(pyceres.CostFunction):
         """Fills in residuals and derivatives, as Ceres asks for them."""
         steps = np.array(parameters)
         by_x, by_z, by_flange = exp(steps)
-        from_x = self.start.x @ by_x
-        pose = invert(self.robot @ by_flange @ from_x) @ self.start.z @ by_z
+        from_x, z = self.start.edges @ [by_x, by_z]
+        pose = invert(self.robot @ by_flange @ from_x) @ z
         at = reproject(self.stack, self.camera, pose[None], lens=False)
         residuals[:] = at.residuals.ravel() / PIXEL_PX
         if jacobians is not None:
@@ -75,11 +77,11 @@ class ViewCost(pyceres.CostFunction):
         return True
 
 
-def by_pyceres(cell: Cell, stacks: list[CornerStack], start: Edges) -> Edges:
+def by_pyceres(cell: Cell, stacks: list[CornerStack], start: State) -> State:
     problem = pyceres.Problem()
     x, z = np.zeros(6), np.zeros(6)
     flanges = [np.zeros(6) for _ in stacks]
-    spread = np.diag(np.repeat(NOISE.sigmas**2, 3))
+    spread = np.diag(np.repeat(NOISE.robots[0] ** 2, 3))
     for stack, robot, flange in zip(stacks, cell.base_from_flange, flanges, strict=True):
         problem.add_residual_block(ViewCost(stack, cell, robot, start), None, [x, z, flange])
         prior = pyceres.factors.NormalPrior(np.zeros(6), spread)
@@ -89,19 +91,20 @@ def by_pyceres(cell: Cell, stacks: list[CornerStack], start: Edges) -> Edges:
     options.minimizer_progress_to_stdout = False
     options.num_threads = 1
     pyceres.solve(options, problem, pyceres.SolverSummary())
-    return Edges(start.x @ exp(x), start.z @ exp(z), start.shared)
+    return start.moved(np.concatenate([x, z]))
 
 
-def by_visioncal(cell: Cell, stack: CornerStack, start: Edges) -> Edges:
+def by_visioncal(cell: Cell, stack: CornerStack, start: State) -> State:
     with one_blas_thread():
-        predicted = invert(cell.base_from_flange @ start.x) @ start.z
+        x, z = start.edges
+        predicted = invert(cell.base_from_flange @ x) @ z
         fit = fit_poses(stack, cell.options.camera, predicted)
         spread = PIXEL_PX**2 * covariance(fit.information)
-        data = Closure("eye-in-hand", cell.base_from_flange, fit.cam_from_target, spread)
-        return solve_closure(data, start, NOISE)[0]
+        problem = chain("eye-in-hand", cell.base_from_flange, fit.cam_from_target, spread)
+        return solve_problem(problem, start, NOISE)[0]
 
 
-def seconds(solve: Callable[[], Edges]) -> float:
+def seconds(solve: Callable[[], State]) -> float:
     begun = time.perf_counter()
     solve()
     return time.perf_counter() - begun
@@ -116,10 +119,10 @@ def main() -> None:
         stack = CornerStack.of({it.view: it for it in cell.corners}, positions)
         stacks = [CornerStack.of({it.view: it}, positions) for it in cell.corners]
         rng = np.random.default_rng(seed)
-        x, z = (it @ exp(2e-3 * rng.standard_normal(6)) for it in cell.transforms.values())
-        start = Edges(x, z, np.zeros(0))
+        start = State(np.stack([*cell.transforms.values()]), np.zeros(0))
+        start = start.moved(2e-3 * rng.standard_normal(12))
         ours, theirs = by_visioncal(cell, stack, start), by_pyceres(cell, stacks, start)
-        apart = np.linalg.norm(log(invert(theirs.x) @ ours.x)[3:])
+        apart = np.linalg.norm(log(invert(theirs.edges[0]) @ ours.edges[0])[3:])
         times = np.array(
             [
                 (

@@ -19,7 +19,8 @@ from cells import calibrated, known_of
 from results import first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.estimation.closure import Edges, Noise, solve_closure
+from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
@@ -95,16 +96,18 @@ def without_blocks(cell: Cell, **changes: object) -> Known:
 
 def corners_alone(known: Known) -> Known:
     """The same unknowns with the robot's stops taken for exact: a fit of reprojection alone."""
-    exact = Noise(1e-6, 1e-6)
+    exact = Noise.of_robot(1e-6, 1e-6)
     for _ in range(6):
         model = known.arm_model
         if model is None:
             break
         known = known.with_arm_errors()
-        data, start = known.closure(known.used).merged(known.stops), known.solved.edges
-        edges = solve_closure(data, Edges(start.x, start.z, data.unchanged), exact)[0]
-        step = edges.shared[len(edges.shared) - len(model.values) :]
-        solved = replace(known.solved, edges=edges)
+        problem, fit = known.problem(known.used), known.solved.fit
+        problem = problem.merged(problem.of_one_stop)
+        state = State(fit.state.edges, problem.start_values)
+        state = solve_problem(problem, state, exact)[0]
+        step = state.values[len(state.values) - len(model.values) :]
+        solved = replace(known.solved, problem=problem, fit=replace(fit, state=state))
         known = replace(known, arm_model=model.moved(step), hand_eye=solved)
     return known
 
