@@ -143,17 +143,6 @@ class Effect:
             concerned=None if self.concerned is None else self.concerned[rows],
         )
 
-    def only(self, columns: slice) -> "Effect":
-        """Returns some of its values alone, as if nothing were open about the others."""
-        return replace(
-            self,
-            values=self.values[columns],
-            known=Knowledge(self.known.information[columns, columns], self.known.pull[columns]),
-            held=self.held[columns],
-            by_sensor=None if self.by_sensor is None else self.by_sensor[:, :, columns],
-            by_flange={name: it[:, :, columns] for name, it in self.by_flange.items()},
-        )
-
     def carried(self, by: FloatArray) -> "Effect":
         """Returns it for poses measured elsewhere on what was observed, by (n, 6, 6) adjoints."""
         return self if self.by_sensor is None else replace(self, by_sensor=by @ self.by_sensor)

@@ -11,9 +11,7 @@ from visioncal.calibration import CameraResult, Rms, Verdict
 from visioncal.estimation.appearance import Free
 from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.boards import Boards
-from visioncal.estimation.chain import chain, edge_names, robot_part
-from visioncal.estimation.closure import Closure
+from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.problem import ROBOT, FramePrior, Problem
 from visioncal.estimation.scene import Scene
 from visioncal.guess.joints import JointReading
@@ -214,39 +212,6 @@ class Known(Observed):
         """What is known of the edges besides; a closed form has no use for it."""
         return priors_of(self.session) if self.solver == "joint" else ()
 
-    def closure(self, views: Sequence[int]) -> Closure:
-        """The chain's known parts for some views, each with its first or chosen pose."""
-        mount, poses = self.session.mount, [self.poses[view] for view in views]
-        robot = self.flange_poses(views)
-        data = Closure(
-            mount,
-            robot_part(robot, mount),
-            np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
-            priors=self.priors,
-        )
-        if self.readings is not None and poses:
-            data = self.readings.told_to(data, poses)
-        elif poses and all(pose.corners is not None for pose in poses):
-            shift = [pose.by_shared[0] for pose in poses]
-            data = replace(
-                data,
-                camera_covariance=np.array([pose.covariance[0] for pose in poses]),
-                effects=() if self.free is None else (self.free.effect(np.array(shift)),),
-            )
-        elif self.free is not None and len(self.free.columns):
-            # Poses that others have measured do not move with lens and board.
-            still = np.zeros((len(poses), 6, len(self.free.columns)))
-            data = data.with_more(self.free.effect(still))
-        data = self.shown(views).brought(data)
-        if self.clock is not None and self.clock.speeds and poses:
-            data = data.with_more(*map(self.shown(views).carried, self.clock.effects(views)))
-        if self.thermal is not None and self.heated_by is not None and poses:
-            data = data.with_more(self.thermal.effect(self._thermal_stops(views), self.heated_by))
-        if self.arm is not None and self.arm.is_estimated and poses:
-            errors = replace(self.arm, basis=self.arm_basis(views))
-            data = data.with_more(errors.effect(ROBOT, values=self.arm_values))
-        return data
-
     def problem(self, views: Sequence[int]) -> Problem:
         """What some views measured, each with its first or chosen pose."""
         poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
@@ -296,39 +261,18 @@ class Known(Observed):
 
     def framed(self, edges: FloatArray) -> dict[str, FloatArray]:
         """Where frames are, by (1 + b, 4, 4) edges of the camera and the chain's boards."""
-        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
-        return dict(zip([camera, *map(self.frame_of, self.boards)], edges, strict=True))
+        frames = (self.camera_frame, *map(self.frame_of, self.boards))
+        return dict(zip(frames, edges, strict=True))
 
     @property
-    def edges(self) -> FloatArray:
-        """(1 + b, 4, 4) of the camera and the chain's boards."""
-        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
-        return np.array([self.frames[it] for it in (camera, *map(self.frame_of, self.boards))])
-
-    @property
-    def from_first(self) -> FloatArray:
-        """(b, 4, 4) where the chain's boards lie: `target_k_from_target_1`."""
-        if len(self.boards) < 2 or not self.frames:
-            return np.eye(4)[None]
-        placed = self.edges[1:]
-        return np.asarray(invert(placed) @ placed[0])
+    def camera_frame(self) -> str:
+        """The frame of the camera, or of the instrument."""
+        return edge_names(self.session.mount)[0].partition("_from_")[2]
 
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""
         first = np.unique(self.stops_of(views), return_index=True)[1]
         return [views[it] for it in first.tolist()]
-
-    def shown(self, views: Sequence[int]) -> Boards:
-        """The boards of some views, all of which the chain holds."""
-        names = tuple(self.session.boards) or ("",)
-        shown = [self.boards.index(self.poses[view].board) for view in views]
-        looks = 0 if self.free is None else len(self.free.columns)
-        return Boards(
-            tuple(names[it] for it in self.boards),
-            np.array(shown, dtype=np.int64),
-            self.from_first,
-            looks,
-        )
 
     def flange_poses(self, views: Sequence[int]) -> FloatArray:
         """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""

@@ -229,7 +229,7 @@ def _held_back_poses(known: Known) -> Iterator[ViewPoses]:
         poses = known.poses[view]
         robot = robot_part(known.flange_poses([view]), mount)[0]
         z = known.frames[known.frame_of(poses.board)]
-        predicted = invert(robot @ known.edges[0]) @ z
+        predicted = invert(robot @ known.frames[known.camera_frame]) @ z
         yield choose_by(poses, predicted, targets[poses.board] if targets else None)
 
 

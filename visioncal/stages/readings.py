@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.closure import Closure, Edges
 from visioncal.estimation.positions import (
     Mounting,
     Places,
@@ -115,17 +114,6 @@ class Readings:
         size = columns.shape[2]
         nothing = Knowledge(np.zeros((size, size)), np.zeros(size))
         return [Effect.free("points", nothing, columns)]
-
-    def told_to(self, data: Closure, poses: Sequence[ViewPoses]) -> Closure:
-        """Adds to a chain what is known of the poses, which are those of `poses`."""
-        spread = np.array([it.covariance[0] for it in poses])
-        guess = None
-        if self.mounting is not None:
-            x, z = self.mounting.edges
-            guess = Edges(x, z, np.zeros(0))
-        return replace(
-            data, camera_covariance=spread, guess=guess, effects=tuple(self.effects(poses))
-        )
 
     def moved(self, state: State) -> "Readings":
         """Returns the readings with what a fit found of the mounting."""
