@@ -214,7 +214,7 @@ def test_one_of_two_boards_that_moved_is_named():
     pushed = replace(moved.problem, observations=replace(seen, measured=measured))
     found = check(replace(moved, problem=pushed), footing)
     assert names(found) == [f"board {tuple(footing.targets)[1]}"]
-    axes = footing.edges[1 + footing.boards.index(1), :3, :3]
+    axes = footing.state.edges[1 + footing.boards.index(1), :3, :3]
     assert sentences(found)[0].endswith(f"along the base's {_signed_axis(axes[:, 1])}.")
     with pytest.raises(DataError, match="several boards") as refused:
         check(moved, footing, board_placed_anew=True)

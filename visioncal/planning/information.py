@@ -58,8 +58,8 @@ class Recorded:
     Attributes:
         problem: The stops, without errors of the arm. Of its effects, what lens and boards leave
             open comes first.
-        edges: Those of the problem, the camera's first.
-        board: The frame of the board that is planned for.
+        edges: Those of the problem: the camera's, that of the board that is planned for, and those
+            of further boards.
         free: Lens and boards as the views see them.
         q: (s, n) joint angles of the stops [rad]; None where they are not known.
         noise: Of the robot at the stops.
@@ -70,7 +70,6 @@ class Recorded:
 
     problem: Problem
     edges: FloatArray
-    board: str
     free: Free
     q: FloatArray | None
     noise: Noise
@@ -85,8 +84,8 @@ class Recorded:
 
     def edges_in(self, cell: PlanCell) -> FloatArray:
         """The edges where a cell is guessed to be; further boards go with the one planned for."""
-        before = self.edges[self.problem.unknown[self.board]]
-        return np.concatenate([cell.x[None], cell.z @ invert(before) @ self.edges[1:]])
+        boards = cell.z @ invert(self.edges[1]) @ self.edges[1:]
+        return np.concatenate([cell.x[None], boards])
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,14 +322,13 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) 
     problem = _erring(cell, purpose, recorded.problem, at, recorded.arm)
     state = State(recorded.edges_in(cell), problem.start_values)
     found = fisher_information(problem, state, recorded.noise)
-    edges, every = 6 * len(problem.unknown), np.arange(problem.size)
+    edges = 6 * len(problem.unknown)
     found[edges:, edges:] -= _of_effects(problem)
-    kept = np.concatenate([every[:6], every[problem.edge_columns(recorded.board)], every[edges:]])
     # Further boards lie anywhere: what is left once they are eliminated is known of all else.
-    others = np.setdiff1d(every, kept)
-    cross = found[np.ix_(others, kept)]
-    taken = cross.T @ np.linalg.solve(found[np.ix_(others, others)], cross)
-    return np.asarray(found[np.ix_(kept, kept)] - taken)
+    further = slice(12, edges)
+    cross = np.delete(found[further], further, axis=1)
+    taken = cross.T @ np.linalg.solve(found[further, further], cross)
+    return np.delete(np.delete(found, further, axis=0), further, axis=1) - taken
 
 
 def _erring(

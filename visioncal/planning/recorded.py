@@ -125,12 +125,10 @@ def begin(
         raise _lacking(known)
     first = known.first_of_stops(known.used)
     # The arm's own errors are the purpose's business: they are put in again with its priors.
-    problem = replace(known, arm=None).problem(known.used)
-    problem = problem.merged(problem.of_one_stop)
-    board = known.frame_of(known.boards[0])
+    problem = replace(known, arm=None).problem(known.used).merged()
     with one_blas_thread():
         state, noise = _start(known, problem, guess)
-        edges, spread = _nearest(problem, state, noise, known, guess)
+        edges, spread = _nearest(problem, state, noise, known.session.mount, guess)
     sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
         raise _too_vague(known)
@@ -140,7 +138,7 @@ def begin(
         free.appearance.camera,
         targets[known.boards[0]],
         edges[0],
-        edges[problem.unknown[board]],
+        edges[1],
         float(sigmas[0]),
         float(sigmas[1]),
         noise,
@@ -154,7 +152,6 @@ def begin(
     recorded = Recorded(
         problem,
         edges,
-        board,
         free,
         q,
         noise,
@@ -192,29 +189,26 @@ def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, 
 
 
 def _nearest(
-    problem: Problem, state: State, noise: Noise, known: Known, guess: Guess | None
+    problem: Problem, state: State, noise: Noise, mount: Mount, guess: Guess | None
 ) -> tuple[FloatArray, FloatArray]:
     """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two.
 
     These are the camera's and that of the board that is planned for.
     """
-    pair = [0, problem.unknown[known.frame_of(known.boards[0])]]
-    size = 6 * len(problem.unknown)
-    both = np.arange(size).reshape(-1, 6)[pair].ravel()
     weights = np.zeros((problem.size, problem.size))
-    weights[both, both] = _weights(known.session.mount, guess)
+    weights[:12, :12] = np.diag(_weights(mount, guess))
     for _ in range(_STEPS):
         information, gradient = normal_equations(problem, state, noise)
         away = np.zeros(problem.size)
-        away[both] = _away(state.edges[pair], guess)
+        away[:12] = _away(state.edges[:2], guess)
         step = -covariance_among(information + weights, problem.moving) @ (
             gradient + weights @ away
         )
         # What is shared has settled before; it may follow, but it does not move.
-        step[size:] = 0.0
+        step[6 * len(state.edges) :] = 0.0
         state = state.moved(step)
     spread = covariance_among(fisher_information(problem, state, noise) + weights, problem.counted)
-    return state.edges, spread[np.ix_(both, both)]
+    return state.edges, spread[:12, :12]
 
 
 def _weights(mount: Mount, guess: Guess | None) -> FloatArray:

@@ -125,7 +125,7 @@ def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
     """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
     if seen.stops < 2:
         return
-    away, placed = log(seen.away(footing)), footing.edges[1:][seen.boards]
+    away, placed = log(seen.away(footing)), footing.state.edges[1:][seen.boards]
     for stop in range(seen.stops):
         mine = seen.problem.observations.stops == stop
         first = int(np.argmax(mine))

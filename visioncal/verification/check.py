@@ -136,10 +136,10 @@ def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> C
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
         moved = mean_transform(seen.away(footing))
-        footing = footing.placed_anew(footing.edges[1] @ moved, _ANYWHERE)
+        footing = footing.placed_anew(footing.state.edges[1] @ moved, _ANYWHERE)
     belief = Belief(
-        seen.state(footing),
-        seen.covariance(footing),
+        footing.state,
+        footing.covariance,
         footing.noise(from_corners=seen.from_corners),
         footing.freedom,
     )

@@ -18,7 +18,7 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.problem import Noise, State
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document
@@ -39,8 +39,8 @@ class Footing:
         calibration: Whose.
         targets: What was printed, by the session's names for it; that of an only one is empty.
         boards: (b,) places among the targets, of those that were placed.
-        edges: (1 + b, 4, 4) of the camera and of these boards.
-        values: (k,) of what all stops share: lens and boards, then the arm.
+        state: The edges of the camera and of these boards, and the k values of what all stops
+            share: lens and boards, then the arm.
         covariance: (6 + 6 b + k, 6 + 6 b + k) of edges and values.
         looks: (l,) which values of lens and board are among them.
         arm: What the last of them are errors of.
@@ -51,8 +51,7 @@ class Footing:
     calibration: Calibration
     targets: Mapping[str, Target]
     boards: tuple[int, ...]
-    edges: FloatArray
-    values: FloatArray
+    state: State
     covariance: FloatArray
     looks: tuple[int, ...]
     arm: ArmKind
@@ -140,7 +139,8 @@ class Footing:
         spread = self.covariance.copy()
         spread[6:12], spread[:, 6:12] = 0.0, 0.0
         spread[6:12, 6:12] = np.diag(sigmas**2)
-        return replace(self, edges=np.stack([self.edges[0], z]), covariance=spread)
+        moved = replace(self.state, edges=np.stack([self.state.edges[0], z]))
+        return replace(self, state=moved, covariance=spread)
 
 
 def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
@@ -160,8 +160,10 @@ def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
         calibration,
         targets,
         tuple(list(targets).index(it) for it in names) if targets else (0,),
-        np.stack([calibration.edges[x_name].matrix, *placed]),
-        np.concatenate([np.zeros(len(looks)), np.array(arm["values"], dtype=float)]),
+        State(
+            np.stack([calibration.edges[x_name].matrix, *placed]),
+            np.concatenate([np.zeros(len(looks)), np.array(arm["values"], dtype=float)]),
+        ),
         slopes @ spread @ slopes.T,
         looks,
         arm["of"],

@@ -39,14 +39,12 @@ class Seen:
     Attributes:
         known: What is known of the session, with the calibration's lens, boards and arm.
         problem: The m sights of a board at a stop, with the calibration's unknowns.
-        places: (e,) those of its edges among the calibration's.
         views: (m,) the views of each sight.
         warnings: What is odd, in sentences.
     """
 
     known: Known
     problem: Problem
-    places: IntArray
     views: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...]
 
@@ -65,22 +63,11 @@ class Seen:
     @property
     def boards(self) -> IntArray:
         """(m,) which of the calibration's boards each sight is of."""
-        observed = self.problem.observations.observed
-        return np.array([self.places[self.problem.unknown[it]] - 1 for it in observed])
-
-    def state(self, footing: Footing) -> State:
-        """The unknowns as the calibration has them."""
-        return State(footing.edges[self.places], footing.values)
-
-    def covariance(self, footing: Footing) -> FloatArray:
-        """(p, p) of them."""
-        edges = (6 * self.places[:, None] + np.arange(6)).ravel()
-        rows = np.concatenate([edges, np.arange(6 * len(footing.edges), len(footing.covariance))])
-        return np.asarray(footing.covariance[np.ix_(rows, rows)])
+        return np.array([self.problem.unknown[it] - 1 for it in self.problem.observations.observed])
 
     def away(self, footing: Footing) -> FloatArray:
         """(m, 4, 4) by how much its board has moved, on its right, as each sight places it."""
-        return asked_of_boards(self.problem, self.state(footing))
+        return asked_of_boards(self.problem, footing.state)
 
     @property
     def from_corners(self) -> bool:
@@ -143,11 +130,10 @@ def seen_by(known: Known, footing: Footing) -> Seen:
     known = _with_arm(known, footing)
     known = _posed(known, footing)
     problem = known.problem(known.used)
-    sights, order = problem.of_one_stop, list(known.frames)
+    sights = problem.of_one_stop
     return Seen(
         known,
-        problem.merged(sights),
-        np.array([order.index(it) for it in problem.unknown]),
+        problem.merged(),
         tuple(tuple(np.array(known.used)[sights == at].tolist()) for at in range(sights.max() + 1)),
         tuple(_warnings(known, footing)),
     )
@@ -181,7 +167,7 @@ def _with_arm(known: Known, footing: Footing) -> Known:
 def _posed(known: Known, footing: Footing) -> Known:
     """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
     mount, targets = known.session.mount, tuple(footing.targets.values())
-    x, *placed = footing.edges
+    x, *placed = footing.state.edges
     order = {board: at for at, board in enumerate(footing.boards)}
     views, chosen = [], []
     for view in (it.number for it in known.session.views):
@@ -199,7 +185,7 @@ def _posed(known: Known, footing: Footing) -> Known:
             culprits=known.lost_views,
         )
     known = replace(known, used=tuple(views), boards=footing.boards, free=footing.free)
-    known = replace(known, frames=known.framed(footing.edges)).posed(chosen)
+    known = replace(known, frames=known.framed(footing.state.edges)).posed(chosen)
     if known.free is not None and all(it.corners is not None for it in chosen):
         known = known.with_noise(_noise_px(known)).posed(chosen)
     return _with_errors(known, footing)

@@ -141,7 +141,7 @@ def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
 
 
 def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> Motion:
-    x, *boards = check.footing.edges
+    x, *boards = check.footing.state.edges
     hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
         rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if hand else "base"
