@@ -16,7 +16,7 @@ from visioncal.planning.information import worlds_of
 from visioncal.planning.purposes import PURPOSES
 from visioncal.planning.recorded import SoFar, begin
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import Cell, CellOptions, Second, simulate
 from visioncal.transforms import compose, exp, invert, log
 
 SIGMA_M = 5e-4
@@ -95,6 +95,23 @@ def test_what_was_measured_of_the_target_helps_as_well(mount):
     # Four sigma, for twelve numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     assert sum("was used" in it for it in known.notes) == 3
+
+
+def test_a_board_of_several_may_be_known_whole():
+    options = CellOptions(robot="ur5e", motion="one_axis", views=12, second=Second(), seed=2)
+    cell = simulate(options)
+    name = "base_from_target_second"
+    edge = cell.transforms[name]
+    turn = Rotation.from_matrix(edge[:3, :3]).as_quat().tolist()
+    prior = dict(zip(("x_m", "y_m", "z_m"), edge[:3, 3].tolist(), strict=True))
+    prior |= {"sigma_m": SIGMA_M, "quaternion_xyzw": turn, "sigma_rad": 1e-5}
+    known = run(cell, {name: prior})
+    sigmas = np.sqrt(np.diag(known.solved.covariance)[:18])
+    # Four sigma, for eighteen numbers.
+    assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
+    # The board is turned no farther than that is known.
+    assert sigmas[6 + 6 * known.boards.index(1) :][:3].max() < 1.001e-5
+    assert sum("was used" in it and name in it for it in known.notes) == 3
 
 
 def test_a_measurement_that_good_data_contradict_is_told_and_hardly_moves_the_answer():

@@ -2,17 +2,13 @@
 
 from collections.abc import Mapping
 
-from scipy.spatial.transform import Rotation
-
 from visioncal.errors import DataError
 from visioncal.estimation.problem import FramePrior, Problem
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.tree import Tree
 from visioncal.files import did_you_mean
 from visioncal.session.tables import PriorTable
-from visioncal.stages.measured import axes_of, components
-
-_BETWEEN = "_from_"
+from visioncal.stages.measured import components, prior_of
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
@@ -29,7 +25,8 @@ def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior,
 
 
 def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
-    first, _, second = name.partition(_BETWEEN)
+    found = prior_of(name, table)
+    first, second = found.first, found.second
     label = f"session.toml: prior.{name}"
     for frame in (first, second):
         if frame not in tree.branches:
@@ -48,11 +45,7 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
             culprits=[label],
             next_step="State where two frames are that stand in the cell, or on one flange.",
         )
-    axes, values = axes_of(table)
-    if table.quaternion_xyzw is None or table.sigma_rad is None:
-        return FramePrior(first, second, axes, values, table.sigma_m)
-    rotation = Rotation.from_quat(table.quaternion_xyzw).as_matrix()
-    return FramePrior(first, second, axes, values, table.sigma_m, rotation, table.sigma_rad)
+    return found
 
 
 def most_contradicted(problem: Problem, solution: Solution) -> FramePrior | None:

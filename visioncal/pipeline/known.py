@@ -26,7 +26,7 @@ from visioncal.stages.handeye import HandEyeResult
 from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
 from visioncal.stages.kinematics import Kinematics
-from visioncal.stages.measured import priors_of
+from visioncal.stages.measured import prior_of
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
@@ -210,7 +210,16 @@ class Known(Observed):
     @property
     def priors(self) -> tuple[FramePrior, ...]:
         """What is known of the edges besides; a closed form has no use for it."""
-        return priors_of(self.session) if self.solver == "joint" else ()
+        tables = self.session.declaration.prior if self.solver == "joint" else {}
+        return tuple(
+            prior_of(it, tables[it]) for it in self.edge_names(self.boards) if it in tables
+        )
+
+    def edge_names(self, boards: Iterable[int]) -> tuple[str, ...]:
+        """The names of the edges of the camera and of some of the session's boards."""
+        camera, target = edge_names(self.session.mount)
+        parent = target.partition("_from_")[0]
+        return (camera, *(f"{parent}_from_{self.frame_of(it)}" for it in boards))
 
     def problem(self, views: Sequence[int]) -> Problem:
         """What some views measured, each with its first or chosen pose."""

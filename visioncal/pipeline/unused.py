@@ -2,23 +2,19 @@
 
 from collections.abc import Iterator
 
-from visioncal.estimation.chain import edge_names
 from visioncal.pipeline.known import Known
 
 
 def not_used(known: Known) -> Iterator[str]:
     """Says what the session declares and this version leaves aside."""
     session = known.session
-    names = edge_names(session.mount)
-    used = [it.name for it in known.priors]
+    names = known.edge_names(range(max(len(session.boards), 1)))
     for edge in session.declaration.prior:
-        if edge in used:
+        if edge in names and known.solver == "joint":
             continue
         reason = f"what is unknown of this session is {' and '.join(names)}"
         if known.solver != "joint":
             reason = f"the closed form {known.solver} cannot"
-        elif edge in names:
-            reason = "the session has several targets"
         yield f"[prior.{edge}] was not used: {reason}."
     readings = sum(view.reading_m is not None for view in session.views)
     if readings and session.mount != "instrument":

@@ -234,15 +234,11 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
     """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
     yield from _unknown_keys(declaration, "", label)
-    for edge, prior in declaration.prior.items():
-        if not declaration.is_network and edge not in _EDGES:
-            hint = did_you_mean(edge, _EDGES)
+    edges = [*_EDGES, *(f"{it}_{name}" for it in _EDGES for name in declaration.targets)]
+    for edge in declaration.prior:
+        if not declaration.is_network and edge not in edges:
+            hint = did_you_mean(edge, edges)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
-        elif not declaration.is_network and prior.quaternion_xyzw is not None:
-            yield (
-                f"{label}: prior.{edge}.quaternion_xyzw is ignored: with one camera and one robot "
-                "a prior is of places alone."
-            )
     if declaration.camera is not None:
         yield from _camera_warnings(declaration.camera, f"{label}: camera")
     for name, camera in declaration.cameras.items():

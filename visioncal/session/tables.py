@@ -80,7 +80,7 @@ class ClockTable(TableModel):
 class PriorTable(TableModel):
     """`[prior.A_from_B]`. Measured components of where frame B is in A, to sigma_m [m].
 
-    quaternion_xyzw: its rotation, to sigma_rad about each axis [rad]; in whole cells alone.
+    quaternion_xyzw: its rotation, to sigma_rad about each axis [rad].
     """
 
     x_m: Number | None = None

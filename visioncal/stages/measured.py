@@ -1,15 +1,14 @@
-"""What a session knows of its unknown edges beforehand, and what it did to the answer, in words."""
+"""What a session knows of frames beforehand, and what it did to the answer, in words."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from visioncal.estimation.chain import edge_names
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.problem import FramePrior, Problem, State
 from visioncal.figures import figure
-from visioncal.session import Session
 from visioncal.session.tables import PriorTable
 from visioncal.types import FloatArray
 
@@ -18,26 +17,16 @@ _COMPONENTS = ("x_m", "y_m", "z_m")
 _CONTRADICTION = 3.0
 
 
-def priors_of(session: Session) -> tuple[FramePrior, ...]:
-    """The components of edges that a session states in [prior.EDGE].
-
-    With several boards the target's edge is that of none in particular: it is left aside.
-    """
-    found = []
-    for place, edge in enumerate(edge_names(session.mount)):
-        prior = session.declaration.prior.get(edge)
-        if prior is None or (place == 1 and len(session.boards) > 1):
-            continue
-        first, second = edge.split("_from_")
-        found.append(FramePrior(first, second, *axes_of(prior), prior.sigma_m))
-    return tuple(found)
-
-
-def axes_of(prior: PriorTable) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Which components a prior states, 0 for x, and their values [m]."""
-    values = [getattr(prior, it) for it in _COMPONENTS]
+def prior_of(name: str, table: PriorTable) -> FramePrior:
+    """Reads `[prior.A_from_B]`: the components that it states, and the rotation where it does."""
+    first, _, second = name.partition("_from_")
+    values = [getattr(table, it) for it in _COMPONENTS]
     axes = tuple(axis for axis, value in enumerate(values) if value is not None)
-    return axes, tuple(float(values[axis]) for axis in axes)
+    places = tuple(float(values[axis]) for axis in axes)
+    if table.quaternion_xyzw is None or table.sigma_rad is None:
+        return FramePrior(first, second, axes, places, table.sigma_m)
+    rotation = Rotation.from_quat(table.quaternion_xyzw).as_matrix()
+    return FramePrior(first, second, axes, places, table.sigma_m, rotation, table.sigma_rad)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from visioncal.camera import project
 from visioncal.estimation.appearance import Free
 from visioncal.estimation.problem import Problem, State
 from visioncal.threads import one_blas_thread
-from visioncal.transforms import invert, rotation_angle
+from visioncal.transforms import distances
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
 # Up to here every stop is left out by itself; beyond, ten groups say the same.
@@ -41,7 +41,6 @@ def validate(
     needs: Sequence[Collection[str]],
     refit: Callable[[Mask], State],
     pixels: Callable[[IntArray, State], FloatArray],
-    own: Callable[[State], FloatArray] | None = None,
 ) -> HeldOut:
     """Leaves stops out, one by one or in ten groups, and predicts what was observed there.
 
@@ -51,7 +50,6 @@ def validate(
         needs: (n,) the names of what each observation needs to be placed by others.
         refit: Fits those of an (n,) mask.
         pixels: Reprojection errors (m,) [px] of (m,) observations at a state.
-        own: (n, 4, 4) at a state, what was observed in the observed frame; None where that is it.
 
     Returns:
         The residuals.
@@ -71,32 +69,22 @@ def validate(
             if not held.any():
                 continue
             state, rows = refit(kept), np.flatnonzero(held)
-            among = None if own is None else own(state)[held]
-            away_m[held], away_rad[held] = apart(problem.subset(held), state, among)
+            away_m[held], away_rad[held] = apart(problem.subset(held), state)
             rms_px[held] = pixels(rows, state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(problem) else "stops"
     return HeldOut(f"{method} over {unit}", away_m, away_rad, rms_px)
 
 
-def apart(
-    problem: Problem, state: State, own: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """How far (n,) [m] and (n,) [rad] observations are from what is predicted.
 
     Args:
         problem: The observations.
         state: The unknowns.
-        own: (n, 4, 4) what was observed in the observed frame; None where that is it.
     """
-    predicted, measured = problem.predicted(state), problem.measured(state)
-    if own is not None:
-        predicted, measured = predicted @ own, measured @ own
-    turned = rotation_angle(invert(predicted) @ measured)
-    return (
-        np.linalg.norm(measured[:, :3, 3] - predicted[:, :3, 3], axis=1),
-        np.where(problem.observations.has_rotation, turned, np.nan),
-    )
+    away_m, turned = distances(problem.measured(state), problem.predicted(state))
+    return away_m, np.where(problem.observations.has_rotation, turned, np.nan)
 
 
 def chain_rms_px(
