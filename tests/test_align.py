@@ -406,12 +406,12 @@ def test_one_camera_on_one_robot_gives_what_calibrate_gives(mount, scale):
         for view, pose in zip(session.views, cell.base_from_flange, strict=True)
     ]
     found = align(replace(session, views=tuple(views)), corners=dict(enumerate(cell.corners)))
-    edges = calibrated(cell, joints_rad=None, robot=None).solved.edges
+    edges = calibrated(cell, joints_rad=None, robot=None).solved.state.edges
     names = {
         "eye-in-hand": ("flange_from_cam", "cell_from_target"),
         "eye-to-hand": ("cell_from_cam", "flange_from_target"),
     }[mount]
-    for name, matrix in zip(names, (edges.x, edges.z), strict=True):
+    for name, matrix in zip(names, edges, strict=True):
         away = log(invert(matrix) @ found.edges[name].matrix)
         # The same but for how levels of noise are estimated: a tenth of a sigma.
         assert np.all(np.abs(away) < 0.1 * np.sqrt(np.diag(found.edges[name].covariance)))

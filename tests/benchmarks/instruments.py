@@ -57,9 +57,9 @@ def prose(text: str) -> str:
 
 def places(known: Known, q: FloatArray) -> FloatArray:
     """(k, 3) where a calibration has the first point, in the instrument's frame."""
-    edges = known.solved.edges
+    x, z = known.solved.state.edges
     robot = known.robot if known.arm_model is None else known.arm_model.robot
-    return (invert(edges.x) @ robot.base_from_flange(q) @ edges.z)[:, :3, 3]
+    return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
 
 
 def true_places(shop: Shop, q: FloatArray) -> FloatArray:
