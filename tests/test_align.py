@@ -485,3 +485,20 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     assert not any(it.startswith("Robot a:") for it in found.verdict.reasons)
     _, squared = off(cell, found, "base_a", "base_b")
     assert squared < 22.0
+
+
+def test_a_board_of_another_size_is_found_beside_arms_that_err():
+    robots = (
+        RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
+        RobotAt("b", (0.6, 0.05, 0.02), offset_sigma_rad=1e-3),
+    )
+    boards = (replace(FLOOR, scale=1.002), BoardAt("plate_a", "a"), BoardAt("plate_b", "b"))
+    cameras = (replace(LEFT, camera=fine_camera()), RIGHT, CameraAt("hand", "b"))
+    options = NetworkOptions(robots, cameras, boards, stops=2 * STOPS)
+    found = aligned(simulate_network(options))
+    floor = found.stages["boards"]["floor"]
+    # Four of its sigmas: one run in fifteen thousand.
+    assert abs(floor["shape"]["scale"] - 0.002) < 4 * floor["sigma"]["scale"] < 4e-4
+    assert found.stages["boards"]["plate_a"]["estimated"] == ["scale"]
+    assert not found.moved
+    assert {found.arms[it].stages["kinematics"]["level"] for it in "ab"} == {"offsets"}

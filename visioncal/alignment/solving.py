@@ -104,7 +104,6 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, problem, state, unplaced = _started(cell, views)
     agreed = agree(problem, state, _movable(problem))
-    agreed = _levelled(cell, views, agreed)
     arms: Mapping[str, RobotArm] = arms_of(cell)
     check_arms(arms, asked)
     seen, late = None, clock_effects(cell, looked.clocks)
@@ -114,6 +113,7 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
         arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
         others = (*late, *effects_of(arms))
         agreed = _with_effects(agreed, others) if others else agreed
+    agreed = _levelled(cell, views, agreed)
     if asked != "hand-eye":
         arms = _levels(agreed, arms, asked)
         agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)

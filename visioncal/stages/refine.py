@@ -26,6 +26,7 @@ from visioncal.estimation.joint import (
     chance_limit,
     contradicted_lens,
     measured_scale,
+    moved_surprise,
     settle,
 )
 from visioncal.estimation.linalg import covariance
@@ -129,12 +130,43 @@ def refined(
         return answer, found
     under_stated = side.with_errors(stated)
     erring = (under_stated if under_stated.errors else found).freed(freely=True)
-    answer = chosen(erring, settle(stated.looks, erring, stated.moving, stated.frames))
+    answer = chosen(erring, _still_asked_for(erring, stated, answer))
     if all(it.of_links for it in erring.errors):
         return answer, erring
     linked = erring.freed(freely=False)
     fitted = settle(answer.looks, linked, answer.moving, answer.frames)
     return fitted, linked.with_errors(fitted)
+
+
+def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
+    """The fit with errors of arms free, and of what was set free before what is still asked for.
+
+    Before, noise was as large as these errors: what they had passed for is as stated again, and
+    what really is another is clear now.
+    """
+    wide = settle(answer.looks, erring, answer.moving, answer.frames)
+    looks = answer.looks
+    freed = [looks.shape_of(it) for it in looks.printed] + [
+        looks.lens_of(it) for it in looks.problems
+    ]
+    kept = [
+        it
+        for it in freed
+        if np.isin(it, answer.moving).all()
+        and not np.isin(it, stated.moving).any()
+        and moved_surprise(wide, it) > chance_limit(len(it))
+    ]
+    kept += [
+        place
+        for board in looks.printed
+        if np.isin(place := looks.scale_of(board), answer.moving).all()
+        and measured_scale(erring, wide, board).is_another
+    ]
+    places = np.concatenate([stated.moving, *kept])
+    unstated = places[np.isinf(looks.prior_sigma[places])]
+    restated = stated.looks.without_prior(unstated.tolist())
+    restated = restated.with_values(places, wide.looks.values[places])
+    return settle(restated, erring, np.unique(places), answer.frames)
 
 
 def _looks(scene: Scene, views: Sequence[ViewPoses], stops: IntArray) -> Looks:
