@@ -6,12 +6,14 @@ import numpy as np
 
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
-from visioncal.robot import load_robot
+from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell, Sweep
-from visioncal.simulation.records import approach_text, load_row
+from visioncal.simulation.records import approach_text, load_row, pose_row
 from visioncal.simulation.second import BOARDS
 from visioncal.stages.cameras import detect_targets
+from visioncal.stages.joints import Matched
+from visioncal.stages.reported import Reported
 from visioncal.transforms import invert, log
 
 
@@ -27,7 +29,10 @@ def session_of(cell: Cell) -> Session:
         View(
             at,
             image=f"{at}.png",
-            numbers=load_row(cell.payloads[at]) if cell.payloads else {},
+            numbers={
+                **pose_row(cell.base_from_flange[at]),
+                **(load_row(cell.payloads[at]) if cell.payloads else {}),
+            },
             text=approach_text(cell, at),
         )
         for at in range(len(cell.corners))
@@ -52,13 +57,12 @@ def session_of(cell: Cell) -> Session:
     )
 
 
-def known_of(cell: Cell, *, joints: bool = True, **changes) -> Known:
+def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **changes) -> Known:
     """What is known after detection; without `joints`, poses are all that is said of the robot."""
-    if joints:
-        arm = {"joints_rad": dict(enumerate(cell.joints)), "robot": load_robot(cell.options.robot)}
-        changes = arm | changes
-    poses = dict(enumerate(cell.base_from_flange))
-    known = replace(Known(session_of(cell)), base_from_flange=poses, **changes)
+    model = load_robot(cell.options.robot) if robot is None else robot
+    matched = Matched(model, dict(enumerate(cell.joints))) if joints else None
+    reported = Reported(dict(enumerate(cell.base_from_flange)), matched=matched)
+    known = replace(Known(session_of(cell)), robots={"": reported}, **changes)
     return detect_targets(known, {it.view: it for it in cell.corners})
 
 
@@ -73,7 +77,7 @@ def calibrated(cell: Cell, **changes) -> Known:
 
 def calibrated_sweep(moved: Sweep) -> Known:
     """What is known at the end of the way, from the corners of a sweep's frames."""
-    known = replace(known_of(moved.cell, joints=False), base_from_flange={})
+    known = replace(known_of(moved.cell, joints=False), robots={})
     views = [
         replace(view, numbers={"stamp_s": stamp_s})
         for view, stamp_s in zip(known.session.views, moved.frames_s.tolist(), strict=True)

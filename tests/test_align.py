@@ -14,6 +14,7 @@ from visioncal.errors import DataError, DegenerateError
 from visioncal.exports import Selection, document
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
+from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.layout import (
     BoardAt,
@@ -27,7 +28,7 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import pairs_session, pose_row
+from visioncal.simulation.records import pairs_session
 from visioncal.simulation.sag import Payload
 from visioncal.transforms import exp, invert, log
 from visioncal.types import Target
@@ -396,17 +397,39 @@ def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
         np.testing.assert_array_equal(kept.edges[name].covariance, edge.covariance)
 
 
+def with_elbow_of_b(session, change):
+    """The session with no more than joints of one robot, the third of them changed."""
+    views = [
+        replace(view, numbers=change({k: it for k, it in view.numbers.items() if k not in POSE}))
+        if view.text.get("robot") == "b"
+        else view
+        for view in session.views
+    ]
+    return replace(session, views=tuple(views))
+
+
+def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
+    cell, _ = clean
+    session, corners = network_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))
+    moved = with_elbow_of_b(session, lambda it: it | {"q3_rad": it["q3_rad"] + 0.2})
+    found = align(moved, corners=corners)
+    (words,) = [it for it in found.verdict.reasons if "elbow_joint" in it]
+    assert words.startswith("Robot b: the joint angles do not belong to ur5e as they are told.")
+    assert "moved by -11.4" in words
+    _, squared = off(cell, found, "base_a", "base_b")
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert squared < 22.0
+    turned = with_elbow_of_b(session, lambda it: it | {"q3_rad": -it["q3_rad"]})
+    with pytest.raises(DataError, match=r"^robot b: .* not those of ur5e .* of the opposite sign"):
+        align(turned, corners=corners)
+
+
 @pytest.mark.parametrize("scale", [1.0, 1.005])
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_one_camera_on_one_robot_gives_what_calibrate_gives(mount, scale):
     cell = simulate(CellOptions(mount=mount, views=15, board_scale=scale))
-    session = session_of(cell)
-    views = [
-        replace(view, numbers={**view.numbers, **pose_row(pose)})
-        for view, pose in zip(session.views, cell.base_from_flange, strict=True)
-    ]
-    found = align(replace(session, views=tuple(views)), corners=dict(enumerate(cell.corners)))
-    edges = calibrated(cell, joints_rad=None, robot=None).solved.state.edges
+    found = align(session_of(cell), corners=dict(enumerate(cell.corners)))
+    edges = calibrated(cell, joints=False).solved.state.edges
     names = {
         "eye-in-hand": ("flange_from_cam", "cell_from_target"),
         "eye-to-hand": ("cell_from_cam", "flange_from_target"),

@@ -10,14 +10,14 @@ from visioncal.estimation.arm import misfit_covariance, stops_of
 from visioncal.estimation.misfit import Drift, Neighbours, drift, inflation, neighbours
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution
-from visioncal.robot import Robot
 from visioncal.session import View
 from visioncal.session.loads import loads_of
 from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.diagnose import FEWEST_STOPS, misfit_words
-from visioncal.stages.joints import Matched, match_joints
+from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import ASKED, doubts, findings
 from visioncal.stages.loads import check_elastic, check_poses
+from visioncal.stages.reported import Reported
 from visioncal.types import FloatArray
 
 # How far the arms of a whole cell may be calibrated.
@@ -37,24 +37,22 @@ class Misfit:
     moved: Drift | None
 
 
-def arms_of(cell: Cell) -> dict[str, RobotArm]:
+def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
     """Reads the arms of a cell, as they are stated."""
     return {
-        robot_key(name): _arm(cell, name)
-        for name in cell.session.robots
+        robot_key(name): _arm(cell, name, it.matched)
+        for name, it in robots.items()
         if robot_key(name) in cell.poses
     }
 
 
-def _arm(cell: Cell, name: str) -> RobotArm:
+def _arm(cell: Cell, name: str, matched: Matched | None) -> RobotArm:
     session, key = cell.session, robot_key(name)
     rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
     reported = cell.poses[key]
     stood = np.isfinite(reported[:, 0, 0])
     views = [rows[it] for it in np.flatnonzero(stood).tolist()]
     loads = loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views])
-    document = session.robot_documents.get(name)
-    matched = None if document is None else match_joints(views, Robot.from_document(document))
     joints = None if matched is None else _joints(views, matched)
     return RobotArm(key, reported, stood, joints, loads, matched)
 
@@ -126,15 +124,12 @@ def doubts_of_arms(
 def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
     """Words what was found of the arms and is no reason for doubt."""
     for robot, arm in arms.items():
-        notes = () if arm.matched is None else arm.matched.notes
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        for words in (*notes, *chosen, *told[robot].notes()):
+        for words in (*chosen, *told[robot].notes()):
             yield _of_robot(robot, words)
 
 
 def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
-    if arm.matched is not None:
-        yield from arm.matched.warnings
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
         yield "It stays as it reports itself: its errors take joint angles and a known model."
     if arm.kinematics is not None:

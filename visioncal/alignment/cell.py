@@ -11,9 +11,9 @@ from visioncal.alignment.priors import priors_of
 from visioncal.errors import DataError
 from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Branch, Tree
-from visioncal.robot import Robot
-from visioncal.session import Observation, Session, View, frame_name
-from visioncal.stages.observed import HELD_BACK
+from visioncal.session import Observation, Session, frame_name
+from visioncal.stages.observed import HELD_BACK, Observed
+from visioncal.stages.reported import Reported
 from visioncal.types import FloatArray
 
 _CELL = "cell"
@@ -90,36 +90,36 @@ class Cell:
         return replace(self, tree=tree, reference=reference)
 
 
-def read_cell(session: Session) -> Cell:
-    """Reads a session as a whole cell.
+def read_cell(seen: Observed) -> Cell:
+    """Takes what was observed as a whole cell.
 
     Raises:
         DataError: It observes nothing, or what it says of its frames is not clear.
     """
+    session = seen.timed
     frames = session.frames
     branches = {
         name: Branch(parent, robot=_robot_of(session, name)) for name, parent in frames.items()
     }
-    seen = [it for it in session.observations if not it.view.is_of_lens]
-    if not seen:
+    observations = [it for it in session.observations if not it.view.is_of_lens]
+    if not observations:
         raise DataError(
             f"session {session.name!r}: no row tells what a camera or an instrument saw.",
             next_step="Give rows images and cameras, or poses in cft_ columns.",
         )
-    poses, unread = _poses(session, seen)
-    reasons, rows = dict(unread), []
-    for it in seen:
-        reason = _unusable(it)
-        if reason:
-            reasons[it.view.number] = reason
-        elif it.view.number not in reasons:
-            rows.append(Row(it.view.number, it.view.stop, it.station, it.seer, it.seen))
+    rows = [
+        Row(it.view.number, it.view.stop, it.station, it.seer, it.seen)
+        for it in observations
+        if it.view.number not in seen.held_back and _is_known(it, seen.robots)
+    ]
+    reasons = {**seen.reasons, **dict.fromkeys(seen.held_back, HELD_BACK), **seen.spared}
     stations: dict[int, int] = {}
-    for it in seen:
+    for it in observations:
         number = it.view.number if it.view.stop is None else it.view.stop
         stations.setdefault(it.station, number)
     tree = Tree(_CELL, branches)
     priors = priors_of(session.declaration.prior, tree)
+    poses = _poses(seen, observations)
     cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors)
     cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
     return cell.held_to(_reference(cell))
@@ -138,49 +138,24 @@ def robot_key(name: str) -> str:
     return name or "robot"
 
 
-def _unusable(it: Observation) -> str:
-    if it.view.holdout:
-        return HELD_BACK
-    if it.lacks:
-        robots = ", ".join(filter(None, it.lacks)) or "the robot"
-        return f"no row of its stop tells where {robots} stood"
-    return ""
+def _is_known(it: Observation, robots: Mapping[str, Reported]) -> bool:
+    """Whether it is known where all robots stood by way of which something was observed."""
+    view = it.view.number
+    return not it.lacks and all(view in robots[name].base_from_flange for name in it.robots)
 
 
-def _poses(
-    session: Session, seen: Sequence[Observation]
-) -> tuple[dict[str, FloatArray], dict[int, str]]:
-    """Where every robot stood at every station, and the rows whose robot's pose is not known."""
-    count = 1 + max(it.station for it in seen)
-    poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in session.robots}
-    models = {
-        name: Robot.from_document(document) for name, document in session.robot_documents.items()
-    }
-    unread: dict[int, str] = {}
-    read: dict[int, FloatArray | None] = {}
-    for it in seen:
-        for name, view in it.robots.items():
-            if view.number not in read:
-                read[view.number] = _pose(view, models.get(name))
-            pose = read[view.number]
-            if pose is None:
-                of = f" of robot {name}" if name else " of the robot"
-                unread[it.view.number] = (
-                    f"no pose{of}: view {view.number} has joint angles that no known model of it "
-                    "takes"
-                )
-            else:
-                poses[robot_key(name)][it.station] = pose
-    return poses, unread
-
-
-def _pose(view: View, model: Robot | None) -> FloatArray | None:
-    pose, joints = view.base_from_flange(), view.joints_rad
-    if pose is not None:
-        return np.asarray(pose.as_matrix())
-    if joints is None or model is None or len(joints) != model.joint_count:
-        return None
-    return np.asarray(model.base_from_flange(joints[None])[0])
+def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, FloatArray]:
+    """(s, 4, 4) where every robot stood at every station."""
+    count = 1 + max(it.station for it in observations)
+    poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in seen.robots}
+    for it in observations:
+        for name, row in it.robots.items():
+            known = seen.robots[name].base_from_flange
+            # What most rows of a stop tell comes before what each tells itself.
+            at = row.number if row.number in known else it.view.number
+            if at in known:
+                poses[robot_key(name)][it.station] = known[at]
+    return poses
 
 
 def _reference(cell: Cell) -> str:

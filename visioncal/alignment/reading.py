@@ -7,27 +7,26 @@ import numpy as np
 from visioncal.alignment.cell import Cell
 from visioncal.errors import DataError
 from visioncal.instruments import Instrument, instrument_names, stated_instrument
-from visioncal.session import View, frame_name
+from visioncal.session import Session, View, frame_name
 from visioncal.stages.pnp import ViewPoses
 from visioncal.types import FloatArray
 
 
-def readings(cell: Cell) -> dict[int, ViewPoses]:
+def readings(session: Session) -> dict[int, ViewPoses]:
     """The readings by view; of places alone, the rotation is any.
 
     Raises:
         DataError: An instrument's noise is not known.
     """
-    seers = {frame_name("instrument", name): name for name in cell.session.instruments}
-    views = {view.number: view for view in cell.session.views}
+    seers = {frame_name("instrument", name): name for name in session.instruments}
     known: dict[str, Instrument] = {}
     found = {}
-    for row in cell.rows:
+    for row in session.observations:
         if not row.seer.startswith("instrument"):
             continue
         if row.seer not in known:
-            known[row.seer] = _instrument(cell, row.seer, seers.get(row.seer))
-        found[row.view] = _sighting(views[row.view], known[row.seer])
+            known[row.seer] = _instrument(session, row.seer, seers.get(row.seer))
+        found[row.view.number] = _sighting(row.view, known[row.seer])
     return found
 
 
@@ -36,7 +35,7 @@ def has_rotation(view: View) -> bool:
     return view.instrument_from_probe() is not None
 
 
-def _instrument(cell: Cell, frame: str, name: str | None) -> Instrument:
+def _instrument(session: Session, frame: str, name: str | None) -> Instrument:
     if name is None:
         raise DataError(
             f"session.toml: rows have readings of {frame} (meas_x_m ...), but nothing says how "
@@ -45,7 +44,7 @@ def _instrument(cell: Cell, frame: str, name: str | None) -> Instrument:
             next_step="Add [instrument] with sigma_m (and sigma_per_m), or with one of these as "
             f"its name: {', '.join(instrument_names())}.",
         )
-    table = cell.session.instruments[name]
+    table = session.instruments[name]
     return stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
 
 

@@ -52,6 +52,7 @@ from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
+from visioncal.stages.robots import check_joints, read_robots
 from visioncal.stages.validate import HeldOut
 from visioncal.targets import corner_positions, target_document
 from visioncal.threads import one_blas_thread
@@ -90,14 +91,15 @@ def align(
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    looked = Observed(loaded, progress, poses=readings(read_cell(loaded)))
+    looked = Observed(loaded, progress, poses=readings(loaded))
     looked = locate_targets(estimate_lenses(detect_targets(looked, corners)))
     if progress is not None:
         progress("align", 0, 1)
     with one_blas_thread():
-        looked = set_clocks(looked)
-        cell = read_cell(looked.timed)
-        cell = replace(cell, reasons={**cell.reasons, **looked.reasons, **looked.spared})
+        calibrates = level != "hand-eye"
+        looked = read_robots(set_clocks(looked))
+        looked = check_joints(looked, drops=calibrates, takes=calibrates)
+        cell = read_cell(looked)
         solved = solve(cell, looked, level)
         return alignment_of(cell, looked, solved, convention)
 

@@ -104,7 +104,7 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     views = [looked.poses[it.view] for it in cell.rows]
     cell, views, problem, state, unplaced = _started(cell, views)
     agreed = agree(problem, state, _movable(problem))
-    arms: Mapping[str, RobotArm] = arms_of(cell)
+    arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
     check_arms(arms, asked)
     seen, late = None, clock_effects(cell, looked.clocks)
     if looked.scenes:

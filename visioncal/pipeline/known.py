@@ -16,7 +16,7 @@ from visioncal.estimation.problem import ROBOT, FramePrior, Problem
 from visioncal.estimation.scene import Scene
 from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
-from visioncal.robot import Convention, Loads, Robot, with_zeros
+from visioncal.robot import Convention, Loads, Robot
 from visioncal.session import frame_name
 from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
@@ -32,11 +32,11 @@ from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
+from visioncal.stages.reported import Reported, moved_arm
 from visioncal.stages.tell import Telling
 from visioncal.stages.validate import HeldOut
 from visioncal.thermal import Inputs, Stops, ThermalFit
-from visioncal.transforms import invert
-from visioncal.types import Corners, FloatArray, IntArray, Rejection, SolverName
+from visioncal.types import Corners, FloatArray, IntArray, SolverName
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,8 @@ class Known(Observed):
 
     Attributes:
         solver: The hand-eye solver asked for.
-        robot: The nominal robot, where the session names a known one.
-        base_from_flange: (4, 4) by view, as the robot reported it.
         boards: Which of the session's boards the chain holds: the one it ends at, and others.
         frames: (4, 4) where the camera and the boards are, by the frame; empty at first.
-        joints_rad: (n,) by view, where each view has them and they fit the robot [rad].
-        matched: The joints beside the reported poses; None without a robot.
-        lost_zero: A joint whose zero is far from where the model has it.
         readings: What an instrument read, where that is all that was observed.
         used: The views in the fit, in the session's order.
         candidates: The views that could be in the fit, if they agree.
@@ -74,13 +69,8 @@ class Known(Observed):
     """
 
     solver: SolverName = "joint"
-    robot: Robot | None = None
-    base_from_flange: Mapping[int, FloatArray] = field(default_factory=dict)
-    joints_rad: Mapping[int, FloatArray] | None = None
     boards: tuple[int, ...] = (0,)
     frames: Mapping[str, FloatArray] = field(default_factory=dict)
-    matched: Matched | None = None
-    lost_zero: JointReading | None = None
     readings: Readings | None = None
     used: tuple[int, ...] = ()
     candidates: tuple[int, ...] = ()
@@ -121,18 +111,6 @@ class Known(Observed):
         cameras = {it: replace(look, pixel_px=pixel_px) for it, look in self.cameras.items()}
         return replace(self, cameras=cameras)
 
-    def without_poses(self, rejections: Iterable[Rejection]) -> Self:
-        """Leaves out the robot's side of some views."""
-        known = self.noting(rejected := tuple(rejections))
-        lost, joints = {it.view for it in rejected}, self.joints_rad
-        return replace(
-            known,
-            base_from_flange={it: at for it, at in self.base_from_flange.items() if it not in lost},
-            joints_rad=None
-            if joints is None
-            else {it: q for it, q in joints.items() if it not in lost},
-        )
-
     def agreeing(self, agreed: Agreed) -> Self:
         """Takes the candidates that agree into the fit; the others are rejected."""
         used = tuple(it for it, ok in zip(self.candidates, agreed.mask, strict=True) if ok)
@@ -166,23 +144,40 @@ class Known(Observed):
         most = max(sorted(set(shown)), key=shown.count, default=0)
         return {view: it for view, it in self.poses.items() if it.board == most}
 
-    def with_zero(self, zero: JointReading) -> Self:
-        """Takes a joint's zero for where it is, and the poses for those of the arm then."""
-        before, after = self, replace(self, lost_zero=zero)
-        if before.zeroed_robot is None or after.zeroed_robot is None:
-            return self
-        views = tuple(self.base_from_flange)
-        moved = _moved(
-            self.flange_poses(views), self.joints(views), before.zeroed_robot, after.zeroed_robot
-        )
-        return replace(after, base_from_flange=dict(zip(views, moved, strict=True)))
+    @property
+    def reported(self) -> Reported:
+        """What its rows report of the robot."""
+        return next(iter(self.robots.values()), Reported({}))
+
+    @property
+    def base_from_flange(self) -> Mapping[int, FloatArray]:
+        """(4, 4) by view, as the robot reported it."""
+        return self.reported.base_from_flange
+
+    @property
+    def joints_rad(self) -> Mapping[int, FloatArray] | None:
+        """(n,) by view, where each view has them and they fit the robot [rad]."""
+        return self.reported.joints_rad
+
+    @property
+    def matched(self) -> Matched | None:
+        """The joints beside the reported poses; None without a robot."""
+        return self.reported.matched
+
+    @property
+    def robot(self) -> Robot | None:
+        """The nominal robot, where the session names a known one."""
+        return None if self.matched is None else self.matched.robot
+
+    @property
+    def lost_zero(self) -> JointReading | None:
+        """A joint whose zero is far from where the model has it."""
+        return None if self.matched is None else self.matched.zero
 
     @property
     def zeroed_robot(self) -> Robot | None:
         """The nominal robot with its joints' zeros where the views have them."""
-        if self.robot is None or self.lost_zero is None:
-            return self.robot
-        return with_zeros(self.robot, self.lost_zero.zeros)
+        return None if self.matched is None else self.matched.arm
 
     def stated_problem(self, views: Sequence[int]) -> Problem | None:
         """What `problem` gives with a lost zero where the model has it; None where none is lost."""
@@ -190,7 +185,7 @@ class Known(Observed):
         if self.lost_zero is None or robot is None or zeroed is None:
             return None
         first = self.first_of_stops(views)
-        poses = _moved(self.flange_poses(first), self.joints(first), zeroed, robot)
+        poses = moved_arm(self.flange_poses(first), self.joints(first), zeroed, robot)
         return replace(self.problem(views), poses={ROBOT: poses})
 
     @property
@@ -432,12 +427,6 @@ class Known(Observed):
         if self.hand_eye is None:
             raise RuntimeError("a stage that needs the hand-eye result comes before it")
         return self.hand_eye
-
-
-def _moved(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
-    """Poses (m, 4, 4) of what is on the flange of one model, on that of another."""
-    on_flange = invert(before.base_from_flange(q)) @ poses
-    return np.asarray(after.base_from_flange(q) @ on_flange)
 
 
 def rms_of(away_m: FloatArray, away_rad: FloatArray, rms_px: FloatArray) -> Rms:

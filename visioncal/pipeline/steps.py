@@ -22,8 +22,7 @@ from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unseen import left_out
 from visioncal.pipeline.unused import not_used
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
-from visioncal.robot import Robot
-from visioncal.session import STREAMS, Session
+from visioncal.session import STREAMS
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
@@ -35,19 +34,12 @@ from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked
 from visioncal.stages.measured import components
-from visioncal.stages.motion import is_open
 from visioncal.stages.observed import all_held_back, nothing_seen
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import mounted, read_instrument
 from visioncal.stages.refine import arm_errors, held, look, refine
-from visioncal.stages.reported import reported_poses
-from visioncal.stages.seen_joints import (
-    contradicted_joints,
-    guess_seen_joints,
-    lost_zero,
-    misread_joints,
-)
+from visioncal.stages.robots import check_joints, read_robots
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import Rejection
 
@@ -68,7 +60,7 @@ class Stage:
 
 def _read_robot(known: Known) -> Known:
     check_one_of_each(known.session)
-    session, document = known.session, known.session.robot_document
+    session = known.session
     if not session.views:
         what = "streams and no views" if session.streams else "no views"
         raise DataError(
@@ -77,31 +69,19 @@ def _read_robot(known: Known) -> Known:
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
-    robot = None if document is None else Robot.from_document(document)
-    known = replace(known, robot=robot)
     known = known.noting((), (*session.warnings, *not_used(known)))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.
-    return known if waits_for_clock(session) else _reported(known, session)
+    return known if waits_for_clock(session) else _reported(known)
 
 
-def _reported(known: Known, session: Session) -> Known:
-    """Takes up the robot's side of a session's views."""
-    reported = reported_poses(session, known.robot)
-    matched = reported.matched
-    if matched is not None and matched.misread:
-        check_asked(known.level, can=False, misread=matched.misread)
-    known = replace(
-        known,
-        robot=known.robot if matched is None else matched.robot,
-        base_from_flange=reported.base_from_flange,
-        joints_rad=reported.joints_rad,
-        matched=matched,
-        lost_zero=None if matched is None else matched.zero,
-        notes=(*known.notes, *reported.notes),
-    ).noting(reported.rejections, reported.warnings)
-    if not reported.base_from_flange:
+def _reported(known: Known) -> Known:
+    """Takes up what is reported of the robot."""
+    known = read_robots(known)
+    if known.matched is not None and known.matched.misread:
+        check_asked(known.level, can=False, misread=known.matched.misread)
+    if not known.base_from_flange:
         raise DataError(
             f"session {known.session.name!r}: no view has a pose of the robot.",
             culprits=known.lost_views,
@@ -114,11 +94,7 @@ def _reported(known: Known, session: Session) -> Known:
 
 def _clock(known: Known) -> Known:
     """Gives views that have a time alone the robot's poses out of its stream."""
-    if not waits_for_clock(known.session):
-        return known
-    known = set_clocks(known)
-    views = tuple(it for it in known.timed.views if not is_open(it))
-    return _reported(known, replace(known.timed, views=views))
+    return _reported(set_clocks(known)) if waits_for_clock(known.session) else known
 
 
 def _readings(known: Known) -> Known:
@@ -146,29 +122,8 @@ def _readings(known: Known) -> Known:
 
 def _joints(known: Known) -> Known:
     """Refuses joints that only fit what the camera sees where they are read otherwise."""
-    robot, matched = known.zeroed_robot, known.matched
-    poses = known.poses_of_one_board
-    views = [it for it in poses if known.joints_rad and it in known.joints_rad]
-    if robot is None or not views or known.readings is not None:
-        return known
-    doubted = {} if matched is None else matched.contradicting
-    sound = [it for it in views if it not in doubted and it not in known.held_back]
-    mount = known.session.mount
-    seen = {view: poses[view].cam_from_target[0] for view in views}
-    rows = np.array([seen[view] for view in sound])
-    guess = guess_seen_joints(robot, known.joints(sound), rows, mount)
-    if matched is not None and known.level != "hand-eye":
-        both = {it: (known.base_from_flange[it], seen[it]) for it in views if it in doubted}
-        known = known.without_poses(contradicted_joints(matched, guess, both, mount))
-    if guess is None or not guess.stands_out:
-        return known
-    zero = guess.zero
-    if zero is None:
-        has_poses = any(it.base_from_flange() is not None for it in known.session.views)
-        raise misread_joints(guess, robot, has_poses=has_poses)
-    taken = known.level != "hand-eye" and known.solver == "joint" and known.lost_zero is None
-    known = known.noting((), (lost_zero(guess, zero, taken=taken),))
-    return known.with_zero(zero) if taken else known
+    drops = known.level != "hand-eye"
+    return check_joints(known, drops=drops, takes=drops and known.solver == "joint")
 
 
 def _choose(known: Known) -> Known:

@@ -9,10 +9,12 @@ from visioncal.estimation.chain import scatter
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import own_numbers
+from visioncal.session import View
 from visioncal.stages.observed import HELD_BACK
 from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.types import Corners, FloatArray
 
+_OF_LENS = "it tells of the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
     "no pose of the target: it has neither image nor rows in corners.csv nor cft_ nor meas_ columns"
 )
@@ -24,8 +26,9 @@ def view_results(known: Known) -> tuple[ViewResult, ...]:
     away_m, away_rad, rms_px = _residuals(known, measured)
     at = {view: index for index, view in enumerate(measured)}
     results = []
-    for view in (it.number for it in known.session.views):
-        result = ViewResult(view, view in known.used, _reason(known, view), _corners(known, view))
+    for row in known.session.views:
+        view = row.number
+        result = ViewResult(view, view in known.used, _reason(known, row), _corners(known, view))
         if view in at:
             index = at[view]
             result = replace(
@@ -73,12 +76,13 @@ def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, 
     return away_m, np.full(len(views), np.nan) if problem.points else away_rad, rms_px
 
 
-def _reason(known: Known, view: int) -> str:
+def _reason(known: Known, row: View) -> str:
+    view, none = row.number, _OF_LENS if row.is_of_lens else _NO_POSE
     if view in known.used:
         return ""
     if view in known.held_back and view not in known.reasons:
         return HELD_BACK
-    return known.reasons.get(view) or known.spared.get(view, _NO_POSE)
+    return known.reasons.get(view) or known.spared.get(view, none)
 
 
 def _corners(known: Known, view: int) -> int | None:

@@ -14,6 +14,7 @@ from visioncal.session import Session
 from visioncal.session.tables import CameraTable
 from visioncal.stages.clock import Clocked, Pair
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.reported import Reported
 from visioncal.types import Corners, Progress, Rejection
 
 # So many views of one reason are named.
@@ -52,6 +53,7 @@ class Observed:
         cameras: What each camera with images gave, by its frame.
         poses: The target's pose by view; several candidates until they are chosen from.
         reasons: Why a view cannot be used, by view.
+        robots: What its rows report of each robot, by the name that rows give it.
         clocks: How the clocks of cameras and robots go together, where robots' streams are used.
         warnings: What the user should know, in sentences.
         notes: What is good to know and no reason for doubt.
@@ -62,6 +64,7 @@ class Observed:
     cameras: Mapping[str, CameraLook] = field(default_factory=dict)
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)
+    robots: Mapping[str, Reported] = field(default_factory=dict)
     clocks: Mapping[Pair, Clocked] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -74,6 +77,10 @@ class Observed:
     def with_camera(self, frame: str, look: CameraLook) -> Self:
         """Takes over what one camera gave."""
         return replace(self, cameras={**self.cameras, frame: look})
+
+    def with_robot(self, name: str, reported: Reported) -> Self:
+        """Takes over what is known of one robot."""
+        return replace(self, robots={**self.robots, name: reported})
 
     @cached_property
     def corners(self) -> Mapping[int, Corners]:
@@ -89,7 +96,7 @@ class Observed:
         views = tuple(found.get(it.number, it) for it in self.session.views)
         return replace(self.session, views=views)
 
-    @property
+    @cached_property
     def spared(self) -> Mapping[int, str]:
         """Why views of sweeps are not needed, by view."""
         return {view: why for it in self.clocks.values() for view, why in it.spared.items()}

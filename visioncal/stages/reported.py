@@ -1,25 +1,34 @@
 """Where the robot says that its flange was: poses as reported, or joints through the model."""
 
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from visioncal.errors import DataError
+from visioncal.guess.joints import JointReading
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.stages.joints import Matched, match_joints
-from visioncal.transforms import pose_difference
+from visioncal.transforms import invert, pose_difference
 from visioncal.types import FloatArray, Rejection
 
 # The robot stands still while a stop's images are taken; controllers report it with some noise.
 _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
 
 
+def moved_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
+    """Poses (m, 4, 4) of what is on the flange of one model, on that of another."""
+    on_flange = invert(before.base_from_flange(q)) @ poses
+    return np.asarray(after.base_from_flange(q) @ on_flange)
+
+
 @dataclass(frozen=True, eq=False)
 class Reported:
-    """The robot's side of the session.
+    """What a robot's rows report of it.
 
     Attributes:
         base_from_flange: (4, 4) by view.
@@ -30,12 +39,12 @@ class Reported:
     """
 
     base_from_flange: Mapping[int, FloatArray]
-    rejections: tuple[Rejection, ...]
-    warnings: tuple[str, ...]
+    rejections: tuple[Rejection, ...] = ()
+    warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     matched: Matched | None = None
 
-    @property
+    @cached_property
     def joints_rad(self) -> Mapping[int, FloatArray] | None:
         """(n,) joint angles by view [rad]; None where a view with a pose lacks them."""
         if self.matched is None or not self.base_from_flange:
@@ -43,6 +52,29 @@ class Reported:
         there = self.matched.joints_rad
         known = {view: there[view] for view in self.base_from_flange if view in there}
         return known if len(known) == len(self.base_from_flange) else None
+
+    def without(self, views: Collection[int]) -> Self:
+        """Leaves out some views."""
+        kept = {it: pose for it, pose in self.base_from_flange.items() if it not in views}
+        return replace(self, base_from_flange=kept)
+
+    def without_joints(self) -> Self:
+        """Leaves out the joints."""
+        if self.matched is None:
+            return self
+        return replace(self, matched=replace(self.matched, joints_rad={}))
+
+    def with_zero(self, zero: JointReading) -> Self:
+        """Takes a joint's zero for where it is, and the poses for those of the arm then."""
+        before, joints = self.matched, self.joints_rad
+        if before is None or joints is None:
+            return self
+        after = replace(before, zero=zero)
+        views = list(self.base_from_flange)
+        q = np.array([joints[it] for it in views])
+        poses = np.array([self.base_from_flange[it] for it in views])
+        moved = moved_arm(poses, q, before.arm, after.arm)
+        return replace(self, base_from_flange=dict(zip(views, moved, strict=True)), matched=after)
 
 
 def reported_poses(session: Session, robot: Robot | None) -> Reported:
@@ -72,7 +104,9 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
             rejections.append(Rejection(view.number, _no_pose(joints, matched)))
         else:
             poses[view.number] = matched.pose(joints)
-    _check_stops(session, poses)
+    if not session.is_network:
+        # Of a whole cell, such rows are of a state of their own.
+        _check_stops(session, poses)
     told = ((), ()) if matched is None else (matched.warnings, matched.notes)
     return Reported(poses, tuple(rejections), *told, matched)
 

@@ -196,12 +196,10 @@ def _with_errors(known: Known, footing: Footing) -> Known:
     if footing.arm == "none":
         return known
     if footing.arm == "poses":
-        basis = replace(known, joints_rad=None).arm_basis(known.used)
-    else:
-        basis = known.arm_basis(known.used)
-    errors = ArmErrors(basis, 1.0, np.inf, of_links=True)
-    joints = None if footing.arm == "poses" else known.joints_rad
-    return replace(known, arm=errors, joints_rad=joints)
+        robots = {name: it.without_joints() for name, it in known.robots.items()}
+        known = replace(known, robots=robots)
+    errors = ArmErrors(known.arm_basis(known.used), 1.0, np.inf, of_links=True)
+    return replace(known, arm=errors)
 
 
 def _noise_px(known: Known) -> float:
