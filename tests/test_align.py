@@ -261,6 +261,25 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
     assert found.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
 
 
+def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
+    cell = simulate_network(NetworkOptions(instruments=TRACKERS, points=POINTS, stops=4))
+    session = network_session(cell, "cell", seen="names")
+    views = tuple(
+        replace(
+            it,
+            numbers={
+                name: 1e3 * at if name.startswith("meas_") else at
+                for name, at in it.numbers.items()
+            },
+        )
+        if it.text.get("instrument") == "t2"
+        else it
+        for it in session.views
+    )
+    with pytest.raises(DataError, match="looks like millimetres"):
+        align(replace(session, views=views))
+
+
 def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
     cell = simulate_network(
         NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS)

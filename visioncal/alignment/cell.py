@@ -12,6 +12,7 @@ from visioncal.errors import DataError
 from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.session import Observation, Session, frame_name
+from visioncal.session.kinds import is_seen
 from visioncal.stages.observed import HELD_BACK, Observed
 from visioncal.stages.reported import Reported
 from visioncal.types import FloatArray
@@ -21,13 +22,14 @@ _CELL = "cell"
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """An observation that can be used, before it is known what was found in it."""
+    """An observation that can be used, of a place alone or of a pose."""
 
     view: int
     stop: int | None
     station: int
     seer: str
     seen: str
+    is_place: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,14 @@ def read_cell(seen: Observed) -> Cell:
             next_step="Give rows images and cameras, or poses in cft_ columns.",
         )
     rows = [
-        Row(it.view.number, it.view.stop, it.station, it.seer, it.seen)
+        Row(
+            it.view.number,
+            it.view.stop,
+            it.station,
+            it.seer,
+            it.seen,
+            not is_seen(it.view) and it.view.instrument_from_probe() is None,
+        )
         for it in observations
         if it.view.number not in seen.held_back and _is_known(it, seen.robots)
     ]

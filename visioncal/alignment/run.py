@@ -32,7 +32,6 @@ from visioncal.alignment.judging import (
     findings_of,
     weakest_link,
 )
-from visioncal.alignment.reading import readings
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.alignment.unseen import budget_mm, left_out
@@ -52,6 +51,7 @@ from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
+from visioncal.stages.readings import read_instruments
 from visioncal.stages.robots import check_joints, read_robots
 from visioncal.stages.validate import HeldOut
 from visioncal.targets import corner_positions, target_document
@@ -91,7 +91,7 @@ def align(
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
-    looked = Observed(loaded, progress, poses=readings(loaded))
+    looked = Observed(loaded, progress, poses=read_instruments(loaded))
     looked = locate_targets(estimate_lenses(detect_targets(looked, corners)))
     if progress is not None:
         progress("align", 0, 1)

@@ -10,7 +10,6 @@ from visioncal.alignment.cell import Cell
 from visioncal.alignment.clocks import clock_effects
 from visioncal.alignment.lenses import CellSide, settled_looks, with_looks
 from visioncal.alignment.priors import most_contradicted
-from visioncal.alignment.reading import nominal_spread, places_alone
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
@@ -31,6 +30,8 @@ from visioncal.types import IntArray, Mask, Target
 # Arms are linearised anew so often, or until their errors move by less, which is far below any
 # arm's repeatability.
 _ROUNDS, _AT_REST_RAD = 4, 1e-7
+# Covariance of a pose that was given without one, but for its level [rad^2, m^2].
+_NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,8 +295,7 @@ def _sighted(cell: Cell, views: Sequence[ViewPoses], targets: Mapping[str, Targe
 
 def _places(cell: Cell) -> Mask:
     """(n,) whether each observation tells a place alone."""
-    alone = places_alone(cell)
-    return np.array([alone[it.view] for it in cell.rows], dtype=bool)
+    return np.array([it.is_place for it in cell.rows], dtype=bool)
 
 
 def _problem(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
@@ -307,7 +307,7 @@ def _problem(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
         for row, view in zip(cell.rows, views, strict=True)
     ]
     spread, places = np.array([it.covariance[0] for it in views]), _places(cell)
-    spread[given] = nominal_spread()
+    spread[given] = _NOMINAL
     turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
     return Problem(
         cell.tree,

@@ -22,6 +22,7 @@ from visioncal.figures import figure
 from visioncal.files import did_you_mean, some_of
 from visioncal.instruments import Instrument, instrument_names, stated_instrument
 from visioncal.session import Session, View
+from visioncal.session.kinds import is_read, is_seen, name_of
 from visioncal.stages.pnp import ViewPoses
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Rejection
@@ -77,17 +78,10 @@ class Readings:
         """
         views = [view for view in self.read_m if view in base_from_flange]
         if self.probes is not None:
-            turn_rad = self.instrument.sigma_rad or 0.0
-            poses = np.array([self.probes[view] for view in views])
-            shifts = self.instrument.sigmas_m(np.array([self.read_m[view] for view in views]))
-            spread = np.zeros((len(views), 6, 6))
-            spread[:, range(3), range(3)] = turn_rad**2
-            spread[:, range(3, 6), range(3, 6)] = shifts[:, None] ** 2
-            columns = np.zeros((len(views), 6, 0))
-        else:
-            places = self.places(views, base_from_flange, np.arange(len(views)))
-            poses, spread = supplied_poses(places, self._mounted)
-            columns = point_columns(places.points, len(self.names))
+            return {view: _sighting(view, self.probes[view], self.instrument) for view in views}
+        places = self.places(views, base_from_flange, np.arange(len(views)))
+        poses, spread = supplied_poses(places, self._mounted)
+        columns = point_columns(places.points, len(self.names))
         return {
             view: ViewPoses(view, None, poses[[at]], (0,), spread[[at]], columns[[at]])
             for at, view in enumerate(views)
@@ -135,8 +129,7 @@ def read_instrument(session: Session) -> Readings:
     """
     rows = [view for view in session.views if view.reading_m is not None]
     _check_unit(rows)
-    are_poses = _are_poses(rows)
-    instrument = _instrument(session, are_poses=are_poses)
+    are_poses, instrument = _are_poses(rows), _instrument(session, rows)
     names, rejections = _names(rows, are_poses=are_poses)
     kept = [view for view in rows if view.number not in {it.view for it in rejections}]
     missing = [
@@ -153,6 +146,33 @@ def read_instrument(session: Session) -> Readings:
         None,
         (*missing, *rejections),
     )
+
+
+def read_instruments(session: Session) -> dict[int, ViewPoses]:
+    """What all instruments of a cell read, by view; of places alone, the rotation is any.
+
+    Raises:
+        DataError: An instrument's noise is not known, or its readings are in millimetres.
+    """
+    rows: dict[str, list[View]] = {}
+    for it in session.observations:
+        if is_read(it.view) and not is_seen(it.view):
+            rows.setdefault(it.seer, []).append(it.view)
+    found = {}
+    for mine in rows.values():
+        _check_unit(mine)
+        instrument = _instrument(session, mine)
+        for view in mine:
+            found[view.number] = _sighting(view.number, _probe(view), instrument)
+    return found
+
+
+def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses:
+    """A probe (4, 4) as an instrument saw it."""
+    spread = np.zeros((6, 6))
+    spread[range(3), range(3)] = (instrument.sigma_rad or 0.0) ** 2
+    spread[range(3, 6), range(3, 6)] = instrument.sigmas_m(probe[None, :3, 3])[0] ** 2
+    return ViewPoses(view, None, probe[None], (0,), spread[None], np.zeros((1, 6, 0)))
 
 
 def mounted(
@@ -195,16 +215,21 @@ def _read(view: View) -> FloatArray:
 
 
 def _probe(view: View) -> FloatArray:
-    pose = view.instrument_from_probe()
-    return np.eye(4) if pose is None else np.asarray(pose.as_matrix())
+    """(4, 4) where the probe was read; of a place alone its rotation is any."""
+    pose, matrix = view.instrument_from_probe(), np.eye(4)
+    if pose is not None:
+        return np.asarray(pose.as_matrix())
+    matrix[:3, 3] = _read(view)
+    return matrix
 
 
 def _name(view: View) -> str:
     return view.text.get("point", "").strip()
 
 
-def _instrument(session: Session, *, are_poses: bool) -> Instrument:
-    table = session.declaration.only_instrument
+def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
+    """The instrument that read some rows."""
+    table = session.instruments.get(name_of(session.declaration, "instrument", rows[0]))
     if table is None:
         raise DataError(
             "session.toml: rows have an instrument's readings (meas_x_m ...), but nothing says "
@@ -214,7 +239,7 @@ def _instrument(session: Session, *, are_poses: bool) -> Instrument:
             f"its name: {', '.join(instrument_names())}.",
         )
     found = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
-    if are_poses and found.sigma_rad is None:
+    if found.sigma_rad is None and any(it.instrument_from_probe() is not None for it in rows):
         raise DataError(
             f"session.toml: rows have rotations of a probe (meas_qx ...), but how good they are "
             f"is not known of the instrument {table.name!r}.",

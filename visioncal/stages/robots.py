@@ -1,6 +1,6 @@
 """Where the robots stood: what their rows report, and whether joints belong to what is seen."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -47,9 +47,8 @@ def read_robots(seen: T) -> T:
         seen = seen.noting((), _of_robot(session, name, reported.warnings))
         notes = (*seen.notes, *_of_robot(session, name, reported.notes))
         seen = replace(seen, notes=notes)
-    rows = (it for it in session.observations if it.view.number not in seen.spared)
-    lost = [it for row in rows for it in _lost(session, row, found)]
-    return replace(seen, robots=found).noting(lost)
+    rows = [it for it in session.observations if it.view.number not in seen.spared]
+    return replace(seen, robots=found).noting(_lost(session, rows, found))
 
 
 def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
@@ -66,19 +65,20 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
     return replace(reported, base_from_flange=poses, matched=matched)
 
 
-def _lost(session: Session, row: Observation, found: Mapping[str, Reported]) -> Iterator[Rejection]:
+def _lost(
+    session: Session, rows: Sequence[Observation], found: Mapping[str, Reported]
+) -> Iterator[Rejection]:
     """Why where a robot stood is not known for an observation."""
-    view = row.view.number
-    for name in (*row.lacks, *row.robots):
-        if view in found[name].base_from_flange:
-            continue
-        reasons = {it.view: it.reason for it in found[name].rejections}
-        told = row.robots.get(name, row.view)
-        if told.number in reasons and (name in row.robots or row.view.stop is None):
+    reasons = {name: {it.view: it.reason for it in at.rejections} for name, at in found.items()}
+    for row in rows:
+        for name in (*row.lacks, *row.robots):
+            if row.view.number in found[name].base_from_flange:
+                continue
+            why = reasons[name].get(row.robots.get(name, row.view).number, "")
             of = f" ({name})" if len(session.robots) > 1 else ""
-            yield Rejection(view, f"{reasons[told.number]}{of}")
-        else:
-            yield Rejection(view, f"no row of its stop tells where {name or 'the robot'} stood")
+            if not why or (name in row.lacks and row.view.stop is not None):
+                why, of = f"no row of its stop tells where {name or 'the robot'} stood", ""
+            yield Rejection(row.view.number, f"{why}{of}")
 
 
 def _of_robot(session: Session, robot: str, told: tuple[str, ...]) -> Iterator[str]:
