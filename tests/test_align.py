@@ -309,13 +309,13 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         true = cell.true_arms[robot].offset - cell.arms[robot].offset
         arm = Robot.from_document(kinematics["robot"])
         told = arm.chain.functions[:, 0] - load_robot("ur5e").chain.functions[:, 0]
-        # What the first joint and the last could take is the base's and the flange's; others are
-        # known to some 0.05 mrad by this many stops.
-        assert told[[0, -1]] == pytest.approx(0.0, abs=1e-9)
+        # What the first joint and the last take may be the base's and the flange's: they stay about
+        # as stated. Others are known to some 0.05 mrad by this many stops.
+        assert told[[0, -1]] == pytest.approx(0.0, abs=1e-6)
         assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
-        zeros = [it for it in kinematics["parameters"] if it["name"] == "theta_rad"][1:-1]
-        surprises = ([it["change"] for it in zeros] - true[1:-1]) / [it["sigma"] for it in zeros]
-        assert np.abs(surprises).max() < 4.5  # one of eight in twenty thousand sessions
+        zeros = [it for it in kinematics["parameters"] if it["name"] == "theta_rad"]
+        surprises = ([it["change"] for it in zeros] - true) / [it["sigma"] for it in zeros]
+        assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
         one = Calibration.whole(found).of("cam_left", robot, f"target_plate_{robot}")
         np.testing.assert_allclose(
             one.standing(cell.joints[robot]), arm.base_from_flange(cell.joints[robot]), atol=1e-12
@@ -323,9 +323,8 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         written = document(Calibration.whole(found), "robot-dh", Selection(robot=robot))
         assert f"theta_offset_rad = {told[1]:.6f}"[:-2] in written.text
     assert off(cell, found, "cam_left", "cam_right")[1] < 22.0
-    assert found.edges["cell_from_cam_left"].sigma_mm < 0.4 * (
-        reported.edges["cell_from_cam_left"].sigma_mm
-    )
+    after, before = (it.between("cam_left", "cam_right").sigma_mm for it in (found, reported))
+    assert after < 0.4 * before
 
 
 def test_a_robot_without_joints_stays_as_it_reports_itself(clean):

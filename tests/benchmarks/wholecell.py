@@ -10,8 +10,8 @@ are rendered: corners carry noise.
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from multiprocessing import Pool
 
 import numpy as np
@@ -20,7 +20,6 @@ from results import wished, write_section
 from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.session import Session
-from visioncal.simulation.arms import forward
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
@@ -115,10 +114,12 @@ class Outcome:
 def outcome(seed: int) -> Outcome:
     it = world(seed)
     found = align(it.session, corners=it.corners)
-    truth = _regauged(it.cell)
     names = [edge.partition("_from_")[2] for edge in found.edges]
     error = np.concatenate(
-        [log(invert(truth(name, found)) @ found.edge_of(name).matrix) for name in names]
+        [
+            log(invert(_true(it.cell, name, found.reference)) @ found.edge_of(name).matrix)
+            for name in names
+        ]
     )
     offsets = [_zeros(found, it.cell, robot) for robot in ("a", "b")]
     (clock,) = found.details["clocks"].values()
@@ -135,35 +136,17 @@ def outcome(seed: int) -> Outcome:
 
 
 def _zeros(found: Alignment, cell: Network, robot: str) -> FloatArray:
-    """(k,) errors over their sigmas of the joints' zeros, from the second to the last but one."""
+    """(k,) errors over their sigmas of the joints' zeros."""
     rows = found.arms[robot].stages["kinematics"]["parameters"]
-    zeros = [it for it in rows if it["name"] == "theta_rad"][1:-1]
-    away = [it["change"] for it in zeros] - cell.true_arms[robot].offset[1:-1]
+    zeros = [it for it in rows if it["name"] == "theta_rad"]
+    away = [it["change"] for it in zeros] - cell.true_arms[robot].offset
     return np.asarray(away / [it["sigma"] for it in zeros])
 
 
-def _regauged(cell: Network) -> Callable[[str, Alignment], FloatArray]:
-    """Where frames are, errors of each arm's first and last joint being the base's and flange's."""
-    before, behind = {}, {}
-    for name, arm in cell.arms.items():
-        q = cell.joints[name][:1]
-        for place, turns in ((0, before), (-1, behind)):
-            only = np.zeros_like(arm.offset)
-            only[place] = cell.true_arms[name].offset[place]
-            turned = forward(replace(arm, offset=arm.offset + only), q)[0]
-            there = forward(arm, q)[0]
-            turns[name] = turned @ invert(there) if place == 0 else invert(there) @ turned
-
-    def truth(name: str, found: Alignment) -> FloatArray:
-        parent, at = cell.parents[name], cell.transforms[name]
-        if parent != "cell":
-            return behind[parent.removeprefix("flange_")] @ at
-        if name.startswith("base_"):
-            at = at @ before[name.removeprefix("base_")]
-        reference = cell.transforms[found.reference] @ before[found.reference.removeprefix("base_")]
-        return invert(reference) @ at
-
-    return truth
+def _true(cell: Network, name: str, reference: str) -> FloatArray:
+    """(4, 4) where a frame is on its flange, or in the cell."""
+    at = cell.transforms[name]
+    return invert(cell.transforms[reference]) @ at if cell.parents[name] == "cell" else at
 
 
 def report(cells: Sequence[Outcome], taken_s: float) -> str:

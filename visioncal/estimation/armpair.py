@@ -169,7 +169,6 @@ class ArmData:
         at: (3,) the point of a target that counts, in its frame [m].
         frames: (f,) which of the unknowns are frames of which nothing is known.
         measured: (6,) which components of the poses are seen (rotation, translation).
-        apart: (p, p) projection of its errors on those that are not the frames'; None for all.
     """
 
     problem: Problem
@@ -186,7 +185,6 @@ class ArmData:
     at: FloatArray
     frames: IntArray
     measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
-    apart: FloatArray | None = None
 
     @property
     def spread(self) -> FloatArray:
@@ -205,5 +203,4 @@ class ArmData:
 
     def basis(self, q: FloatArray) -> FloatArray:
         """(k, 6, p) how the flange moves with the arm's errors."""
-        found = self.model.basis(q)
-        return found if self.apart is None else found @ self.apart
+        return self.model.basis(q)

@@ -98,19 +98,3 @@ def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     padded = np.vstack([matrix, np.zeros((matrix.shape[1],) * 2)])
     _, sizes, turned = np.linalg.svd(np.linalg.qr(padded, mode="r"))
     return sizes, turned
-
-
-def frames_apart(frames: FloatArray, arm: FloatArray) -> FloatArray:
-    """Projects errors of the arm on those that no frames at its ends do as well.
-
-    Args:
-        frames: (r, f) slopes by the frames, at postures all over the workspace.
-        arm: (r, p) slopes by the errors.
-
-    Returns:
-        (p, p) a symmetric projection.
-    """
-    _, free = Slopes(frames, arm).free()
-    sizes, turned = right_vectors(free)
-    null = turned[sizes <= LEAST_SHARE * sizes[0]]
-    return np.asarray(np.eye(arm.shape[1]) - null.T @ null)

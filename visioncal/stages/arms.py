@@ -1,11 +1,10 @@
 """The robots' arms: where each stood, which of its errors show, and how they are unknowns."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from visioncal.estimation.arm import (
     ArmErrors,
@@ -18,8 +17,6 @@ from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Effect, Problem, State
 from visioncal.estimation.solve import Solution
-from visioncal.estimation.told import frames_apart
-from visioncal.estimation.workspace import postures
 from visioncal.robot import Convention, Loads
 from visioncal.stages import backlash, elastic
 from visioncal.stages.backlash import Play, plays_of
@@ -27,7 +24,6 @@ from visioncal.stages.elastic import Elastic, springs_of
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import Kinematics, choose_level
 from visioncal.stages.tell import Telling, tell
-from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray, Mask
 
 
@@ -73,8 +69,6 @@ class RobotArm:
         errors: Errors that follow its posture, where they are likely.
         kinematics: Which levels were compared; None where that was not asked or cannot be.
         model: The arm with the errors of the level that was taken; None where it stays as stated.
-        apart: Of each block of its model's errors, the (p, p) projection on those that the frames
-            of its base and of what it carries do not do as well: these frames go with the arm.
     """
 
     robot: str
@@ -86,7 +80,6 @@ class RobotArm:
     errors: ArmErrors | None = None
     kinematics: Kinematics | None = None
     model: ArmModel | None = None
-    apart: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def poses(self) -> FloatArray:
@@ -157,7 +150,6 @@ class RobotArm:
             self.loads.chosen(rows),
             middles.get(observed, np.zeros(3)),
             edges[problem.counted[edges]],
-            apart=block_diag(*(self._apart(self.model, name) for name in self.model.weights)),
         )
 
     def found(self, seen: ArmData | None, convention: Convention | None = None) -> ArmFound:
@@ -222,23 +214,17 @@ class RobotArm:
         q, loads = self.joints_rad, self.loads
         model = ArmModel.of(self.matched.arm, q, self.reported[self.stood]).loaded(q, loads)
         blocks = blocks_of(model.nominal, loads)
-        apart = {name: frames_apart(*_anywhere(model, name)) for name in blocks if name in RIGID}
-        arm = replace(self, apart=apart)
-        bases = {name: arm._columns(model, name) for name in blocks}
+        bases = {name: self._columns(model, name) for name in blocks}
         start = State(fit.state.edges, problem.start_values)
         found = choose_level(problem, start, self.robot, bases, asked, noise=fit.noise)
-        arm = replace(arm, kinematics=found)
+        arm = replace(self, kinematics=found)
         return arm._bending(model.erring(found.errors)) if found.errors else arm
 
     def _columns(self, model: ArmModel, name: str) -> FloatArray:
-        """(s, 6, p) how the flange moves with the errors of a block, apart from frames."""
+        """(s, 6, p) how the flange moves with the errors of a block."""
         if self.joints_rad is None:
             raise RuntimeError("an arm is calibrated by its joints")
-        columns = self._by_stop(model.columns(name, self.joints_rad, self.loads))
-        return columns @ self._apart(model, name)
-
-    def _apart(self, model: ArmModel, name: str) -> FloatArray:
-        return self.apart[name] if name in self.apart else np.eye(model.size_of(name))
+        return self._by_stop(model.columns(name, self.joints_rad, self.loads))
 
     def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
         """Linearises the calibrated arm anew where a fit has it.
@@ -267,16 +253,6 @@ class RobotArm:
         found = np.zeros((len(self.stood), *columns.shape[1:]))
         found[self.stood] = columns
         return found
-
-
-def _anywhere(model: ArmModel, name: str) -> tuple[FloatArray, FloatArray]:
-    """Slopes all over the workspace, by the frames at both ends and by a block's errors."""
-    q = postures(model.robot)
-    of_base = adjoint(invert(model.base_from_flange(q)))
-    of_flange = np.broadcast_to(np.eye(6), of_base.shape)
-    columns = model.columns(name, q)
-    frames = np.concatenate([of_base, of_flange], axis=2)
-    return frames.reshape(-1, 12), columns.reshape(-1, columns.shape[2])
 
 
 def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
