@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.alignment.cell import Cell, robot_key
 from visioncal.estimation.arm import misfit_covariance, stops_of
 from visioncal.estimation.misfit import Drift, Neighbours, drift, inflation, neighbours
 from visioncal.estimation.problem import Problem
@@ -13,6 +12,7 @@ from visioncal.estimation.solve import Solution
 from visioncal.session import View
 from visioncal.session.loads import loads_of
 from visioncal.stages.arms import ArmFound, RobotArm
+from visioncal.stages.cell import Cell, robot_key
 from visioncal.stages.diagnose import FEWEST_STOPS, misfit_words
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import ASKED, doubts, findings

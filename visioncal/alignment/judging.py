@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from visioncal.alignment.cell import Cell
 from visioncal.alignment.faults import PoseFault, by_way_of
 from visioncal.alignment.solving import Solved
 from visioncal.alignment.ties import robot_motion
@@ -22,6 +21,7 @@ from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
+from visioncal.stages.cell import Cell
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
 from visioncal.types import Mask, Rejection
 

@@ -6,7 +6,6 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.alignment.cell import Cell
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import Fitted, settle
@@ -14,6 +13,7 @@ from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.problem import Effect, Noise, Problem
 from visioncal.estimation.scene import CornerProblem, repeat_shares
 from visioncal.stages.arms import RobotArm, effects_of
+from visioncal.stages.cell import Cell
 from visioncal.stages.observed import Observed
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.refine import refined

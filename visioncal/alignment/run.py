@@ -16,7 +16,6 @@ from visioncal.alignment.arms import (
     misfits,
     notes_on_arms,
 )
-from visioncal.alignment.cell import Cell, read_cell, robot_key
 from visioncal.alignment.faults import (
     PoseFault,
     Version,
@@ -44,6 +43,7 @@ from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.arms import ArmFound
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
+from visioncal.stages.cell import Cell, read_cell, robot_key
 from visioncal.stages.clock import Pair
 from visioncal.stages.clocks import set_clocks
 from visioncal.stages.delays import FoundDelay

@@ -6,10 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.alignment.arms import arms_of, check_arms, with_errors
-from visioncal.alignment.cell import Cell
-from visioncal.alignment.clocks import clock_effects
 from visioncal.alignment.lenses import CellSide, settled_looks, with_looks
-from visioncal.alignment.priors import most_contradicted
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
@@ -17,11 +14,14 @@ from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.stages.arms import RobotArm, effects_of
+from visioncal.stages.cell import Cell
 from visioncal.stages.choose import chosen
+from visioncal.stages.clocks import clock_effects
 from visioncal.stages.found import found_of_looks
 from visioncal.stages.observed import Observed
 from visioncal.stages.pairwise import Candidates
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.priors import most_contradicted
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
 from visioncal.targets import rotation_transforms

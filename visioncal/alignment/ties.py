@@ -4,10 +4,10 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from visioncal.alignment.cell import Cell
 from visioncal.errors import DegenerateError
 from visioncal.estimation.observability import motion_words, open_offset
 from visioncal.files import some_of
+from visioncal.stages.cell import Cell
 from visioncal.transforms import invert
 from visioncal.types import IntArray
 

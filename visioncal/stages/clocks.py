@@ -4,17 +4,24 @@ Every pair of a camera and a robot has clocks of its own, whose offset is estima
 that both have seen.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
+
 from visioncal.errors import VisioncalError
+from visioncal.estimation.effects.clock import clock_effect
+from visioncal.estimation.problem import Effect
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import is_seen
 from visioncal.session.tables import ClockTable
-from visioncal.stages.clock import Pair, Sweep, set_clock
+from visioncal.stages.cell import Cell, robot_key
+from visioncal.stages.clock import Clocked, Pair, Sweep, set_clock
 from visioncal.stages.motion import is_open, motion_of, stream_of
 from visioncal.stages.observed import Observed
+from visioncal.stages.offset import Clock
 from visioncal.targets import numbered_positions
 from visioncal.types import Rejection
 
@@ -97,3 +104,28 @@ def _stated_s(session: Session, camera: str) -> float | None:
     }
     clock = tables.get(camera, declared.clock)
     return clock.camera_minus_robot_s if clock.model_fields_set else None
+
+
+def clock_effects(cell: Cell, clocks: Mapping[Pair, Clocked]) -> tuple[Effect, ...]:
+    """The errors of offsets and times within images [s], as effects on the cell's rows."""
+    views = [it.view for it in cell.rows]
+    found: list[Effect] = []
+    for pair, clocked in clocks.items():
+        if clocked.clock.speeds and robot_key(pair.robot) in cell.poses:
+            found.append(_effect(cell, pair, clocked.clock))
+            found += [
+                it.effect(views, pair.delay(it.of)) for it in clocked.clock.delays if it.is_clear
+            ]
+    return tuple(found)
+
+
+def _effect(cell: Cell, pair: Pair, clock: Clock) -> Effect:
+    speeds = clock.speeds
+    concerned = np.array([it.view in speeds for it in cell.rows], dtype=bool)
+    robot = robot_key(pair.robot)
+    moving = np.zeros((len(cell.poses[robot]), 6))
+    for row in cell.rows:
+        if row.view in speeds:
+            moving[row.station] = speeds[row.view]
+    found = clock_effect(moving, clock.sigma_s, pair.effect, robot)
+    return replace(found, concerned=concerned)

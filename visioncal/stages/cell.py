@@ -7,13 +7,13 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from visioncal.alignment.priors import priors_of
 from visioncal.errors import DataError
 from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen
 from visioncal.stages.observed import HELD_BACK, Observed
+from visioncal.stages.priors import priors_of
 from visioncal.stages.reported import Reported
 from visioncal.types import FloatArray
 
@@ -25,7 +25,6 @@ class Row:
     """An observation that can be used, of a place alone or of a pose."""
 
     view: int
-    stop: int | None
     station: int
     seer: str
     seen: str
@@ -112,7 +111,6 @@ def read_cell(seen: Observed) -> Cell:
     rows = [
         Row(
             it.view.number,
-            it.view.stop,
             it.station,
             it.seer,
             it.seen,
