@@ -60,7 +60,8 @@ def session_of(cell: Cell) -> Session:
 def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **changes) -> Known:
     """What is known after detection; without `joints`, poses are all that is said of the robot."""
     model = load_robot(cell.options.robot) if robot is None else robot
-    matched = Matched(model, dict(enumerate(cell.joints))) if joints else None
+    known = joints or robot is not None
+    matched = Matched(model, dict(enumerate(cell.joints)) if joints else {}) if known else None
     reported = Reported(dict(enumerate(cell.base_from_flange)), matched=matched)
     known = replace(Known(session_of(cell)), robots={"": reported}, **changes)
     return detect_targets(known, {it.view: it for it in cell.corners})
