@@ -11,7 +11,7 @@ from commands import visioncal
 from later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
 from pages import Page
 
-from visioncal import calibrate
+from visioncal import calibrate, verify
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.pipeline.result import result_of
@@ -219,6 +219,25 @@ def test_one_of_two_boards_that_moved_is_named():
     with pytest.raises(DataError, match="several boards") as refused:
         check(moved, footing, board_placed_anew=True)
     assert "the one that moved is named" in refused.value.next_step
+
+
+def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_path):
+    cell = simulate(CellOptions(views=24, seed=3))
+    flange = cell.base_from_flange.copy()
+    # Two images of one stop stand in the rows of another.
+    flange[[4, 9]] = flange[[9, 4]]
+    wrong = replace(cell, base_from_flange=flange)
+    session = Session.load(write_session(wrong, tmp_path / "cell", images=False))
+    calibration = calibrate(session)
+    assert [it.view for it in calibration.views if not it.used] == [4, 9]
+    found = verify(session, calibration)
+    assert found.passed
+    assert found.seen.stops == 22
+    assert [it["view"] for it in to_document(found, ())["not_used"]] == [4, 9]
+    # Of another session nothing is known beforehand.
+    assert not verify(
+        replace(session, document={**session.document, "name": "b"}), calibration
+    ).passed
 
 
 def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(tmp_path):

@@ -118,11 +118,13 @@ def verify(
     Raises:
         DataError: The session is of another cell, or the calibration does not say enough.
     """
+    is_its_own = session.digest() == calibration.session_sha256
     session, calibration = picked(session, calibration, Choice(camera, robot, target))
+    # What the calibration has left out contradicts it now as it did then.
+    without = {it.view: it.reason for it in calibration.views if is_its_own and not it.used}
     footing = Footing.of(calibration)
-    return check(
-        see_again(session, footing, progress), footing, board_placed_anew=board_placed_anew
-    )
+    seen = see_again(session, footing, progress, without)
+    return check(seen, footing, board_placed_anew=board_placed_anew)
 
 
 def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> Check:

@@ -1,6 +1,6 @@
 """A few stops of a session, seen with a calibration's own lens, boards and arm."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from reprlib import repr as shorten
 
@@ -21,7 +21,7 @@ from visioncal.session.boards import COLUMN
 from visioncal.stages.choose import choose_by
 from visioncal.targets import target_document
 from visioncal.transforms import invert, pose_difference
-from visioncal.types import FloatArray, IntArray, Progress, Target
+from visioncal.types import FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.verification.footing import Footing
 
 # Models that place the flange alike to this are of one robot; tables are written with six digits.
@@ -75,13 +75,19 @@ class Seen:
         return not self.problem.is_combined
 
 
-def see_again(session: Session, footing: Footing, progress: Progress | None = None) -> Seen:
+def see_again(
+    session: Session,
+    footing: Footing,
+    progress: Progress | None = None,
+    without: Mapping[int, str] | None = None,
+) -> Seen:
     """Looks at a session with what a calibration rests on, and estimates nothing anew.
 
     Args:
         session: Of the same cell.
         footing: The calibration's.
         progress: Told of long work.
+        without: Views that are not to be looked at, and why not.
 
     Raises:
         DataError: It is of another mount, camera, target or robot, lacks joint angles that the
@@ -89,7 +95,8 @@ def see_again(session: Session, footing: Footing, progress: Progress | None = No
     """
     known = _STAGES["robot"](known_before(session, footing, progress))
     known = _STAGES["detect"](known)
-    return seen_by(known, footing)
+    rejected = {it: why for it, why in (without or {}).items() if it not in known.held_back}
+    return seen_by(known.noting(Rejection(*it) for it in rejected.items()), footing)
 
 
 def known_before(session: Session, footing: Footing, progress: Progress | None = None) -> Known:
@@ -172,7 +179,9 @@ def _posed(known: Known, footing: Footing) -> Known:
     views, chosen = [], []
     for view in (it.number for it in known.session.views):
         poses = known.poses.get(view)
-        if poses is None or view not in known.base_from_flange or poses.board not in order:
+        if poses is None or view not in known.base_from_flange or view in known.reasons:
+            continue
+        if poses.board not in order:
             continue
         robot = robot_part(known.flange_poses([view]), mount)[0]
         predicted = invert(robot @ x) @ placed[order[poses.board]]

@@ -260,7 +260,7 @@ def _joint_figures(check: Check, suspect: Suspect) -> tuple[float, float, str]:
 
 def _agreement(check: Check) -> str:
     turn, shift = np.sqrt(np.mean(np.sum(check.away.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
-    chance = f"{100 * check.p_value:.2g} %"
+    chance = f"{figure(100 * check.p_value)} %"
     sure = _SURE * check.camera_sigma
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     return (
