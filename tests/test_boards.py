@@ -293,7 +293,7 @@ def test_what_is_written_of_the_fit_is_read_back(given):
     known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))
     assert known.arm_model is not None
     footing, solved = Footing.of(result_of(known)), known.solved
-    np.testing.assert_allclose(footing.edges, solved.state.edges, atol=1e-12)
+    np.testing.assert_allclose(footing.state.edges, solved.state.edges, atol=1e-12)
     sigmas = np.sqrt(np.diag(solved.covariance))
     # Slopes there and back undo each other up to rounding.
     scale = np.outer(sigmas, sigmas)

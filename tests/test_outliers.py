@@ -146,3 +146,19 @@ def test_a_square_is_the_distance_from_what_the_others_predict():
         state, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
         without = distances(problem, others, Solution(state, fit.noise))
         assert without.squares[view] == pytest.approx(inside.squares[view], rel=1e-3)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_rows_that_are_exchanged_and_an_image_of_another_row_are_named(mount):
+    cell = simulate(CellOptions(mount=mount, seed=3))
+    poses = cell.base_from_flange.copy()
+    poses[[4, 9]] = poses[[9, 4]]
+    corners = [replace(cell.corners[2], view=7) if it.view == 7 else it for it in cell.corners]
+    known = calibrated(replace(cell, base_from_flange=poses, corners=tuple(corners)), joints=False)
+    verdict = known.verdict
+    assert verdict.status == "check"
+    (words,) = [it for it in verdict.reasons if "exchanged" in it]
+    assert words.startswith("Views 4 and 9 are exchanged: the image of each fits the pose in the")
+    (words,) = [it for it in verdict.reasons if it.startswith("View 7 was left out")]
+    assert "it fits the pose of view 2: its pose or its image is wrong" in words
+    assert set(known.reasons) == {4, 7, 9}

@@ -2,24 +2,20 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
-from visioncal.chance import chi2_limit
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import by_noise_alone
 from visioncal.figures import figure
 from visioncal.files import some_of
+from visioncal.stages.agree import exchanged, other_stops
 from visioncal.stages.validate import apart
 from visioncal.transforms import distances, mean_transform, pose_difference
 from visioncal.types import FloatArray, IntArray, Mask
 
-# An image fits another stop where it is as near to what is predicted there as noise may put it, and
-# twice as far: what is predicted has errors, too, and other stops are farther by far.
-_CHANCE, _NEAR = 1e-3, 4.0
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
 # A robot's pose is wrong where so many observations of its stop say so.
@@ -141,7 +137,7 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     if not len(out):
         return ()
     found = _pushed_bases(solved)
-    found += _exchanged(solved, _mutual(solved, out, _fitting(solved, out)))
+    found += _exchanged(solved, exchanged(solved.agreed.problem, _fitting(solved, out)))
     explained = {row for it in found for row in it.rows}
     return (*found, *_wrong_poses(solved, explained))
 
@@ -230,7 +226,7 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
         return {}
     away = residuals(solved)[out]
     fitting = _fitting(solved, out)
-    mutual = _mutual(solved, out, fitting)
+    mutual = exchanged(solved.agreed.problem, fitting)
     robots = {row: it.short for it in faults if it.short for row in it.rows}
     found = {}
     for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
@@ -267,79 +263,9 @@ def residuals(solved: Solved) -> FloatArray:
 
 
 def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
-    """The other stations that observations fit, which do not fit their own, best first."""
-    # Between the last stop before a move and the first one after it, either may be true.
-    late = {it.twin: it.stop for it in solved.agreed.moves}
-    early = {it.twin: _last_used(solved, it.frame) + 1 for it in solved.agreed.moves}
-    found = {}
-    for at in out.tolist():
-        ways = [_squares_by_station(solved, at, it) for it in (late, early)]
-        squares = np.minimum(*ways)
-        squares[solved.cell.rows[at].station] = np.inf
-        near = np.flatnonzero(squares < _NEAR * chi2_limit(_CHANCE, 6))
-        if len(near):
-            found[at] = near[np.argsort(squares[near])].tolist()
-    return found
-
-
-def _last_used(solved: Solved, key: str) -> int:
-    """The last station at which a frame, as the problem knows it, is in what is used."""
-    problem = solved.agreed.problem
-    rows = problem.observations.involves(key) & solved.agreed.used
-    return int(problem.observations.stops[rows].max(initial=-1))
-
-
-def _squares_by_station(solved: Solved, at: int, starts: Mapping[str, int]) -> FloatArray:
-    """Squared distances (s,) of an observation from what is predicted at every station.
-
-    Args:
-        solved: The fit.
-        at: The observation.
-        starts: The first station of each frame that stands elsewhere from then on.
-
-    Returns:
-        Infinite where a robot's pose is not known, or where no robot has a part in it.
-    """
-    problem, row = solved.agreed.problem, solved.cell.rows[at]
-    stations = np.arange(len(solved.cell.stops))
-    repeated = np.full(len(stations), at)
-    here = replace(
-        problem.observations.take(repeated),
-        observers=(row.seer,) * len(stations),
-        observed=(row.seen,) * len(stations),
-        stops=stations,
-    )
-    for move in solved.agreed.moves:
-        here = here.renamed(move.frame, move.twin, stations >= starts[move.twin])
-    effects = tuple(it.take(repeated) for it in problem.effects)
-    there = replace(problem, observations=here, effects=effects)
-    known, squares = _known(there), np.full(len(stations), np.inf)
-    if known.any() and any(it.robot for group in there.groups for it in group.path):
-        squares[known] = by_noise_alone(there.subset(known), solved.agreed.fit)
-    return squares
-
-
-def _known(problem: Problem) -> Mask:
-    """(n,) whether every robot in an observation's way has a known pose."""
-    known = np.ones(len(problem), dtype=bool)
-    for group in problem.groups:
-        for step in group.path:
-            if step.robot:
-                poses = problem.poses[step.robot][problem.observations.stops[group.rows]]
-                known[group.rows] &= np.isfinite(poses[:, 0, 0])
-    return known
-
-
-def _mutual(solved: Solved, out: IntArray, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Pairs of observations of one camera and board, of which each fits the other's stop."""
-    rows, found = solved.cell.rows, {}
-    for a in out.tolist():
-        for b in out.tolist():
-            if a >= b or (rows[a].seer, rows[a].seen) != (rows[b].seer, rows[b].seen):
-                continue
-            if rows[b].station in fitting.get(a, ()) and rows[a].station in fitting.get(b, ()):
-                found[a], found[b] = b, a
-    return found
+    """The other stations that observations fit; see `other_stops`."""
+    agreed = solved.agreed
+    return other_stops(agreed.problem, agreed.used, agreed.fit, out, agreed.moves)
 
 
 def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:

@@ -323,7 +323,7 @@ def _judge(known: Known) -> Known:
         used_rms(known),
         rms_of(held.away_m, held.away_rad, held.rms_px),
         holdout_rms(known),
-        agreed.rejections,
+        agreed.unexplained,
     )
     sensor = Sensor(
         sum(it.used for it in views), lost, [it.view for it in agreed.rejections], known.pixel_px
@@ -343,7 +343,7 @@ def _judge(known: Known) -> Known:
         (arm,),
         known.solved.worst,
         (Place("Where the views look, a point", budget, diagnosis.radius95_mm),),
-        known.warnings,
+        (*agreed.doubts(), *known.warnings),
         known.notes,
         known.session.mount,
     )

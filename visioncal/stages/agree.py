@@ -1,7 +1,7 @@
-"""Takes out the views that are wrong as a whole."""
+"""Takes out the views that are wrong as a whole, and says which stops they fit instead."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -9,8 +9,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from visioncal.chance import chi2_limit
+from visioncal.estimation.moves import Move
 from visioncal.estimation.outliers import LEAST_VIEWS, inliers
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import Solution, by_noise_alone
 from visioncal.estimation.variance import LEAST_SIGMA
 from visioncal.figures import figure
 from visioncal.threads import one_blas_thread
@@ -19,6 +21,11 @@ from visioncal.types import FloatArray, IntArray, Mask, Mount, Rejection
 
 # Two sound images of one stop disagree in one session of a thousand.
 _FALSE_ALARM = 1e-3
+# An image fits another stop where it is as near to what is predicted there as noise may put it, and
+# twice as far: what is predicted has errors, too, and other stops are farther by far.
+_CHANCE, _NEAR = 1e-3, 4.0
+# So many of the views whose pose another one fits are named.
+_NAMED = 3
 # The noise of measured poses differs by so much from view to view: with tilt and distance.
 _UNEVEN = 3.0
 
@@ -31,11 +38,27 @@ class Agreed:
         mask: (m,) which ones.
         frames: (4, 4) where the unknown frames are as they see them.
         rejections: The others, with the figures.
+        exchanged: Pairs of them, each of which fits the pose of the other.
     """
 
     mask: Mask
     frames: Mapping[str, FloatArray]
     rejections: tuple[Rejection, ...]
+    exchanged: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def unexplained(self) -> list[Rejection]:
+        """The others, but for those that are exchanged."""
+        explained = {view for pair in self.exchanged for view in pair}
+        return [it for it in self.rejections if it.view not in explained]
+
+    def doubts(self) -> Iterator[str]:
+        """Says which rows to exchange."""
+        for first, second in self.exchanged:
+            yield (
+                f"Views {first} and {second} are exchanged: the image of each fits the pose in the "
+                "other's row. They were left out: exchange them in views.csv, and calibrate again."
+            )
 
 
 def agree(
@@ -73,6 +96,11 @@ def agree(
     mask, state, away = found.used[units], found.fit.state, found.distances
     between = invert(problem.predicted(state)) @ problem.measured(state)
     away_m, away_rad = np.linalg.norm(between[:, :3, 3], axis=1), rotation_angle(between)
+    with one_blas_thread():
+        fitting = other_stops(
+            problem, mask, Solution(state, found.fit.noise), np.flatnonzero(~mask)
+        )
+    mutual = exchanged(problem, fitting)
     counted = np.maximum(away.directions, 1)
     surprise, limit = (np.sqrt(it / counted)[units] for it in (away.squares, away.limit))
     seen = "target" if mount != "instrument" else "point" if problem.points else "probe"
@@ -81,6 +109,12 @@ def agree(
         turned = "" if problem.points else f" and {figure(np.rad2deg(away_rad[at]))} deg"
         of_its_target = (observed == observed[at]) & mask & several
         cause = _cause(views, (stops == stops[at]) & mask, of_its_target, mount)
+        if at in mutual:
+            other = views[mutual[at]]
+            cause = f"it fits the pose of view {other}, which fits its own: they are exchanged"
+        elif at in fitting:
+            first = [views[int(np.argmax(stops == it))] for it in fitting[at][:_NAMED]]
+            cause = f"it fits the pose of view {', '.join(map(str, first))}: {cause}"
         rejections.append(
             Rejection(
                 views[at],
@@ -89,7 +123,98 @@ def agree(
                 f"{figure(limit[at])}); {cause}",
             )
         )
-    return Agreed(mask, dict(zip(problem.unknown, state.edges, strict=True)), tuple(rejections))
+    return Agreed(
+        mask,
+        dict(zip(problem.unknown, state.edges, strict=True)),
+        tuple(rejections),
+        tuple((views[one], views[other]) for one, other in sorted(mutual.items()) if one < other),
+    )
+
+
+def other_stops(
+    problem: Problem, used: Mask, fit: Solution, out: IntArray, moves: Sequence[Move] = ()
+) -> dict[int, list[int]]:
+    """The other stops that observations fit which do not fit their own, best first.
+
+    Args:
+        problem: All n observations.
+        used: (n,) those that the fit was made from.
+        fit: The unknowns and the noise.
+        out: Observations that are left out.
+        moves: What moved between stops.
+    """
+    seen = problem.observations
+    # Between the last stop before a move and the first one after it, either may be true.
+    late = {it.twin: it.stop for it in moves}
+    early = {
+        it.twin: int(seen.stops[seen.involves(it.frame) & used].max(initial=-1)) + 1 for it in moves
+    }
+    found = {}
+    for at in out.tolist():
+        squares = np.minimum(
+            *(_squares_by_stop(problem, fit, at, moves, starts) for starts in (late, early))
+        )
+        squares[seen.stops[at]] = np.inf
+        near = np.flatnonzero(squares < _NEAR * chi2_limit(_CHANCE, 6))
+        if len(near):
+            found[at] = near[np.argsort(squares[near])].tolist()
+    return found
+
+
+def _squares_by_stop(
+    problem: Problem, fit: Solution, at: int, moves: Sequence[Move], starts: Mapping[str, int]
+) -> FloatArray:
+    """Squared distances (s,) of an observation from what is predicted at every stop.
+
+    Infinite where a robot's pose is not known, or where no robot has a part in it. What moved is at
+    its other place from the stops in `starts` on.
+    """
+    seen = problem.observations
+    stops = np.arange(max(map(len, problem.poses.values()), default=0))
+    repeated = np.full(len(stops), at)
+    observer, observed = (it[at].partition("@")[0] for it in (seen.observers, seen.observed))
+    here = replace(
+        seen.take(repeated),
+        observers=(observer,) * len(stops),
+        observed=(observed,) * len(stops),
+        stops=stops,
+    )
+    for move in moves:
+        here = here.renamed(move.frame, move.twin, stops >= starts[move.twin])
+    effects = tuple(it.take(repeated) for it in problem.effects)
+    there = replace(problem, observations=here, effects=effects)
+    known, squares = _known(there), np.full(len(stops), np.inf)
+    if known.any() and any(it.robot for group in there.groups for it in group.path):
+        squares[known] = by_noise_alone(there.subset(known), fit)
+    return squares
+
+
+def _known(problem: Problem) -> Mask:
+    """(n,) whether every robot in an observation's way has a known pose."""
+    known = np.ones(len(problem), dtype=bool)
+    for group in problem.groups:
+        for step in group.path:
+            if step.robot:
+                poses = problem.poses[step.robot][problem.observations.stops[group.rows]]
+                known[group.rows] &= np.isfinite(poses[:, 0, 0])
+    return known
+
+
+def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
+    """Pairs of observations of the same two frames, of which each fits the other's stop.
+
+    Args:
+        problem: All observations.
+        fitting: The other stops that some of them fit; see `other_stops`.
+    """
+    seen, found = problem.observations, {}
+    first = [it.partition("@")[0] for it in seen.observers]
+    second = [it.partition("@")[0] for it in seen.observed]
+    for a, b in combinations(sorted(fitting), 2):
+        alike = (first[a], second[a]) == (first[b], second[b])
+        if alike and seen.stops[b] in fitting[a] and seen.stops[a] in fitting[b]:
+            found[a], found[b] = b, a
+    return found
 
 
 def whole_units(problem: Problem) -> IntArray:
