@@ -34,7 +34,7 @@ from visioncal.alignment.judging import (
 from visioncal.alignment.solving import Solved, sensors_of, solve
 from visioncal.alignment.ties import untied_words
 from visioncal.alignment.unseen import budget_mm, left_out
-from visioncal.alignment.written import corner_residuals, fit_sections
+from visioncal.alignment.written import fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
 from visioncal.estimation.arm import stops_of
@@ -364,14 +364,15 @@ def _sights(
     """What became of each observation, in the order of the session's rows."""
     rows, used = solved.cell.rows, solved.agreed.used
     away, why = residuals(solved), reasons(solved, faults)
-    corners = corner_residuals(solved, solved.agreed.fit.state, np.arange(len(rows)))
+    rms_px = solved.chain_px(np.arange(len(rows)), solved.agreed.fit.state)
     unseen = np.full((len(rows), 3), np.nan)
     unseen[used] = np.stack(
         [1e3 * held_out.away_m, np.rad2deg(held_out.away_rad), held_out.rms_px], axis=1
     )
     found = {}
     for at, row in enumerate(rows):
-        mm, deg = _known(away[at])
+        mm, deg, px = _known(np.append(away[at], rms_px[at]))
+        corners = solved.poses[at].corners
         found[row.view] = Sight(
             row.view,
             solved.cell.stops[row.station],
@@ -381,7 +382,8 @@ def _sights(
             why.get(row.view, ""),
             mm,
             deg,
-            *corners.get(row.view, (None, None)),
+            None if corners is None else len(corners.ids),
+            px,
             *_known(unseen[at]),
         )
     lost = solved.cell.reasons

@@ -24,8 +24,9 @@ from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.priors import most_contradicted
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
+from visioncal.stages.validate import chain_rms_px
 from visioncal.targets import rotation_transforms
-from visioncal.types import IntArray, Mask, Target
+from visioncal.types import FloatArray, IntArray, Mask, Target
 
 # Arms are linearised anew so often, or until their errors move by less, which is far below any
 # arm's repeatability.
@@ -76,6 +77,22 @@ class Solved:
             return None
         found = self.agreed.problem.values_of(LENSES, state)
         return self.seen.looks.with_values(self.seen.free, found)
+
+    def chain_px(self, rows: IntArray, state: State) -> FloatArray:
+        """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
+
+        Args:
+            rows: (m,) the observations.
+            state: The unknowns of the fit, or those of another one to a part of them.
+        """
+        looks, chosen = self.looks_at(state), np.isin(np.arange(len(self.cell.rows)), rows)
+        if looks is None:
+            return np.full(len(rows), np.nan)
+        poses = self.agreed.problem.subset(chosen).predicted(state)
+        lenses = {it: looks.camera(it) for it in looks.problems}
+        seen = [self.poses[it].corners for it in rows]
+        cameras = [lenses.get(self.cell.rows[it].seer) for it in rows]
+        return chain_rms_px(seen, poses, cameras, np.concatenate(looks.corners))
 
     def columns_of(self, places: IntArray) -> IntArray:
         """The problem's columns of free values of lenses and boards, by their places."""

@@ -5,39 +5,26 @@ from collections.abc import Mapping
 import numpy as np
 
 from visioncal.alignment.solving import Solved
-from visioncal.alignment.written import corner_residuals
 from visioncal.estimation.appearance import shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.effects.lenses import LENSES
-from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import State
-from visioncal.estimation.solve import normal_equations
+from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.solve import solve_problem
 from visioncal.stages.validate import HeldOut, validate
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.types import FloatArray, IntArray
 
 
 def left_out(solved: Solved) -> HeldOut:
     """Residuals of the used observations, each by a fit without its stop."""
     fit, used = solved.agreed.fit, np.flatnonzero(solved.agreed.used)
-    problem = solved.agreed.problem.subset(solved.agreed.used)
-    needs = [frozenset[str]()] * len(problem)
-    for group in problem.groups:
-        frames = frozenset(it.frame for it in group.path if it.frame in problem.unknown)
-        for row in group.rows.tolist():
-            needs[row] = frames
 
-    def again(kept: Mask) -> State:
-        # One step: a few stops move the answer by its sigmas, over which it is linear.
-        part = problem.subset(kept)
-        information, gradient = normal_equations(part, fit.state, fit.noise)
-        return fit.state.moved(-covariance_among(information, part.moving) @ gradient)
+    def again(part: Problem) -> State:
+        return solve_problem(part, fit.state, fit.noise)[0]
 
     def pixels(rows: IntArray, state: State) -> FloatArray:
-        found, every = corner_residuals(solved, state, used[rows]), solved.cell.rows
-        return np.array([found.get(every[it].view, (0, np.nan))[1] for it in used[rows].tolist()])
+        return solved.chain_px(used[rows], state)
 
-    stops = np.unique(problem.observations.stops, return_inverse=True)[1]
-    return validate(problem, stops, needs, again, pixels)
+    return validate(solved.agreed.problem.subset(solved.agreed.used), again, pixels)
 
 
 def budget_mm(solved: Solved, of_arms: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:

@@ -1,4 +1,4 @@
-"""What is written of a whole cell's lenses, boards and corners beside its frames."""
+"""What is written of a whole cell's lenses and boards beside its frames."""
 
 from typing import Any
 
@@ -6,40 +6,9 @@ import numpy as np
 
 from visioncal.alignment.solving import Solved
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
-from visioncal.estimation.corners import reproject
-from visioncal.estimation.problem import State
 from visioncal.session import Session
 from visioncal.session.frames import thing_name
-from visioncal.types import FloatArray, IntArray
-
-
-def corner_residuals(solved: Solved, state: State, rows: IntArray) -> dict[int, tuple[int, float]]:
-    """By view, how many corners its image has, and how far they are off the whole chain [px].
-
-    Args:
-        solved: The fit.
-        state: Its unknowns, or those of another fit to a part of the observations.
-        rows: (m,) the observations.
-    """
-    looks = solved.looks_at(state)
-    if looks is None:
-        return {}
-    chosen = np.isin(np.arange(len(solved.cell.rows)), rows)
-    chain = solved.agreed.problem.subset(chosen).predicted(state)
-    predicted = {solved.cell.rows[at].view: it for at, it in zip(rows.tolist(), chain, strict=True)}
-    shaped = np.concatenate(looks.corners)
-    found: dict[int, tuple[int, float]] = {}
-    for name, corners in looks.problems.items():
-        kept = np.isin(corners.stack.views, list(predicted))
-        stack = corners.stack.keep(kept[corners.stack.view_of])
-        if not stack.views:
-            continue
-        poses = np.array([predicted[it] for it in stack.views])
-        off = reproject(stack.with_points(shaped[stack.ids]), looks.camera(name), poses).residuals
-        squares = stack.sum_by_view(np.sum(off**2, axis=1)) / stack.counts
-        counted = zip(stack.views, stack.counts.tolist(), np.sqrt(squares).tolist(), strict=True)
-        found |= {view: (count, px) for view, count, px in counted}
-    return found
+from visioncal.types import FloatArray
 
 
 def fit_sections(

@@ -7,36 +7,29 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.problem import State
+from visioncal.estimation.problem import Problem, State
 from visioncal.pipeline.known import Known
+from visioncal.pipeline.views import chain_px
 from visioncal.stages.handeye import refit
 from visioncal.stages.kinematics import Kinematics
-from visioncal.stages.validate import HeldOut, apart, chain_rms_px, validate
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.stages.validate import HeldOut, apart, validate
+from visioncal.types import FloatArray, IntArray
 
 
 def left_out(known: Known) -> HeldOut:
     """Residuals of the used views, each by a fit without its stop."""
-    result, mount, seen = known.solved, known.session.mount, known.seen(known.used)
-    problem = known.problem(known.used)
+    result, mount = known.solved, known.session.mount
+    problem, views = known.problem(known.used), np.array(known.used)
 
-    def again(kept: Mask) -> State:
-        return refit(problem.subset(kept).merged(), result, mount, known.solver)
+    def again(part: Problem) -> State:
+        return refit(part.merged(), result, mount, known.solver)
 
     def pixels(rows: IntArray, state: State) -> FloatArray:
-        chosen = np.isin(np.arange(len(problem)), rows)
-        poses = problem.subset(chosen).predicted(state)
-        return chain_rms_px([seen[it] for it in rows], poses, known.free, state.values)
+        part = problem.subset(np.isin(np.arange(len(problem)), rows))
+        return chain_px(known, views[rows].tolist(), part, state)
 
-    needs = [(it,) for it in problem.observations.observed]
-    found = validate(problem, known.stops, needs, again, pixels)
     fit = "whole fit" if mount == "instrument" else "hand-eye fit"
-    unknown = np.full(len(problem), np.nan)
-    return replace(
-        found,
-        method=f"{found.method}, of the {fit}",
-        away_rad=unknown if problem.points else found.away_rad,
-    )
+    return validate(problem, again, pixels, f", of the {fit}")
 
 
 def unseen_views(known: Known, found: Kinematics) -> dict[str, list[dict[str, Any]]]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from visioncal.calibration import Rms, ViewResult
 from visioncal.estimation.chain import scatter
+from visioncal.estimation.problem import Problem, State
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import own_numbers
@@ -71,9 +72,19 @@ def _residuals(known: Known, views: list[int]) -> tuple[FloatArray, FloatArray, 
     Each view's place of its board is compared with the mean of those that show the same one.
     """
     state, problem = known.solved.state, known.problem(views)
-    rms_px = chain_rms_px(known.seen(views), problem.predicted(state), known.free, state.values)
     away_m, away_rad = scatter(problem, known.problem(known.used), state)
-    return away_m, np.full(len(views), np.nan) if problem.points else away_rad, rms_px
+    if problem.points:
+        away_rad = np.full(len(views), np.nan)
+    return away_m, away_rad, chain_px(known, views, problem, state)
+
+
+def chain_px(known: Known, views: list[int], problem: Problem, state: State) -> FloatArray:
+    """Reprojection errors (m,) [px] of some views, those of a problem, through the chain."""
+    if known.free is None:
+        return np.full(len(views), np.nan)
+    cameras = [known.free.after(state.values).camera] * len(views)
+    positions = known.free.corners_after(state.values)
+    return chain_rms_px(known.seen(views), problem.predicted(state), cameras, positions)
 
 
 def _reason(known: Known, row: View) -> str:

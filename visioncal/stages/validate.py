@@ -1,12 +1,11 @@
 """Predicts each observation from a fit that was made without its stop."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.camera import project
-from visioncal.estimation.appearance import Free
 from visioncal.estimation.problem import Problem, State
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import distances
@@ -37,23 +36,23 @@ class HeldOut:
 
 def validate(
     problem: Problem,
-    stops: IntArray,
-    needs: Sequence[Collection[str]],
-    refit: Callable[[Mask], State],
+    refit: Callable[[Problem], State],
     pixels: Callable[[IntArray, State], FloatArray],
+    of: str = "",
 ) -> HeldOut:
     """Leaves stops out, one by one or in ten groups, and predicts what was observed there.
 
     Args:
         problem: The n observations in the fit.
-        stops: (n,) the stop of each, numbered from 0; those of one are left out together.
-        needs: (n,) the names of what each observation needs to be placed by others.
-        refit: Fits those of an (n,) mask.
-        pixels: Reprojection errors (m,) [px] of (m,) observations at a state.
+        refit: Fits a part of them.
+        pixels: Reprojection errors (m,) [px] of some observations (m,) at a state.
+        of: What is fitted, as a part of the method's words.
 
     Returns:
-        The residuals.
+        The residuals. What the others do not place has none.
     """
+    stops = np.unique(problem.observations.stops, return_inverse=True)[1]
+    needs = _needs(problem)
     count = int(stops.max()) + 1
     folds = count if count <= _MOST_FOLDS_OF_ONE else _FOLDS
     # Strides, so that a group's stops are not neighbours.
@@ -62,18 +61,25 @@ def validate(
     with one_blas_thread():
         for left_out in range(folds):
             kept = fold != left_out
-            known = {it for row, its in enumerate(needs) if kept[row] for it in its}
-            held = np.array(
-                [not kept[row] and known.issuperset(it) for row, it in enumerate(needs)]
-            )
+            known = needs[kept].any(axis=0)
+            held = ~kept & ~(needs & ~known).any(axis=1)
             if not held.any():
                 continue
-            state, rows = refit(kept), np.flatnonzero(held)
+            state = refit(problem.subset(kept))
             away_m[held], away_rad[held] = apart(problem.subset(held), state)
-            rms_px[held] = pixels(rows, state)
+            rms_px[held] = pixels(np.flatnonzero(held), state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(problem) else "stops"
-    return HeldOut(f"{method} over {unit}", away_m, away_rad, rms_px)
+    return HeldOut(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
+
+
+def _needs(problem: Problem) -> Mask:
+    """(n, u) the unknown frames on the way of each observation."""
+    needs = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
+    for group in problem.groups:
+        frames = [problem.unknown[it.frame] for it in group.path if it.frame in problem.unknown]
+        needs[group.rows[:, None], frames] = True
+    return needs
 
 
 def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
@@ -84,26 +90,29 @@ def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
         state: The unknowns.
     """
     away_m, turned = distances(problem.measured(state), problem.predicted(state))
-    return away_m, np.where(problem.observations.has_rotation, turned, np.nan)
+    seen = problem.observations
+    # The rotation of what is only a point is a matter of choice.
+    chosen = np.isin(seen.observed, list(problem.points))
+    return away_m, np.where(seen.has_rotation & ~chosen, turned, np.nan)
 
 
 def chain_rms_px(
-    seen: Sequence[Corners | None], poses: FloatArray, free: Free | None, change: FloatArray
+    seen: Sequence[Corners | None],
+    poses: FloatArray,
+    cameras: Sequence[Camera | None],
+    positions: FloatArray,
 ) -> FloatArray:
     """Reprojection error of each view's corners, (m,) [px]; NaN where there are none.
 
     Args:
         seen: (m,) each view's corners.
         poses: (m, 4, 4) `cam_from_target` as the chain predicts it.
-        free: Lens and board that the views' poses were made with; None without corners.
-        change: (k,) by how much they changed since.
+        cameras: (m,) each view's camera, where it has corners.
+        positions: (c, 3) all corners, each on its target [m].
     """
     rms = np.full(len(poses), np.nan)
-    if free is None:
-        return rms
-    camera, positions = free.after(change).camera, free.corners_after(change)
-    for at, (pose, it) in enumerate(zip(poses, seen, strict=True)):
-        if it is not None:
+    for at, (pose, camera, it) in enumerate(zip(poses, cameras, seen, strict=True)):
+        if it is not None and camera is not None:
             away = predict_corners(camera, pose, positions[it.ids]) - it.px
             # A corner behind the camera counts as a whole image away.
             away = np.nan_to_num(away, nan=float(max(camera.resolution)))
