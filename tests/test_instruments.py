@@ -183,7 +183,7 @@ def test_wrong_rows_are_named_and_left_out():
     known = known_of(session_of(replace(shop, rows=tuple(rows))))
     assert set(known.reasons) >= {4, 9}
     assert "places the point" in known.reasons[4]
-    assert "its pose or its reading is wrong" in known.reasons[4]
+    assert "it fits the pose of view 9, which fits its own" in known.reasons[4]
     assert known.kinematics.level == "geometry"
 
 
