@@ -28,7 +28,7 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import pairs_session
+from visioncal.simulation.records import pairs_session, pose_row
 from visioncal.simulation.sag import Payload
 from visioncal.transforms import exp, invert, log
 from visioncal.types import Target
@@ -361,6 +361,54 @@ def test_few_stops_are_said_to_be_few():
     assert "Robot a: only 6 stops are used; 10 or more give" in found.verdict.reasons[0]
     with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of robot b"):
         aligned(simulate_network(NetworkOptions(stops=2)))
+
+
+def one_camera(cell):
+    return pairs_session(cell, "cell")
+
+
+def two_cameras(cell):
+    """What two fixed cameras say of the board on a robot's flange, one of them a metre beside."""
+    session = pairs_session(cell, "cell")
+    columns, rows = ("camera", "stop", *session.columns), []
+    beside = exp(np.array([[0.0, 0.3, 0.0, 1.0, 0.0, 0.0]]))[0]
+    for view in session.views:
+        seen = view.cam_from_target().as_matrix()
+        for camera, pose in (("left", seen), ("right", beside @ seen)):
+            row = view.numbers | {f"cft_{it}": value for it, value in pose_row(pose).items()}
+            row |= {"view": len(rows), "camera": camera, "stop": view.number}
+            rows.append([str(row[it]) for it in columns])
+    cameras = {name: {"resolution": [640, 480]} for name in ("left", "right")}
+    document = {"schema": 1, "name": "cell", "mount": "eye-to-hand", "cameras": cameras}
+    return Session.assemble(document, columns, rows, session.images)
+
+
+@pytest.mark.parametrize(
+    ("changes", "motion", "left_open"),
+    [
+        ({"motion": "one_axis"}, "all 20 stops of the robot turn about base's", "offset along"),
+        ({"motion": "translation"}, "the 20 stops of the robot differ in position", "offset from"),
+        ({"views": 2}, "all 2 stops of the robot turn about base's", "offset along"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("mount", "frame", "seen"),
+    [
+        ("eye-in-hand", "flange", one_camera),
+        ("eye-to-hand", "base", one_camera),
+        ("eye-to-hand", "base", two_cameras),
+    ],
+)
+def test_motion_that_ties_an_only_robot_to_nothing_is_named(
+    changes, motion, left_open, mount, frame, seen
+):
+    cell = simulate(CellOptions(mount=mount, **changes))
+    with pytest.raises(DegenerateError, match=motion) as caught:
+        align(seen(cell))
+    (culprit,) = caught.value.culprits
+    assert culprit.startswith("cam")
+    assert f"'s {left_open} {frame}" in culprit
+    assert "Add 3 or more stops in which flange is tilted" in caught.value.next_step
 
 
 def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.errors import DegenerateError
 from visioncal.estimation.observability import motion_words, open_offset
 from visioncal.files import some_of
-from visioncal.stages.cell import Cell
+from visioncal.stages.cell import Cell, robot_key
 from visioncal.transforms import invert
 from visioncal.types import IntArray
 
@@ -24,10 +24,15 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
         DegenerateError: A robot's base is among the frames that are lost.
     """
     branches = cell.tree.branches
-    flanges = [it for it in branches if branches[it].robot and branches[it].parent in lost]
+    # Where no row is left, the robot whose base stands for the cell is tied to nothing, too.
+    none_left = seen and all(it.seer in lost or it.seen in lost for it in cell.rows)
+    flanges = [
+        it for it in branches if branches[it].robot and (branches[it].parent in lost or none_left)
+    ]
     if not flanges:
         return
     bases = [branches[it].parent for it in flanges]
+    untied = [it for it in bases if it in lost] or [it for it in lost if not branches[it].robot]
     words = [untied_words(cell, it) for it in bases]
     robots = "this robot" if len(bases) == 1 else "these robots"
     why = f"no observation links {robots} to the rest of the cell"
@@ -38,7 +43,9 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
             f"the observations that link {robots} to the rest of the cell are too few, too much "
             f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(told)}"
         )
-        parts = [part for it in bases if (part := _open_part(cell, it))]
+        parts = [
+            part for it in bases if (part := _open_part(cell, it, it if it in lost else untied[0]))
+        ]
         if parts:
             why += f", which does not determine {' and '.join(parts)}"
             words = [
@@ -47,18 +54,21 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
                 for it in flanges
             ]
     raise DegenerateError(
-        f"align: nothing ties {some_of(bases)} to {cell.reference}: {why}.",
-        culprits=parts or bases,
+        f"align: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
+        culprits=parts or untied,
         next_step=" ".join(words),
     )
 
 
-def _open_part(cell: Cell, base: str) -> str:
-    """What the motion of the robot on a base leaves open, where it turns about one axis alone."""
-    stations = _stations(cell, base)
+def _open_part(cell: Cell, base: str, frame: str) -> str:
+    """What of a frame the motion of the robot on a base leaves open, where it turns too little."""
+    stations, robot = _stations(cell, base), _robot_on(cell, base)
     if len(stations) < 2:
         return ""
-    return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
+    poses, body = cell.poses[robot][stations], cell.tree.body(frame)
+    if body == cell.tree.root:
+        return open_offset(invert(poses), frame, base)
+    return open_offset(poses, frame, body)
 
 
 def _robot_on(cell: Cell, base: str) -> str:
@@ -69,10 +79,12 @@ def _robot_on(cell: Cell, base: str) -> str:
 def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
     """Says how a robot stood at some stations, and what of it determines little."""
     robot = _robot_on(cell, base)
-    poses = cell.poses[robot][stations]
+    poses, who = cell.poses[robot][stations], f"robot {robot}"
+    if robot == robot_key(""):
+        who = "the robot"
     if len(stations) < 2:
-        return f"robot {robot} was observed at {len(stations)} stop{'s' * (len(stations) != 1)}"
-    return motion_words(invert(poses), poses, f"{len(stations)} stops of robot {robot}", base)
+        return f"{who} was observed at {len(stations)} stop{'s' * (len(stations) != 1)}"
+    return motion_words(invert(poses), poses, f"{len(stations)} stops of {who}", base)
 
 
 def _stations(cell: Cell, base: str) -> IntArray:
