@@ -55,7 +55,7 @@ def predicted_m(known: Known, q: FloatArray, load: Payload) -> FloatArray:
     """(m, 3) how the calibrated model says that it does [m]."""
     from visioncal.robot import Loads
 
-    model, count = known.arm_model, len(q)
+    model, count = known.robot_arm.model, len(q)
     hung = Loads.alike(count, load.kg, load.centre_m, load.force_n)
     moved = model.base_from_flange(q, hung) - model.base_from_flange(q)
     return np.asarray(moved[:, :3, 3])

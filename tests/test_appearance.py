@@ -146,7 +146,7 @@ def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scal
     known = calibrated(cell, joints=joints)
     assert any("which is not what is stated" in it for it in known.verdict.reasons)
     assert known.verdict.status == "check"
-    assert known.arm is None or not known.arm.is_significant
+    assert known.robot_arm.errors is None or not known.robot_arm.errors.is_significant
     assert surprise(cell, known) < UNLIKELY
     # Left as stated, the camera would be off by 5 mm and more.
     assert np.linalg.norm(error_of(cell, known)[3:6]) < 0.5e-3

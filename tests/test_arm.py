@@ -50,11 +50,11 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
     for seed in range(6):
         cell = simulate(replace(WRONG, mount=mount, seed=seed))
         known = calibrated(cell, joints=joints)
-        assert known.arm is not None
-        assert known.arm.of_links == joints
+        assert known.robot_arm.errors is not None
+        assert known.robot_arm.errors.of_links == joints
         # A scale of thirty to fifty random effects: its own sigma is some 15 %, and another basis
         # than the arm's own makes it another number.
-        assert 4e-4 < known.arm.sigma < 3e-3
+        assert 4e-4 < known.robot_arm.errors.sigma < 3e-3
         told = known.notes if joints else known.warnings
         assert any(("was calibrated" if joints else "arm's posture") in it for it in told)
         error, spread = error_of(cell, known), known.solved.covariance[:12, :12]
@@ -84,7 +84,7 @@ def test_white_noise_is_not_taken_for_a_wrong_arm(mount, sigma):
             seed=seed,
         )
         for joints in (True, False):
-            assert calibrated(simulate(options), joints=joints).arm is None
+            assert calibrated(simulate(options), joints=joints).robot_arm.errors is None
 
 
 def test_estimating_the_links_along_makes_the_answer_better():

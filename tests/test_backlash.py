@@ -10,7 +10,6 @@ from test_kinematics import GOOD
 
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import simulate
-from visioncal.stages.backlash import plays_of
 
 PLAY = (3e-4, 5e-4, 4e-4, 6e-4, 3e-4, 4e-4)
 
@@ -22,13 +21,13 @@ def worn():
 
 
 def test_play_is_told_and_is_no_stiffness(worn):
-    assert worn.kinematics.level == "elastic"
-    plays = plays_of(worn.arm_model, worn.arm_spread)
+    assert worn.robot_arm.kinematics.level == "elastic"
+    plays = worn.arm_found.plays
     for play, true in zip(plays, PLAY, strict=True):
         assert play.is_sure
         # Six draws, at three and a half sigma.
         assert abs(play.deadband_rad - true) < 3.5 * play.sigma_rad
-    springs = worn.elastic.springs
+    springs = worn.arm_found.springs.springs
     for at in (1, 2):
         assert abs(springs[at].compliance - 1.0 / COBOT[at]) < 3.5 * springs[at].sigma
     assert any("Joints have play: shoulder_pan_joint" in it for it in worn.verdict.reasons)
@@ -42,12 +41,12 @@ def test_play_is_in_the_result(worn):
 
 def test_an_arm_that_is_right_but_for_its_play():
     known = calibrated(simulate(replace(GOOD, views=40, backlash_rad=PLAY, seed=3)))
-    assert known.kinematics.level == "backlash"
-    told = [it.deadband_rad for it in plays_of(known.arm_model, known.arm_spread)]
+    assert known.robot_arm.kinematics.level == "backlash"
+    told = [it.deadband_rad for it in known.arm_found.plays]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
-    q = known.joints(known.used)
-    away = known.arm_model.base_from_flange(q) - known.robot.base_from_flange(q)
+    q = known.arm_at(known.used).joints_rad
+    away = known.robot_arm.model.base_from_flange(q) - known.robot.base_from_flange(q)
     assert np.abs(away).max() < 1e-9
     result = result_of(known)
     assert result.arm_is_calibrated
@@ -57,4 +56,4 @@ def test_an_arm_that_is_right_but_for_its_play():
 def test_stops_from_one_side_tell_no_play():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     known = calibrated(replace(cell, approach=np.ones(len(cell.approach))))
-    assert plays_of(known.arm_model, known.arm_spread) == ()
+    assert known.arm_found.plays == ()

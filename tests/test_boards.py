@@ -116,7 +116,7 @@ def test_two_boards_tell_more_of_an_arm_than_one():
         for second in (None, Second(target=charuco_target())):
             cell = simulate(replace(options, second=second))
             known = calibrated(cell)
-            assert known.kinematics.level == "geometry"
+            assert known.robot_arm.kinematics.level == "geometry"
             errors.append(error_m(cell, known))
         ratios.append(errors[1] / errors[0])
     # Both boards are seen by most stops: 0.55 in the median of five cells.
@@ -128,17 +128,17 @@ def test_each_board_adds_six_values_that_are_told(mount):
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
     cell = simulate(replace(TWO, **WRONG_LINKS, mount=mount, views=24, seed=1))
     known = calibrated(cell)
-    told = known.telling.told
-    assert known.kinematics.level == "geometry"
+    told = known.arm_found.telling.told
+    assert known.robot_arm.kinematics.level == "geometry"
     assert (told.columns, told.identifiable, told.told) == (54, 36, 36)
     # The first board alone tells thirty.
     one = calibrated(without(cell, set(np.flatnonzero(cell.shown.boards == 1).tolist())))
-    assert (one.telling.told.columns, one.telling.told.identifiable) == (48, 30)
+    assert (one.arm_found.telling.told.columns, one.arm_found.telling.told.identifiable) == (48, 30)
 
 
 def error_m(cell, known):
     """Root mean square error of the first board's place, seen from the camera [m]."""
-    robot = known.arm_model.robot
+    robot = known.robot_arm.model.robot
     q = postures(robot)
     x, z, *_ = cell.transforms.values()
     board = known.solved.state.edges[1 + known.boards.index(0)]
@@ -291,7 +291,7 @@ def test_every_output_shows_all_boards(tmp_path):
 def test_what_is_written_of_the_fit_is_read_back(given):
     """Further boards are written relative to the first."""
     known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))
-    assert known.arm_model is not None
+    assert known.robot_arm.model is not None
     footing, solved = Footing.of(result_of(known)), known.solved
     np.testing.assert_allclose(footing.state.edges, solved.state.edges, atol=1e-12)
     sigmas = np.sqrt(np.diag(solved.covariance))

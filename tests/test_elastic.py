@@ -49,15 +49,15 @@ def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
     cell = simulate(replace(SAGGING, seed=0))
     known, nominal = calibrated(cell), calibrated(cell, joints=False)
     rigid = calibrated(cell, level="kinematics")
-    assert known.kinematics.level == "elastic"
+    assert known.robot_arm.kinematics.level == "elastic"
     before = error_m(cell, nominal, load_robot("ur10e"))
     # Hundred views leave 1 % in the median; forty are dearer.
-    assert error_m(cell, known, known.arm_model) < 0.06 * before
+    assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
     # A rigid arm cannot follow.
-    assert error_m(cell, rigid, rigid.arm_model) > 0.3 * before
+    assert error_m(cell, rigid, rigid.robot_arm.model) > 0.3 * before
     assert any("speak for more" in it for it in rigid.verdict.reasons)
     # The first axis is upright: no weight turns it.
-    assert known.elastic.untold[0] == "shoulder_pan_joint"
+    assert known.arm_found.springs.untold[0] == "shoulder_pan_joint"
     assert any("taken for rigid" in it for it in known.verdict.reasons)
 
 
@@ -66,7 +66,7 @@ def test_springs_are_told_to_their_bound(carrying):
     # Some disagree with the arm as stated, which does not bend; they come back.
     assert len(known.used) == len(cell.corners)
     bound = compliance_bound(cell)
-    for at, spring in enumerate(known.elastic.springs[1:5], start=1):
+    for at, spring in enumerate(known.arm_found.springs.springs[1:5], start=1):
         assert spring.is_told
         # The bound knows the sizes of all errors; the fit estimates them from forty stops.
         assert spring.sigma < 1.2 * bound[at]
@@ -130,21 +130,21 @@ def test_stops_are_planned_that_tell_springs():
 
 def test_a_payload_that_is_not_as_stated_is_told(carrying):
     cell, known = carrying
-    factor = known.elastic.payload
+    factor = known.arm_found.springs.payload
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
     light = tuple(replace(it, kg=it.kg / 2.0) for it in cell.payloads)
     wrong = calibrated(replace(cell, payloads=light))
-    assert wrong.elastic.payload.value > 1.3
+    assert wrong.arm_found.springs.payload.value > 1.3
     assert any("Load and bend do not fit" in it for it in wrong.verdict.reasons)
     assert wrong.verdict.status != "good"
 
 
 def test_a_stiff_arm_is_not_made_to_bend():
     known = calibrated(simulate(replace(GOOD, views=40, seed=3, payloads=CARRIED)))
-    assert known.kinematics.level == "nominal"
-    assert known.elastic is None
+    assert known.robot_arm.kinematics.level == "nominal"
+    assert known.arm_found.springs is None
     asked = calibrated(simulate(replace(WRONG_LINKS, seed=2)), level="elastic")
-    assert asked.kinematics.level == "nominal"
+    assert asked.robot_arm.kinematics.level == "nominal"
     assert any("stays as stated" in it for it in asked.verdict.reasons)
 
 
@@ -167,7 +167,7 @@ def test_a_loaded_arm_read_by_a_tracker():
     """Loads of 10, 20 and 50 N on a shoulder of 1.4e6 and an elbow of 9e5 N m/rad."""
     shop, known = loaded(seed=2)
     for joint in (1, 2):
-        spring = known.elastic.springs[joint]
+        spring = known.arm_found.springs.springs[joint]
         assert abs(spring.compliance - COMPLIANCE[joint]) < 3.0 * spring.sigma
         assert spring.sigma < 0.1 * COMPLIANCE[joint]
     q = np.vstack([STRETCHED, shop.joints[::4]])

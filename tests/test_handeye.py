@@ -118,7 +118,7 @@ def test_rounds_of_a_calibration_solve_each_closed_form_once(monkeypatch):
     # Errors of the arm are taken up by several rounds.
     cell = simulate(CellOptions(views=40, dh_sigma_m=1e-3, dh_sigma_rad=1e-3, branches=True))
     known = calibrated(cell, joints=True)
-    assert known.kinematics.errors
+    assert known.robot_arm.kinematics.errors
     result_of(known)
     assert set(calls.values()) == {1}
 

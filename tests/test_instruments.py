@@ -82,17 +82,17 @@ def test_errors_follow_their_covariance_and_reach_their_bound(options):
 def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options):
     shop = tracked(replace(options, **WRONG, stops=40))
     known = known_of(session_of(shop))
-    assert known.kinematics.level == "geometry"
+    assert known.robot_arm.kinematics.level == "geometry"
     assert known.verdict.status == "good"
     q = postures(known.robot)
-    (x, z), size = known.solved.state.edges, len(known.arm_model.values)
+    (x, z), size = known.solved.state.edges, len(known.robot_arm.model.values)
 
     def place(robot):
         return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
 
     true = invert(shop.base_from_instrument) @ forward(shop.true_arm, q) @ shop.flange_from_probe
-    away = 1e3 * np.linalg.norm(place(known.arm_model.robot) - true[:, :3, 3], axis=1)
-    nominal = known.kinematics.levels[0].inside.mm
+    away = 1e3 * np.linalg.norm(place(known.robot_arm.model.robot) - true[:, :3, 3], axis=1)
+    nominal = known.robot_arm.kinematics.levels[0].inside.mm
     assert nominal > 1.0
     # 40 readings of 20 um by an arm that repeats to 30 um; seen 0.03 mm.
     assert np.median(away) < 0.06
@@ -112,7 +112,7 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
     Three points have six values more than one, of their places.
     """
     shop = tracked(replace(options, **WRONG))
-    seen = known_of(session_of(shop)).telling.told
+    seen = known_of(session_of(shop)).arm_found.telling.told
     # What shapes the points' pattern is told beside the arm.
     assert (seen.identifiable, seen.told) == (min(rank, 30), min(rank, 30))
     whole = information(shop, arm_columns=True)
@@ -184,7 +184,7 @@ def test_wrong_rows_are_named_and_left_out():
     assert set(known.reasons) >= {4, 9}
     assert "places the point" in known.reasons[4]
     assert "it fits the pose of view 9, which fits its own" in known.reasons[4]
-    assert known.kinematics.level == "geometry"
+    assert known.robot_arm.kinematics.level == "geometry"
 
 
 def test_exchanged_points_are_named():
@@ -194,7 +194,7 @@ def test_exchanged_points_are_named():
     known = known_of(session_of(replace(shop, rows=tuple(rows))))
     assert sorted(known.reasons) == [12, 14]
     assert "the points a and c are exchanged at this stop" in known.reasons[12]
-    assert known.kinematics.level == "geometry"
+    assert known.robot_arm.kinematics.level == "geometry"
 
 
 @pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])

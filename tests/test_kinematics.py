@@ -62,10 +62,10 @@ def test_an_arm_off_by_a_millimetre_is_calibrated_all_over_its_workspace(mount):
     for seed in range(4):
         cell = simulate(replace(WRONG_LINKS, mount=mount, seed=seed, branches=True))
         known, nominal = calibrated(cell), calibrated(cell, joints=False)
-        assert known.kinematics.level == "geometry"
-        assert nominal.arm_model is None
+        assert known.robot_arm.kinematics.level == "geometry"
+        assert nominal.robot_arm.model is None
         assert known.verdict.status in ("good", "check")
-        after = error_m(cell, known, known.arm_model.robot)
+        after = error_m(cell, known, known.robot_arm.model.robot)
         shares.append(after / error_m(cell, nominal, known.robot))
     # Thirty views leave 5 % of what a fit of the edges alone leaves; four worlds scatter by half.
     assert np.median(shares) < 0.08
@@ -74,12 +74,12 @@ def test_an_arm_off_by_a_millimetre_is_calibrated_all_over_its_workspace(mount):
 def test_offsets_alone_are_told_from_wrong_links():
     cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
     known = calibrated(cell)
-    assert known.kinematics.level == "offsets"
-    by_name = {it.name: it for it in known.kinematics.levels}
+    assert known.robot_arm.kinematics.level == "offsets"
+    by_name = {it.name: it for it in known.robot_arm.kinematics.levels}
     assert by_name["offsets"].left_out.mm < 0.3 * by_name["nominal"].left_out.mm
     assert by_name["offsets"].left_out.mm < 1.05 * by_name["geometry"].left_out.mm
     # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
-    found = known.arm_model.robot.chain.functions[1:5, 0]
+    found = known.robot_arm.model.robot.chain.functions[1:5, 0]
     true = (cell.true_arm.offset - cell.arm.offset)[1:5]
     assert found == pytest.approx(true, abs=3e-4)
 
@@ -92,7 +92,7 @@ def test_links_that_are_off_by_little_count_in_the_covariance():
     for seed in (1, 9, 13):
         cell = simulate(replace(little, seed=seed))
         known = calibrated(cell)
-        assert known.kinematics.level == "geometry"
+        assert known.robot_arm.kinematics.level == "geometry"
         error = error_of(cell, known)
         squares += error @ np.linalg.solve(known.solved.covariance[:12, :12], error)
     # Chi-square of 36 degrees of freedom but for one in a thousand; under offsets it is 118.
@@ -107,9 +107,9 @@ def test_an_eccentric_gear_is_told():
     robot = known_of(cell).robot
     wavy = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
     known = calibrated(wavy)
-    assert known.kinematics.level == "eccentricity"
+    assert known.robot_arm.kinematics.level == "eccentricity"
     # Told to a few tenths of a milliradian beside errors of all links.
-    assert known.arm_model.robot.chain.functions[1:3, 2] == pytest.approx(1e-3, abs=5e-4)
+    assert known.robot_arm.model.robot.chain.functions[1:3, 2] == pytest.approx(1e-3, abs=5e-4)
 
 
 def test_a_wrong_gear_ratio_is_told():
@@ -119,10 +119,10 @@ def test_a_wrong_gear_ratio_is_told():
     robot = known_of(cell).robot
     geared = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
     known = calibrated(geared)
-    assert known.kinematics.level == "eccentricity"
-    assert "ratios" in known.kinematics.errors
+    assert known.robot_arm.kinematics.level == "eccentricity"
+    assert "ratios" in known.robot_arm.kinematics.errors
     # Told to a tenth beside errors of all links.
-    assert known.arm_model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
+    assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
 
 
 def test_a_dirty_cell_is_calibrated_all_over_its_workspace():
@@ -132,8 +132,8 @@ def test_a_dirty_cell_is_calibrated_all_over_its_workspace():
     worn = replace(wrong, eccentricity_sigma_rad=1.5e-4, ripple_sigma_rad=3e-5)
     cell = simulate(replace(worn, board_bow_m=3e-4, lens_mismatch_px=0.1, seed=1))
     known, nominal = calibrated(cell), calibrated(cell, joints=False)
-    assert known.kinematics.level == "eccentricity"
-    share = error_m(cell, known, known.arm_model.robot) / error_m(cell, nominal, known.robot)
+    assert known.robot_arm.kinematics.level == "eccentricity"
+    share = error_m(cell, known, known.robot_arm.model.robot) / error_m(cell, nominal, known.robot)
     # A median of 6 % over many worlds, of which nine in ten lie under twice that.
     assert share < 0.12
 
@@ -146,20 +146,20 @@ def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     # three sigma; what was measured to a millionth is kept.
     assert known.free.columns.tolist() == [9]
     assert known.free.anchored.all()
-    sigma = float(np.sqrt(np.mean(known.telling.sigmas_m**2)))
-    assert error_m(cell, known, known.arm_model.robot) < 2.0 * sigma
+    sigma = float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
+    assert error_m(cell, known, known.robot_arm.model.robot) < 2.0 * sigma
 
 
 def test_a_right_arm_stays_nominal():
     known = calibrated(simulate(replace(GOOD, seed=3)))
-    assert known.kinematics.level == "nominal"
-    assert known.arm_model is None
-    assert [it.name for it in known.kinematics.levels] == ["nominal"]
+    assert known.robot_arm.kinematics.level == "nominal"
+    assert known.robot_arm.model is None
+    assert [it.name for it in known.robot_arm.kinematics.levels] == ["nominal"]
 
 
 def test_without_joints_no_level_can_be_asked_for():
     cell = simulate(replace(WRONG_LINKS, views=12))
-    assert calibrated(cell, joints=False).kinematics is None
+    assert calibrated(cell, joints=False).robot_arm.kinematics is None
     with pytest.raises(DataError, match="needs the joint angles of every view"):
         calibrated(cell, joints=False, level="kinematics")
 
@@ -167,7 +167,8 @@ def test_without_joints_no_level_can_be_asked_for():
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_predictions_move_as_their_derivatives_say(mount):
     known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
-    model, edges, q = known.arm_model, known.solved.state.edges, known.joints(known.used)[:3]
+    arm, edges = known.arm_at(known.used[:3]), known.solved.state.edges
+    model, q = arm.model, arm.joints_rad
     size, step = 12 + len(model.values), 1e-6
     middle = target_in_camera(mount, *edges, model.robot.base_from_flange(q))
     problem = known.solved.problem.with_effects([])
@@ -196,13 +197,13 @@ def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
     cell = simulate(replace(WRONG_LINKS, seed=6, mount=mount, target=sure))
     known = calibrated(cell)
-    sigma = float(np.sqrt(np.mean(known.telling.sigmas_m**2)))
+    sigma = float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
     bound = workspace_bound_m(cell, postures(known.robot)[::20])
     # The bound knows the size of each error; the fit estimates one size and the noise's levels from
     # 30 views, which tell them to a tenth. Twenty postures stand for all to about as much.
     assert sigma == pytest.approx(bound, rel=0.3)
     # One world's error along the weakest direction, at three sigma.
-    assert error_m(cell, known, known.arm_model.robot) < 3.0 * sigma
+    assert error_m(cell, known, known.robot_arm.model.robot) < 3.0 * sigma
 
 
 def test_the_result_holds_the_calibrated_arm(tmp_path):
@@ -213,7 +214,7 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     result = visioncal.Calibration.load(file)
     found = result.stages["kinematics"]
     q = postures(known.robot)[:5]
-    calibrated_poses = known.arm_model.robot.base_from_flange(q)
+    calibrated_poses = known.robot_arm.model.robot.base_from_flange(q)
     # RigidTransform makes rotations orthonormal anew, to the last digits.
     assert result.base_from_flange(q).as_matrix() == pytest.approx(calibrated_poses, abs=1e-14)
     assert found["level"] == "geometry"
@@ -250,9 +251,9 @@ def test_touches_close_on_the_calibrated_arm():
 def test_a_level_that_explains_too_little_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=1))
     known = calibrated(cell, level="offsets")
-    assert known.kinematics.level == "offsets"
+    assert known.robot_arm.kinematics.level == "offsets"
     assert any("speak for more than the arm's offsets" in it for it in known.verdict.reasons)
     assert known.verdict.status != "good"
     right = calibrated(simulate(replace(GOOD, seed=3)), level="kinematics")
-    assert right.kinematics.level == "nominal"
+    assert right.robot_arm.kinematics.level == "nominal"
     assert any("The arm stays as stated" in it for it in right.verdict.reasons)

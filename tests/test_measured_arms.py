@@ -8,7 +8,7 @@ from tracked import known_of
 def test_an_irb_120_by_a_measuring_arm(real_data):
     known = known_of(thirdparty.irb120(real_data))
     # 4.67 mm in the mean, the frames fitted.
-    assert known.kinematics.levels[0].inside.mm > 4.0
+    assert known.robot_arm.kinematics.levels[0].inside.mm > 4.0
     assert known.findings.held_out.mm < 0.3
     assert known.verdict.status == "good"
     for joints, read, limit in (
@@ -17,7 +17,7 @@ def test_an_irb_120_by_a_measuring_arm(real_data):
         ("TestJointAngles2", "TestPosition2", 0.26),
     ):
         q, places = thirdparty.irb120_set(real_data, joints, read)
-        flange, (x, _) = known.arm_model.base_from_flange(q), known.solved.state.edges
+        flange, (x, _) = known.robot_arm.model.base_from_flange(q), known.solved.state.edges
         in_base = places @ x[:3, :3].T + x[:3, 3]
         on_flange = np.einsum("mji,mj->mi", flange[:, :3, :3], in_base - flange[:, :3, 3])
         # The sets have another tool: its point is what the first five configurations say.
@@ -28,7 +28,7 @@ def test_an_irb_120_by_a_measuring_arm(real_data):
 
 def test_a_six_axis_arm_by_a_laser(real_data):
     known = known_of(thirdparty.rokae(real_data))
-    assert known.kinematics.levels[0].inside.mm > 2.0
+    assert known.robot_arm.kinematics.levels[0].inside.mm > 2.0
     # Plain least squares leave 0.099 mm and 0.038 deg in the fit; left out they are at 0.12 mm.
     assert known.findings.rms.mm < 0.1
     assert known.findings.rms.deg < 0.03

@@ -85,8 +85,8 @@ def test_joints_alone_that_are_misread_are_refused_with_the_fix():
 def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     told = planted("joints in degrees", with_poses=True)
     known = finished(told)
-    assert known.joints_rad is None
-    assert known.kinematics is None
+    assert known.reported.joints_rad is None
+    assert known.robot_arm.kinematics is None
     assert known.verdict.status != "good"
     assert any("--joint-unit deg" in it for it in known.verdict.reasons)
     alone = finished(replace(told, robot=None))
@@ -154,8 +154,8 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     joints = told.joints - zeros
     poses = load_robot("ur5e").base_from_flange(joints) if with_poses else None
     known = finished(replace(told, joints=joints, poses=poses))
-    assert known.kinematics.level != "nominal"
-    nominal, *others = known.kinematics.levels
+    assert known.robot_arm.kinematics.level != "nominal"
+    nominal, *others = known.robot_arm.kinematics.levels
     assert nominal.left_out.mm > 10.0
     assert others[-1].left_out.mm < 0.5
     theta = {it["joint"]: it for it in parameters(known) if it["name"] == "theta_rad"}
@@ -163,7 +163,7 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     assert theta["elbow_joint"]["nominal"] == pytest.approx(0.0, abs=1e-9)
     assert theta["elbow_joint"]["change"] == pytest.approx(np.deg2rad(10.0), abs=5e-3)
     # What is seen of the target hardly depends on whose errors the last tenths of a degree are.
-    found = known.arm_model.robot.base_from_flange(joints)
+    found = known.robot_arm.model.robot.base_from_flange(joints)
     true = IN_HAND.true_base_from_flange
     moved, moves = invert(found[:-1]) @ found[1:], invert(true[:-1]) @ true[1:]
     away = np.linalg.norm((moved - moves)[:, :3, 3], axis=1)
@@ -185,8 +185,8 @@ def test_one_row_of_wrong_joints_costs_its_view_alone():
     joints = told.joints.copy()
     joints[5, 1] += 0.3
     known = finished(replace(told, joints=joints))
-    assert known.joints_rad.keys() == set(range(16)) - {5}
-    assert known.kinematics.level == "geometry"
+    assert known.reported.joints_rad.keys() == set(range(16)) - {5}
+    assert known.robot_arm.kinematics.level == "geometry"
     assert known.reasons[5].endswith("with which the camera agrees")
 
 
@@ -196,14 +196,14 @@ def test_one_row_of_a_wrong_pose_is_left_to_the_consensus():
     poses[5] = poses[5] @ exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
     known = finished(replace(told, poses=poses))
     assert known.reasons[5].startswith("disagrees with the other views")
-    assert known.kinematics.level == "geometry"
+    assert known.robot_arm.kinematics.level == "geometry"
 
 
 def test_an_arm_in_the_world_is_calibrated_where_it_stands():
     told = in_the_world(Told.of(IN_HAND, with_poses=True), np.random.default_rng(0))
     known = finished(told)
-    assert known.kinematics.level == "geometry"
-    found = known.arm_model.robot.base_from_flange(told.joints)
+    assert known.robot_arm.kinematics.level == "geometry"
+    found = known.robot_arm.model.robot.base_from_flange(told.joints)
     away_m = np.linalg.norm((found - told.poses)[:, :3, 3], axis=1)
     # The poses are of the nominal arm: in the world the calibrated one is off by its errors alone.
     assert 1e-4 < np.median(away_m) < 0.01

@@ -309,8 +309,9 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     poses = {} if case == "estimated" else {"joints": False, "robot": load_robot("ur5e")}
     found = so_far_of(cell, **poses)
     known = found.known
-    assert (known.arm is None) == (case == "neighbours alike")
-    assert known.arm is None or known.arm.is_estimated == (case == "estimated")
+    errors = known.robot_arm.errors
+    assert (errors is None) == (case == "neighbours alike")
+    assert errors is None or errors.is_estimated == (case == "estimated")
     assert (known.diagnosis.inflation > 1.5) == (case == "neighbours alike")
     begun, q = begin(found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q, 3).design

@@ -18,8 +18,8 @@ from visioncal.estimation.problem import Effect, Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline.arm import telling_of
 from visioncal.pipeline.result import result_of
+from visioncal.pipeline.steps import STAGES
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
 from visioncal.robot.slopes import number_slopes, table_moves
 from visioncal.robot.tables import table_document, table_from_document
@@ -332,9 +332,10 @@ def calibrated_cell():
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, convention):
     cell, known = calibrated_cell
-    assert known.telling.convention == "hayati"
+    assert known.arm_found.telling.convention == "hayati"
     asked = replace(known, convention=convention)
-    known = replace(asked, telling=telling_of(asked))
+    (tell_again,) = (it for it in STAGES if it.name == "tell")
+    known = tell_again.run(asked)
     found = json.loads(json.dumps(result_of(known).stages["kinematics"], allow_nan=False))
     assert found["convention"] == convention
     changes = {(it["joint"], it["name"]): it for it in found["parameters"]}
@@ -366,11 +367,11 @@ def test_a_missing_direction_is_in_the_verdict():
     """Looking straight at a board leaves the fifth joint of a UR almost where it is."""
     options = replace(WRONG_LINKS, seed=9, tilt_rad=(0.0, 0.03), roll_rad=0.4, views=40)
     known = calibrated(simulate(options))
-    assert known.telling.told.told < 30
-    assert known.telling.advice in known.verdict.reasons
-    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in known.telling.advice
+    assert known.arm_found.telling.told.told < 30
+    assert known.arm_found.telling.advice in known.verdict.reasons
+    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in known.arm_found.telling.advice
     rich = calibrated(simulate(replace(WRONG_LINKS, seed=9, views=40)))
-    assert rich.telling.told.told == 30
+    assert rich.arm_found.telling.told.told == 30
     assert not any("that can be told of this arm" in it for it in rich.verdict.reasons)
 
 

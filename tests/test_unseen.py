@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from cells import known_of
 
-from visioncal.pipeline.arm import kinematics_document
 from visioncal.pipeline.known import Known
+from visioncal.pipeline.result import result_of
 from visioncal.pipeline.steps import STAGES
 from visioncal.pipeline.views import view_evidence, view_results
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
@@ -49,7 +49,7 @@ def rms(rows, name):
 
 
 def test_views_left_out_add_up_to_the_levels_figures(known):
-    found = kinematics_document(known)
+    found = result_of(known).stages["kinematics"]
     by_name = {it["level"]: it for it in found["levels"]}
     nominal, chosen = by_name["nominal"], by_name[found["level"]]
     assert [it["view"] for it in found["left_out"]] == list(known.used)
@@ -61,7 +61,7 @@ def test_views_left_out_add_up_to_the_levels_figures(known):
 
 
 def test_views_held_back_are_predicted_by_both_arms(known):
-    rows = kinematics_document(known)["holdout"]
+    rows = result_of(known).stages["kinematics"]["holdout"]
     assert tuple(it["view"] for it in rows) == HELD
     shown = {it.view: it for it in view_results(known)}
     for it in rows:
@@ -76,13 +76,13 @@ def test_without_a_calibrated_arm_there_is_nothing_to_compare(cell):
     for stage in STAGES:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
-    assert kinematics_document(known) is None
+    assert "kinematics" not in result_of(known).stages
     reported = [it.base_from_flange for it in view_evidence(known)]
     assert np.array_equal(reported, cell.base_from_flange)
 
 
 def test_evidence_has_the_calibrated_arm_s_poses(cell, known):
     ours = np.stack([it.base_from_flange for it in view_evidence(known)])
-    expected = known.arm_model.robot.base_from_flange(cell.joints)
+    expected = known.robot_arm.model.robot.base_from_flange(cell.joints)
     assert np.array_equal(ours, expected)
     assert not np.allclose(ours, cell.base_from_flange, atol=1e-4)

@@ -279,7 +279,7 @@ def test_other_cells_are_refused_by_what_differs():
             known_before(wrong, footing)
     known = known_again(place.cell, np.random.default_rng(9))
     with pytest.raises(DataError, match="no joint angles"):
-        seen_by(known.with_robot("", known.reported.without_joints()), footing)
+        seen_by(known.with_robot("", replace(known.reported, matched=None)), footing)
     look = known.cameras["cam"]
     with pytest.raises(DataError, match="640 x 480"):
         seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), footing)

@@ -40,14 +40,14 @@ def test_weight_is_among_the_functions(bare):
 def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     cell = simulate(replace(SAGGING, views=60, seed=4))
     known = calibrated(cell, robot=bare)
-    assert known.kinematics.level == "elastic"
-    assert all(it.stiffness is None for it in known.elastic.springs)
+    assert known.robot_arm.kinematics.level == "elastic"
+    assert all(it.stiffness is None for it in known.arm_found.springs.springs)
     assert any("of which its model tells nothing" in it for it in known.verdict.reasons)
     before = error_m(cell, calibrated(cell, joints=False), bare)
-    assert error_m(cell, known, known.arm_model) < 0.06 * before
+    assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
     q = postures(bare)[:20]
     result = result_of(known)
-    ours = known.arm_model.base_from_flange(q)
+    ours = known.robot_arm.model.base_from_flange(q)
     # RigidTransform makes rotations orthonormal anew.
     assert result.base_from_flange(q).as_matrix() == pytest.approx(ours, abs=1e-12)
 
@@ -55,7 +55,7 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
 def test_payloads_tell_its_stiffness(bare):
     known = calibrated(simulate(replace(SAGGING, views=60, payloads=CARRIED, seed=5)), robot=bare)
     for at in (1, 2):
-        spring = known.elastic.springs[at]
+        spring = known.arm_found.springs.springs[at]
         assert spring.is_told
         # One draw, at three and a half sigma.
         assert abs(spring.compliance - 1.0 / COBOT[at]) < 3.5 * spring.sigma

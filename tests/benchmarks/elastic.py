@@ -67,7 +67,8 @@ def world(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, fl
     rigid = calibrated(cell, level="kinematics")
     edges = error_m(cell, calibrated(cell, joints=False), robot)
     errors = [edges] + [
-        error_m(cell, it, robot if it.arm_model is None else it.arm_model) for it in (rigid, ours)
+        error_m(cell, it, robot if it.robot_arm.model is None else it.robot_arm.model)
+        for it in (rigid, ours)
     ]
     springs = []
     if options.board_bow_m:
@@ -94,9 +95,9 @@ def weighed(seed: int) -> tuple[float, ...]:
     The last is a share of the deflection under 50 N, at postures of the session and stretched out.
     """
     shop, known = loaded(seed, count=20)
-    if known.elastic is None:
+    if known.arm_found.springs is None:
         return (np.nan,) * 5
-    springs = [known.elastic.springs[it] for it in (1, 2)]
+    springs = [known.arm_found.springs.springs[it] for it in (1, 2)]
     off = [
         (it.compliance - true) / it.sigma for it, true in zip(springs, COMPLIANCE[1:3], strict=True)
     ]

@@ -184,9 +184,9 @@ def from_corners(world: World) -> Found:
     begun = process_time()
     known = calibrated(world.cell)
     seconds = process_time() - begun
-    if known.arm_model is None:
+    if known.robot_arm.model is None:
         raise RuntimeError("the arm stayed nominal")
-    edges, robot = known.solved.state.edges, known.arm_model.robot
+    edges, robot = known.solved.state.edges, known.robot_arm.model.robot
     return lambda q: world.at(edges, robot.base_from_flange(q)), seconds
 
 

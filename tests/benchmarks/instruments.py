@@ -58,7 +58,7 @@ def prose(text: str) -> str:
 def places(known: Known, q: FloatArray) -> FloatArray:
     """(k, 3) where a calibration has the first point, in the instrument's frame."""
     x, z = known.solved.state.edges
-    robot = known.robot if known.arm_model is None else known.arm_model.robot
+    robot = known.robot if known.robot_arm.model is None else known.robot_arm.model.robot
     return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
 
 
@@ -106,12 +106,12 @@ def arm_row(options: Tracked, worlds: int) -> str:
         seconds = time.process_time() - begun
         q = postures(known.robot)
         error = rms(np.linalg.norm(places(known, q) - true_places(shop, q), axis=1))
-        level = known.kinematics.levels[0]
+        level = known.robot_arm.kinematics.levels[0]
         predicted = known.findings.arms[0].workspace_mm or float("nan")
         found.append(
             (level.inside.mm, 1e3 * error, 1e3 * workspace_bound(shop, q), predicted, seconds)
         )
-        levels.append(known.kinematics.level)
+        levels.append(known.robot_arm.kinematics.level)
     before, after, bound, predicted, seconds = np.array(found).T
     return (
         f"{np.median(before):.2f} | {np.median(after):.3f} | {rms(after) / rms(bound):.2f} | "
@@ -148,9 +148,9 @@ def example_a(worlds: int) -> str:
         known = known_of(session_of(shop))
         q = postures(known.robot)
         held.append(1e3 * rms(np.linalg.norm(places(known, q) - true_places(shop, q), axis=1)))
-        before.append(known.kinematics.levels[0].inside.mm)
+        before.append(known.robot_arm.kinematics.levels[0].inside.mm)
         conditions.append(parameter_conditions(shop))
-        taken.append(known.kinematics.level)
+        taken.append(known.robot_arm.kinematics.level)
     stated, metres, millimetres, scaled = np.median(conditions, axis=0)
     text = f"""A 6R arm of 1.8 m (generic-6r-1800), one reflector on its flange, 30 random stops
     read by a laser tracker of 20 um, no other noise; {worlds} worlds. Where the tracker stands and
@@ -250,7 +250,7 @@ def irb120() -> str:
     ):
         q, places_m = thirdparty.irb120_set(DATA, joints, read)
         rest, everything = tool_errors_mm(
-            known.arm_model.robot.base_from_flange(q), known.solved.state.edges[0], places_m
+            known.robot_arm.model.robot.base_from_flange(q), known.solved.state.edges[0], places_m
         )
         before = tool_errors_mm(known.robot.base_from_flange(q), nominal, places_m)[1]
         lines.append(
@@ -287,7 +287,7 @@ def rokae() -> str:
     """A laser's poses of a six-axis arm."""
     known = known_of(thirdparty.rokae(DATA))
     folds = cross_validated(lambda held: thirdparty.rokae(DATA, held), 30)
-    levels = [it for it in known.kinematics.levels if it.name == "geometry"]
+    levels = [it for it in known.robot_arm.kinematics.levels if it.name == "geometry"]
     found = known.findings.rms
     return prose(
         f"""**ROKAE-type arm**: 30 poses by a laser that is taken as of 0.02 mm and 0.1 mrad.
@@ -311,12 +311,12 @@ def talos() -> str:
 
 def told(known: Known) -> str:
     """What the method says of its trust."""
-    held, levels = known.findings.held_out, known.kinematics.levels
+    held, levels = known.findings.held_out, known.robot_arm.kinematics.levels
     workspace_mm = known.findings.arms[0].workspace_mm
     return (
-        f"Level {known.kinematics.level} ({levels[0].inside.mm:.2f} mm with the nominal arm); left "
-        f"out in turn, readings are predicted to {held.mm:.3f} mm rms; all over the workspace to "
-        f"{workspace_mm:.2g} mm (sigma, median); verdict {known.verdict.status}."
+        f"Level {known.robot_arm.kinematics.level} ({levels[0].inside.mm:.2f} mm with the nominal "
+        f"arm); left out in turn, readings are predicted to {held.mm:.3f} mm rms; all over the "
+        f"workspace to {workspace_mm:.2g} mm (sigma, median); verdict {known.verdict.status}."
     )
 
 

@@ -59,12 +59,12 @@ def measured(options: CellOptions) -> tuple[float, ...]:
     seconds = time.perf_counter() - begun
     before = error_m(cell, calibrated(cell, joints=False), known.robot)
     bound = workspace_bound_m(cell, postures(known.robot)[::EVERY])
-    model = known.arm_model
+    model = known.robot_arm.model
     if model is None:
         return 1e3 * before, 1e3 * before, 1e3 * bound, np.nan, seconds, 0.0
     after = error_m(cell, known, model.robot)
-    predicted = 1e3 * float(np.sqrt(np.mean(known.telling.sigmas_m**2)))
-    taken = known.kinematics.level == "geometry"
+    predicted = 1e3 * float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
+    taken = known.robot_arm.kinematics.level == "geometry"
     return 1e3 * before, 1e3 * after, 1e3 * bound, predicted, seconds, float(taken)
 
 
@@ -76,7 +76,7 @@ def dirty(options: CellOptions) -> tuple[float, ...]:
     links = without_blocks(cell, level="kinematics")
     errors = [error_m(cell, edges, ours.robot)]
     for known in (ours, links, corners_alone(links)):
-        model = known.arm_model
+        model = known.robot_arm.model
         errors.append(errors[0] if model is None else error_m(cell, known, model.robot))
     return tuple(1e3 * it for it in errors)
 
@@ -98,17 +98,12 @@ def corners_alone(known: Known) -> Known:
     """The same unknowns with the robot's stops taken for exact: a fit of reprojection alone."""
     exact = Noise.of_robot(1e-6, 1e-6)
     for _ in range(6):
-        model = known.arm_model
-        if model is None:
-            break
-        known = known.with_arm_errors()
         problem, fit = known.problem(known.used), known.solved.fit
         problem = problem.merged(problem.of_one_stop)
         state = State(fit.state.edges, problem.start_values)
         state = solve_problem(problem, state, exact)[0]
-        step = state.values[len(state.values) - len(model.values) :]
         solved = replace(known.solved, problem=problem, fit=replace(fit, state=state))
-        known = replace(known, arm_model=model.moved(step), hand_eye=solved)
+        known = replace(known, calibrated=known.robot_arm.moved(problem, state)[0], hand_eye=solved)
     return known
 
 

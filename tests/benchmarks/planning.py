@@ -72,7 +72,7 @@ def expected_mm(truth: World, rows: FloatArray) -> float:
 
 def arm_error(cell: Cell, known: Known) -> FloatArray:
     """Error all over the workspace [mm]."""
-    model = known.arm_model
+    model = known.robot_arm.model
     return 1e3 * np.array([error_m(cell, known, known.robot if model is None else model.robot)])
 
 

@@ -16,7 +16,6 @@ from visioncal.stages.cell import Cell, robot_key
 from visioncal.stages.diagnose import FEWEST_STOPS, misfit_words
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import ASKED, doubts, findings
-from visioncal.stages.loads import check_elastic, check_poses
 from visioncal.stages.reported import Reported
 from visioncal.types import FloatArray
 
@@ -62,18 +61,6 @@ def _joints(views: Sequence[View], matched: Matched) -> FloatArray | None:
     known = [matched.joints_rad.get(it.number) for it in views]
     found = [it for it in known if it is not None]
     return np.array(found) if found and len(found) == len(known) else None
-
-
-def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
-    """Refuses loads that determine nothing.
-
-    Raises:
-        DataError: Springs are asked for that nothing bends.
-        DegenerateError: Loads change while an arm stands still.
-    """
-    for arm in arms.values():
-        check_poses(arm.loads, arm.reported[arm.stood])
-        check_elastic(asked, None if arm.matched is None else arm.matched.robot, arm.loads)
 
 
 def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.alignment.arms import arms_of, check_arms, with_errors
+from visioncal.alignment.arms import arms_of, with_errors
 from visioncal.alignment.lenses import CellSide, settled_looks, with_looks
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
@@ -13,7 +13,7 @@ from visioncal.estimation.joint import Fitted
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import fit_problem
-from visioncal.stages.arms import RobotArm, effects_of
+from visioncal.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.stages.cell import Cell
 from visioncal.stages.choose import chosen
 from visioncal.stages.clocks import clock_effects
@@ -146,7 +146,8 @@ def _levels(agreed: Agreed, arms: Mapping[str, RobotArm], asked: str) -> dict[st
     problem, chosen = agreed.problem.subset(agreed.used), dict(arms)
     for name, arm in arms.items():
         stated = arm.without_errors(problem)
-        chosen[name] = arm.with_level(stated, agreed.fit, asked)
+        start = State(agreed.fit.state.edges, stated.start_values)
+        chosen[name] = arm.with_level(stated, start, asked, agreed.fit.noise)
         poses = {**problem.poses, name: chosen[name].poses}
         effects = [*stated.effects, *chosen[name].effects()]
         problem = replace(problem, poses=poses).with_effects(effects)

@@ -49,14 +49,15 @@ def conditions_document(known: Known) -> dict[str, float]:
 
 def _arm(known: Known) -> dict[str, Any] | None:
     """What the arm's errors are of, and what they were found to be beside the arm that is told."""
-    model, errors = known.arm_model, known.arm
+    arm = known.robot_arm
+    model, errors = arm.model, arm.errors
     if errors is None:
         return None
     count = errors.basis.shape[2]
     # Errors that only count are where they were stated; those of a model are in its arm already.
     values = known.solved.state.values[-count:] if errors.is_estimated else np.zeros(count)
     if model is None:
-        of = "links" if known.joints_rad is not None and known.robot is not None else "poses"
+        of = "links" if arm.is_modelled else "poses"
         return {"of": of, "values": values.tolist()}
     return {
         "of": "model",
@@ -84,7 +85,7 @@ def _by_stop(model: ArmModel) -> dict[str, Any]:
 
 def _covariance(known: Known) -> FloatArray:
     """The fit's own, and beside it what it has in common with errors that only count in it."""
-    result, errors, diagnosis = known.solved, known.arm_by_stop, known.diagnosis
+    result, errors, diagnosis = known.solved, known.arm_at_stops.errors, known.diagnosis
     written = _written(known)
     own = written @ result.covariance @ written.T
     if errors is None or errors.is_estimated or diagnosis is None:

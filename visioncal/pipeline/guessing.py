@@ -58,12 +58,12 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
         DataError: There is nothing to read.
         DegenerateError: Too few views have both poses.
     """
-    seen, matched = replace(seen, poses=seen.poses_of_one_board), seen.matched
+    seen, matched = replace(seen, poses=seen.poses_of_one_board), seen.reported.matched
     # Joints that are misread say nothing about the poses.
     chain = (
         None
         if matched is not None and matched.misread
-        else chain_poses(seen.session, seen.zeroed_robot)
+        else chain_poses(seen.session, None if matched is None else matched.arm)
     )
     if robot is None:
         told = numbers_in(seen.session, POSE)

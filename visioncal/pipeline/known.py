@@ -9,31 +9,25 @@ import numpy as np
 
 from visioncal.calibration import CameraResult, Rms, Verdict
 from visioncal.estimation.appearance import Free
-from visioncal.estimation.arm import ArmErrors, link_basis, pose_basis
-from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.problem import ROBOT, FramePrior, Problem
 from visioncal.estimation.scene import Scene
-from visioncal.guess.joints import JointReading
 from visioncal.pipeline.visits import visits
 from visioncal.robot import Convention, Loads, Robot
 from visioncal.session import frame_name
 from visioncal.session.loads import loads_of
 from visioncal.stages.agree import Agreed
+from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.diagnose import Diagnosis
-from visioncal.stages.elastic import Elastic
 from visioncal.stages.handeye import HandEyeResult
-from visioncal.stages.joints import Matched
 from visioncal.stages.judge import Findings
-from visioncal.stages.kinematics import Kinematics
 from visioncal.stages.measured import prior_of
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
-from visioncal.stages.reported import Reported, moved_arm
-from visioncal.stages.tell import Telling
+from visioncal.stages.reported import Reported
 from visioncal.stages.validate import HeldOut
 from visioncal.thermal import Inputs, Stops, ThermalFit
 from visioncal.types import Corners, FloatArray, IntArray, SolverName
@@ -54,15 +48,12 @@ class Known(Observed):
         free: Lens and board as all views see them together; None without corners.
         level: How far to go: `auto`, `hand-eye`, `offsets` or `kinematics`.
         convention: Of the joint table in which the arm is told; None for the stated one.
-        arm: Errors that follow the arm's posture, where they are likely.
+        calibrated: The robot's arm, as far as it was calibrated; None for not at all.
         thermal: How the arm drifts with its temperature; None where that is not told.
         heated_by: What heats it.
-        kinematics: Which of them the views tell; None where that was not asked or cannot be.
-        arm_model: The arm with these errors; None where it stays nominal.
         hand_eye: Both unknown edges.
         diagnosis: What the residuals show beyond noise.
-        telling: What the stops tell of a calibrated arm.
-        elastic: What they tell of its joints as springs; None for a rigid one.
+        arm_found: What the stops tell of a calibrated arm.
         held_out: Residuals of used views, left out of the fit.
         findings: What the verdict is made of.
         verdict: Whether to trust it all.
@@ -78,15 +69,12 @@ class Known(Observed):
     free: Free | None = None
     level: str = "auto"
     convention: Convention | None = None
-    arm: ArmErrors | None = None
+    calibrated: RobotArm | None = None
     thermal: ThermalFit | None = None
     heated_by: Inputs | None = None
-    kinematics: Kinematics | None = None
-    arm_model: ArmModel | None = None
     hand_eye: HandEyeResult | None = None
     diagnosis: Diagnosis | None = None
-    telling: Telling | None = None
-    elastic: Elastic | None = None
+    arm_found: ArmFound = field(default_factory=ArmFound)
     held_out: HeldOut | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None
@@ -121,7 +109,8 @@ class Known(Observed):
     def seeing(self, refined: Refined) -> Self:
         """Takes over lens, board and poses, and makes the poses of all other views anew."""
         seen = {it.view: it for it in refined.views}
-        known = replace(self.with_noise(refined.sigma_px), free=refined.free, arm=refined.arm)
+        known = replace(self.with_noise(refined.sigma_px), free=refined.free)
+        known = replace(known, calibrated=self.robot_arm.erring(refined.arm))
         known = known.posed([it for view, it in self.poses.items() if view not in seen])
         return replace(known, poses={**known.poses, **seen})
 
@@ -155,38 +144,38 @@ class Known(Observed):
         return self.reported.base_from_flange
 
     @property
-    def joints_rad(self) -> Mapping[int, FloatArray] | None:
-        """(n,) by view, where each view has them and they fit the robot [rad]."""
-        return self.reported.joints_rad
-
-    @property
-    def matched(self) -> Matched | None:
-        """The joints beside the reported poses; None without a robot."""
-        return self.reported.matched
-
-    @property
     def robot(self) -> Robot | None:
         """The nominal robot, where the session names a known one."""
-        return None if self.matched is None else self.matched.robot
+        matched = self.reported.matched
+        return None if matched is None else matched.robot
+
+    @cached_property
+    def robot_arm(self) -> RobotArm:
+        """The robot's arm; its stops are all views with a pose, in their order."""
+        if self.calibrated is not None:
+            return self.calibrated
+        views, joints = tuple(self.base_from_flange), self.reported.joints_rad
+        return RobotArm(
+            ROBOT,
+            np.array([*self.base_from_flange.values()]).reshape(-1, 4, 4),
+            np.ones(len(views), dtype=bool),
+            None if joints is None else np.array([joints[it] for it in views]),
+            self.loads(views),
+            self.reported.matched,
+        )
+
+    def arm_at(self, views: Sequence[int]) -> RobotArm:
+        """The robot's arm at some views."""
+        return self.robot_arm.at(np.array([self._places[it] for it in views], dtype=np.int64))
 
     @property
-    def lost_zero(self) -> JointReading | None:
-        """A joint whose zero is far from where the model has it."""
-        return None if self.matched is None else self.matched.zero
+    def arm_at_stops(self) -> RobotArm:
+        """The robot's arm at the stops of the used views, by the first view of each."""
+        return self.arm_at(self.first_of_stops(self.used))
 
-    @property
-    def zeroed_robot(self) -> Robot | None:
-        """The nominal robot with its joints' zeros where the views have them."""
-        return None if self.matched is None else self.matched.arm
-
-    def stated_problem(self, views: Sequence[int]) -> Problem | None:
-        """What `problem` gives with a lost zero where the model has it; None where none is lost."""
-        robot, zeroed = self.robot, self.zeroed_robot
-        if self.lost_zero is None or robot is None or zeroed is None:
-            return None
-        first = self.first_of_stops(views)
-        poses = moved_arm(self.flange_poses(first), self.joints(first), zeroed, robot)
-        return replace(self.problem(views), poses={ROBOT: poses})
+    @cached_property
+    def _places(self) -> Mapping[int, int]:
+        return {view: at for at, view in enumerate(self.base_from_flange)}
 
     @property
     def scene(self) -> Scene | None:
@@ -236,9 +225,7 @@ class Known(Observed):
             effects += [it.of_stops(of_stops) for it in self.clock.effects(views)]
         if self.thermal is not None and self.heated_by is not None:
             effects.append(self.thermal.effect(self._thermal_stops(first), self.heated_by))
-        if self.arm is not None and self.arm.is_estimated:
-            errors = replace(self.arm, basis=self.arm_basis(first))
-            effects.append(errors.effect(ROBOT, values=self.arm_values))
+        effects += self.arm_at(first).effects()
         return chain(
             self.session.mount,
             self.flange_poses(first),
@@ -280,11 +267,7 @@ class Known(Observed):
 
     def flange_poses(self, views: Sequence[int]) -> FloatArray:
         """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""
-        if self.arm_model is None or self.joints_rad is None:
-            poses = np.array([self.base_from_flange[view] for view in views]).reshape(-1, 4, 4)
-        else:
-            poses = self.arm_model.base_from_flange(self.joints(views), self.loads(views))
-        return np.asarray(poses @ self.drift(views))
+        return np.asarray(self.arm_at(views).poses @ self.drift(views))
 
     def drift(self, views: Sequence[int]) -> FloatArray:
         """(m, 4, 4) how far the flange of some views had moved by its arm's temperature."""
@@ -296,13 +279,10 @@ class Known(Observed):
     def _thermal_stops(self, views: Sequence[int]) -> Stops:
         stamps = {view.number: view.stamp_s or 0.0 for view in self.session.views}
         at_s = np.array([stamps[it] for it in views])
-        return Stops(ROBOT, np.arange(len(views)), self.joints(views), at_s)
-
-    def joints(self, views: Sequence[int]) -> FloatArray:
-        """(m, n) joint angles of some views, where all have them [rad]."""
-        joints = {} if self.joints_rad is None else self.joints_rad
-        count = 0 if self.robot is None else self.robot.joint_count
-        return np.array([joints[view] for view in views]).reshape(len(views), count)
+        joints = self.arm_at(views).joints_rad
+        if joints is None:
+            raise RuntimeError("a drift is told by joints")
+        return Stops(ROBOT, np.arange(len(views)), joints, at_s)
 
     def loads(self, views: Sequence[int]) -> Loads:
         """What the flange carried at some views, and from which side the joints came."""
@@ -319,38 +299,6 @@ class Known(Observed):
         known = replace(self, readings=readings, poses=readings.poses(flange))
         return known.noting(readings.rejections)
 
-    def with_arm_errors(self) -> Self:
-        """Takes the errors of the arm's model for those that are estimated."""
-        if self.arm_model is None or self.kinematics is None:
-            return self
-        first = next(iter(self.kinematics.errors.values()))
-        gain = sum(it.gain for it in self.kinematics.errors.values())
-        errors = ArmErrors(self.arm_basis(self.used), first.sigma, gain, of_links=True)
-        return replace(self, arm=errors)
-
-    @property
-    def arm_size(self) -> int:
-        """How many values the arm's errors have; they come last of what the views share."""
-        return 0 if self.arm_model is None else len(self.arm_model.values)
-
-    @property
-    def arm_spread(self) -> FloatArray:
-        """(p, p) covariance of the errors of the arm's model."""
-        first = len(self.solved.covariance) - self.arm_size
-        return self.solved.covariance[first:, first:]
-
-    @property
-    def arm_by_stop(self) -> ArmErrors | None:
-        """Errors that follow the arm's posture, at the stops of the used views; None for none."""
-        if self.arm is None:
-            return None
-        return replace(self.arm, basis=self.arm_basis(self.first_of_stops(self.used)))
-
-    @property
-    def arm_values(self) -> FloatArray | None:
-        """(p,) present values of the arm's errors; None for the nominal arm's."""
-        return None if self.arm_model is None else self.arm_model.values
-
     @property
     def estimates_looks(self) -> bool:
         """Whether the views have to tell the first effect.
@@ -362,15 +310,6 @@ class Known(Observed):
             return not self.readings.are_poses and len(self.readings.names) > 1
         told = self.camera is not None and self.camera.estimated
         return told and self.free is not None and len(self.free.columns) > 0
-
-    def arm_basis(self, views: Sequence[int]) -> FloatArray:
-        """How errors of the arm move each view's flange: of its links where these are known."""
-        if self.arm_model is not None:
-            return self.arm_model.basis(self.joints(views), self.loads(views))
-        robot = self.zeroed_robot
-        if self.joints_rad is not None and robot is not None:
-            return link_basis(robot, np.array([self.joints_rad[view] for view in views]))
-        return pose_basis(np.array([self.base_from_flange[view] for view in views]))
 
     @property
     def stops(self) -> IntArray:

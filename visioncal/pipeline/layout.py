@@ -39,13 +39,18 @@ def without_lost_boards(known: Known) -> Known:
     return known.noting([Rejection(*it) for it in why.items()], doubts)
 
 
-def middles(known: Known) -> FloatArray:
-    """(m, 3) middle of the target that each observation is of, in its frame [m]."""
+def middles_of(known: Known) -> dict[str, FloatArray]:
+    """(3,) the middle of each printed target by its frame, in that [m]."""
     targets = tuple(known.session.boards.values())
-    middle = {
+    return {
         known.frame_of(it): corner_positions(targets[it]).mean(axis=0)
         for it in known.boards
         if targets
     }
+
+
+def middles(known: Known) -> FloatArray:
+    """(m, 3) middle of the target that each observation is of, in its frame [m]."""
+    middle = middles_of(known)
     observed = known.solved.problem.observations.observed
     return np.array([middle.get(it, np.zeros(3)) for it in observed])

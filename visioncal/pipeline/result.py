@@ -11,13 +11,12 @@ from visioncal.calibration import Calibration, CameraResult, Edge, SolverResult,
 from visioncal.errors import DataError, VisioncalError
 from visioncal.estimation.appearance import BOARD_NAMES, LENS_AND_BOARD, Free, shape_slices
 from visioncal.evidence import ViewEvidence
-from visioncal.pipeline.arm import kinematics_document
-from visioncal.pipeline.elastic import elastic_document
 from visioncal.pipeline.fit import conditions_document, fit_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.pipeline.thermal import thermal_document
+from visioncal.pipeline.unseen import unseen_views
 from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
@@ -189,16 +188,12 @@ def _further(known: Known) -> dict[str, Any]:
 
 def _arm(known: Known) -> dict[str, Any]:
     """What was found of the arm."""
-    documents: dict[str, Any] = {}
-    if known.arm is not None:
-        documents["arm_errors"] = known.arm.document()
-    arm = {
-        "kinematics": kinematics_document(known),
-        "elastic": elastic_document(known),
-        "thermal": thermal_document(known),
-    }
-    documents |= {name: it for name, it in arm.items() if it is not None}
-    return documents
+    arm, found = known.robot_arm, known.arm_found
+    documents = arm.documents(found, known.first_of_stops(known.used))
+    if arm.kinematics is not None and found.telling is not None:
+        documents["kinematics"] |= unseen_views(known, arm.kinematics)
+    thermal = thermal_document(known)
+    return documents if thermal is None else documents | {"thermal": thermal}
 
 
 def _instrument(known: Known, readings: Readings) -> dict[str, Any]:

@@ -13,11 +13,9 @@ from visioncal.errors import DataError
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.joint import Arm
 from visioncal.estimation.observability import directions, refuse_too_few
-from visioncal.pipeline.arm import telling_of
-from visioncal.pipeline.choosing import arm_told, with_views_back
-from visioncal.pipeline.elastic import check_loads, with_springs
+from visioncal.estimation.problem import ROBOT
 from visioncal.pipeline.known import Known, rms_of
-from visioncal.pipeline.layout import middles, without_lost_boards
+from visioncal.pipeline.layout import middles, middles_of, without_lost_boards
 from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unseen import left_out
 from visioncal.pipeline.unused import not_used
@@ -25,6 +23,7 @@ from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.session import STREAMS
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.agree import agree
+from visioncal.stages.arms import check_arms
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clocks import set_clocks, waits_for_clock
@@ -32,7 +31,8 @@ from visioncal.stages.diagnose import diagnose
 from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
-from visioncal.stages.kinematics import check_asked
+from visioncal.stages.kinematics import check_asked, doubts, findings
+from visioncal.stages.loads import check_stops
 from visioncal.stages.measured import components
 from visioncal.stages.observed import all_held_back, nothing_seen
 from visioncal.stages.place import lay_out
@@ -79,8 +79,9 @@ def _read_robot(known: Known) -> Known:
 def _reported(known: Known) -> Known:
     """Takes up what is reported of the robot."""
     known = read_robots(known)
-    if known.matched is not None and known.matched.misread:
-        check_asked(known.level, can=False, misread=known.matched.misread)
+    matched = known.reported.matched
+    if matched is not None and matched.misread:
+        check_asked(known.level, can=False, misread=matched.misread)
     if not known.base_from_flange:
         raise DataError(
             f"session {known.session.name!r}: no view has a pose of the robot.",
@@ -88,7 +89,12 @@ def _reported(known: Known) -> Known:
             next_step=" ".join(known.session.warnings)
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
-    check_loads(known)
+    views, declared = (
+        tuple(known.base_from_flange),
+        {it.number: it.stop for it in known.session.views},
+    )
+    check_stops(known.loads(views), views, [declared[it] for it in views])
+    check_arms({ROBOT: known.robot_arm}, known.level)
     return known
 
 
@@ -195,7 +201,8 @@ def _refine(known: Known) -> Known:
         return known
     if scene is None or free is None or any(it is None for it in known.seen(known.used)):
         problem = known.problem(known.used).merged()
-        return replace(known, arm=arm_errors(_arm(known), problem, known.frames))
+        errors = arm_errors(_arm(known), problem, known.frames)
+        return replace(known, calibrated=known.robot_arm.erring(errors))
     notes = known.notes
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
@@ -212,14 +219,14 @@ def _refine(known: Known) -> Known:
 
 
 def _arm(known: Known) -> Arm:
-    first = known.first_of_stops(known.used)
+    arm = known.arm_at_stops
     return Arm(
         known.session.mount,
-        known.flange_poses(first),
+        known.flange_poses(known.first_of_stops(known.used)),
         known.stops,
         known.targets(known.used),
-        known.arm_basis(first),
-        known.joints_rad is not None,
+        arm.basis,
+        arm.is_modelled,
         priors=known.priors,
     )
 
@@ -237,11 +244,43 @@ def _thermal(known: Known) -> Known:
 
 def _kinematics(known: Known) -> Known:
     """Takes up the arm's errors, again with views that disagree with the arm as stated alone."""
-    found = arm_told(known)
-    if found.arm_model is None or len(known.used) == len(known.candidates):
+    found = _with_level(known)
+    if found.robot_arm.model is None or len(known.used) == len(known.candidates):
         return found
-    more = with_views_back(known, _hand_eye(found))
-    return found if more is None else arm_told(more)
+    more = _with_views_back(known, _hand_eye(found))
+    return found if more is None else _with_level(more)
+
+
+def _with_level(known: Known) -> Known:
+    """Chooses how far the arm is calibrated, and takes its errors up as unknowns."""
+    arm = known.robot_arm
+    can = arm.is_modelled and known.solver == "joint"
+    check_asked(known.level, can=can)
+    if not can or known.level == "hand-eye":
+        return known
+    stated = replace(known, calibrated=arm.erring(None))
+    problem = stated.problem(known.used).merged()
+    start = problem.start(known.frames)
+    arm = arm.calibrated_as(known.arm_at_stops.with_level(problem, start, known.level))
+    known = replace(known, calibrated=arm)
+    if arm.kinematics is None:
+        return known
+    known = replace(known, notes=(*known.notes, *findings(arm.kinematics)))
+    return known.noting((), doubts(arm.kinematics))
+
+
+def _with_views_back(stated: Known, calibrated: Known) -> Known | None:
+    """The views that agree when the arm is calibrated; None where that brings none back."""
+    before, all_of = stated.agreed, stated.candidates
+    if before is None:
+        return None
+    mount = stated.session.mount
+    again = agree(calibrated.problem(all_of), all_of, mount, calibrated.frames, before.mask)
+    alike = stated.arm_at(all_of).reported_alike(before.mask)
+    back = again.mask & (before.mask | alike)
+    if not (back & ~before.mask).any():
+        return None
+    return without_lost_boards(stated.agreeing(replace(again, mask=back, frames=before.frames)))
 
 
 def _hand_eye(known: Known) -> Known:
@@ -250,24 +289,23 @@ def _hand_eye(known: Known) -> Known:
     With it go the rotations that were supplied to readings of points.
     """
     for _ in range(_ROUNDS):
-        known = known.with_arm_errors()
         problem = known.problem(known.used).merged()
         result = solve_hand_eye(
             problem,
             known.session.mount,
             known.solver,
-            known.arm_by_stop,
+            known.arm_at_stops.errors,
             looks=known.estimates_looks,
             start=problem.start(known.frames),
         )
         frames = dict(zip(problem.unknown, result.state.edges, strict=True))
         known = replace(known, hand_eye=result, frames=frames)
-        model, readings, values = known.arm_model, known.readings, result.state.values
-        step = values[len(values) - known.arm_size :]
-        if np.abs(step).max(initial=0.0) < _ARM_AT_REST_RAD and _is_aimed(known):
+        arm, readings = known.robot_arm, known.readings
+        moved, step = arm.moved(problem, result.state)
+        if step < _ARM_AT_REST_RAD and _is_aimed(known):
             break
-        if model is not None:
-            known = replace(known, arm_model=model.moved(step))
+        if arm.model is not None:
+            known = replace(known, calibrated=moved)
         if readings is not None:
             known = known.with_readings(readings.moved(result.state))
     found = components(result.problem, result.state, result.covariance)
@@ -291,9 +329,9 @@ def _diagnose(known: Known) -> Known:
         result,
         mount,
         known.free,
-        known.arm_by_stop,
+        known.arm_at_stops.errors,
         middles(known),
-        calibrated=known.arm_model is not None,
+        calibrated=known.robot_arm.model is not None,
     )
     spread = diagnosis.inflation * result.covariance
     worst = directions(result.problem, result.state, spread, mount)
@@ -307,16 +345,18 @@ def _validate(known: Known) -> Known:
 
 
 def _tell(known: Known) -> Known:
-    telling = telling_of(known)
-    advice = () if telling is None or not telling.advice else (telling.advice,)
-    return with_springs(replace(known, telling=telling, notes=(*known.notes, *advice)))
+    result, arm = known.solved, known.arm_at_stops
+    seen = arm.seen(result.problem, result.fit, result.covariance, middles_of(known))
+    found = arm.found(seen, known.convention)
+    known = replace(known, arm_found=found, notes=(*known.notes, *found.notes()))
+    return known.noting((), found.doubts())
 
 
 def _judge(known: Known) -> Known:
     held, diagnosis, agreed = known.held_out, known.diagnosis, known.agreed
     if held is None or diagnosis is None or agreed is None:
         raise RuntimeError("the verdict comes before what it is made of")
-    telling, noise, views = known.telling, known.robot_noise, view_results(known)
+    telling, noise, views = known.arm_found.telling, known.robot_noise, view_results(known)
     lost = [Rejection(*it) for it in known.reasons.items() if it[0] not in known.held_back]
     pair = Pair(
         views,

@@ -10,7 +10,6 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.problem import ROBOT, State
 from visioncal.estimation.solve import starting_noise
 from visioncal.pipeline.known import Known
-from visioncal.robot import Robot
 from visioncal.stages.thermal import (
     LEVEL,
     findings,
@@ -75,8 +74,8 @@ def thermal_document(known: Known) -> dict[str, Any] | None:
 
 def _told(known: Known) -> tuple[Inputs | None, str]:
     """What heats the arm; or None, and what is missing."""
-    robot = known.zeroed_robot
-    if robot is None or known.joints_rad is None or known.solver != "joint":
+    robot = known.robot
+    if robot is None or not known.robot_arm.is_modelled or known.solver != "joint":
         return None, "the joint angles of every view, a known model of the robot and the joint fit"
     used = set(known.used)
     timeless = [it.number for it in known.session.views if it.number in used and it.stamp_s is None]
@@ -104,28 +103,26 @@ def _stamps(known: Known) -> FloatArray:
 
 def _fit(known: Known, inputs: Inputs) -> ThermalFit | None:
     """Fits the drift with the edges and, where they are off, the arm's links."""
-    robot = known.zeroed_robot
-    if robot is None or known.agreed is None:
+    known = replace(known, calibrated=known.robot_arm.erring(None))
+    arm = known.arm_at_stops
+    q, matched = arm.joints_rad, arm.matched
+    if matched is None or q is None:
         return None
-    first = np.unique(known.stops, return_index=True)[1]
-    q = known.joints(known.used)
-    model = ArmModel.of(robot, q, known.flange_poses(known.used))
-    known = replace(known, arm=None)
+    model = ArmModel.of(matched.arm, q, arm.reported)
     problem = known.problem(known.used).merged()
     state = problem.start(known.frames)
-    noise, basis = starting_noise(problem), model.columns("links", q[first])
+    noise, basis = starting_noise(problem), model.columns("links", q)
     links = find_arm_errors(problem, state, noise, ROBOT, basis, of_links=True)
     if links is not None:
         problem = problem.with_effects([*problem.effects, links.effect(ROBOT)])
         state = State(state.edges, problem.start_values)
-    stops = Stops(ROBOT, np.arange(len(first)), q[first], _stamps(known))
-    return fit_thermal(problem, state, model.robot, stops, inputs, robot)
+    stops = Stops(ROBOT, np.arange(len(q)), q, _stamps(known))
+    return fit_thermal(problem, state, model.robot, stops, inputs, matched.arm)
 
 
 def _course(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float]]:
     """How far the flange has drifted at the stops' mean posture, and how surely that is known."""
-    model, robot = fit.model, known.zeroed_robot
-    q = _typical(known, model.robot if robot is None else robot)
+    model, q = fit.model, _typical(_joints(known))
     at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _DRAWN)
     links = model.heating.links_c(inputs, at_s)
     rows = np.tile(q, (len(at_s), 1))
@@ -148,9 +145,8 @@ def _seen(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, float
     """
     first = np.unique(known.stops, return_index=True)[1]
     views = [known.used[at] for at in first]
-    q, stamps_s, model = known.joints(views), _stamps(known), fit.model
-    robot = known.zeroed_robot
-    there = np.abs(q - _typical(known, model.robot if robot is None else robot)).max(axis=1)
+    q, stamps_s, model = _joints(known), _stamps(known), fit.model
+    there = np.abs(q - _typical(q)).max(axis=1)
     chosen = np.flatnonzero(there < _SAME_RAD)
     problem = replace(known.solved.problem, is_combined=False)
     linear = problem.linear(known.solved.state)
@@ -179,10 +175,14 @@ def _by_view(known: Known, fit: ThermalFit, inputs: Inputs) -> list[dict[str, fl
     ]
 
 
-def _typical(known: Known, robot: Robot) -> FloatArray:
-    """(n,) the posture that most stops are in; of several, the one that most are near to."""
-    first = np.unique(known.stops, return_index=True)[1]
-    q = known.joints(known.used).reshape(-1, robot.joint_count)[first]
+def _joints(known: Known) -> FloatArray:
+    """(s, n) joint angles at the used stops [rad]."""
+    q = known.arm_at_stops.joints_rad
+    return np.zeros((0, 0)) if q is None else q
+
+
+def _typical(q: FloatArray) -> FloatArray:
+    """(n,) the posture that most of (s, n) stops are in; of several, the one that most are near."""
     alike = [int((np.abs(q - it).max(axis=1) < _SAME_RAD).sum()) for it in q]
     away = np.abs(q - np.median(q, axis=0)).sum(axis=1)
     return np.asarray(q[np.lexsort((away, -np.array(alike)))[0]])

@@ -57,9 +57,10 @@ def _held_back(
     Returns:
         Twice (m, 2) rotation [rad] and distance [m].
     """
-    stated = replace(known, arm=None, arm_model=None)
-    lost = stated.stated_problem(views)
-    before = apart(stated.problem(views) if lost is None else lost, found.fits[0].fit.state)
+    stated = replace(known, calibrated=known.robot_arm.erring(None))
+    problem = stated.problem(views)
+    lost = stated.arm_at(stated.first_of_stops(views)).stated(problem)
+    before = apart(problem if lost is None else lost, found.fits[0].fit.state)
     after = apart(known.problem(views), known.solved.state)
     return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
 

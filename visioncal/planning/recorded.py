@@ -123,9 +123,10 @@ def begin(
     robot, free, targets = known.robot, known.free, tuple(known.session.boards.values())
     if robot is None or free is None or not targets or known.pixel_px is None:
         raise _lacking(known)
-    first = known.first_of_stops(known.used)
+    first, arm = known.first_of_stops(known.used), known.arm_at_stops
     # The arm's own errors are the purpose's business: they are put in again with its priors.
-    problem = replace(known, arm=None).problem(known.used).merged()
+    bare = replace(known, calibrated=replace(known.robot_arm, errors=None))
+    problem = bare.problem(known.used).merged()
     with one_blas_thread():
         state, noise = _start(known, problem, guess)
         edges, spread = _nearest(problem, state, noise, known.session.mount, guess)
@@ -147,16 +148,15 @@ def begin(
         boxes,
         spread,
     )
-    q = None if known.joints_rad is None else known.joints(first)
     corner = int(first_corners(targets)[known.boards[0]])
     recorded = Recorded(
         problem,
         edges,
         free,
-        q,
+        arm.joints_rad,
         noise,
         corner,
-        None if known.arm is None else replace(known.arm, basis=known.arm_basis(first)),
+        arm.errors,
         1.0 if known.diagnosis is None else known.diagnosis.inflation,
     )
     return Begun(cell, recorded, found.refusal, tuple(first))
@@ -164,11 +164,10 @@ def begin(
 
 def _arm(known: Known, robot: Robot) -> Robot:
     """The arm up to the frame of the reported poses, as far as it is calibrated."""
-    if known.arm_model is not None:
-        return known.arm_model.robot
-    if known.joints_rad is None:
-        return robot
-    return ArmModel.of(robot, known.joints(known.used), known.flange_poses(known.used)).robot
+    arm = known.arm_at(known.used)
+    if arm.model is not None:
+        return arm.model.robot
+    return robot if arm.joints_rad is None else ArmModel.of(robot, arm.joints_rad, arm.poses).robot
 
 
 def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, Noise]:

@@ -15,7 +15,7 @@ from visioncal.estimation.arm import (
 )
 from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
-from visioncal.estimation.problem import Effect, Problem, State
+from visioncal.estimation.problem import Effect, Noise, Problem, State
 from visioncal.estimation.solve import Solution
 from visioncal.robot import Convention, Loads
 from visioncal.stages import backlash, elastic
@@ -23,8 +23,14 @@ from visioncal.stages.backlash import Play, plays_of
 from visioncal.stages.elastic import Elastic, springs_of
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import Kinematics, choose_level
+from visioncal.stages.loads import check_elastic, check_poses
+from visioncal.stages.reported import moved_arm
 from visioncal.stages.tell import Telling, tell
-from visioncal.types import FloatArray, Mask
+from visioncal.transforms import distances, invert, mean_transform
+from visioncal.types import FloatArray, IntArray, Mask
+
+# Poses and joints are written with so many digits [m, rad].
+_ROUNDED = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +88,35 @@ class RobotArm:
     model: ArmModel | None = None
 
     @property
+    def is_modelled(self) -> bool:
+        """Whether its joints at all stops belong to a known model."""
+        return self.matched is not None and self.joints_rad is not None
+
+    def at(self, stops: IntArray) -> Self:
+        """The arm at (k,) of its stops."""
+        stood = self.stood[stops]
+        kept = (np.cumsum(self.stood) - 1)[stops][stood]
+        joints, errors = self.joints_rad, self.errors
+        return replace(
+            self,
+            reported=self.reported[stops],
+            stood=stood,
+            joints_rad=None if joints is None else joints[kept],
+            loads=self.loads.chosen(kept),
+            errors=None if errors is None else replace(errors, basis=errors.basis[stops]),
+        )
+
+    def erring(self, errors: ArmErrors | None) -> Self:
+        """The arm with errors that were found at some of its stops, none of them estimated yet."""
+        arm = replace(self, errors=errors, kinematics=None, model=None)
+        return arm if errors is None else replace(arm, errors=replace(errors, basis=arm.basis))
+
+    def calibrated_as(self, other: Self) -> Self:
+        """The arm with what was found of it at some of its stops."""
+        arm = replace(self, kinematics=other.kinematics)
+        return arm if other.model is None else arm._bending(other.model)
+
+    @property
     def poses(self) -> FloatArray:
         """(s, 4, 4) where the flange stood, by the calibrated arm where there is one."""
         if self.model is None or self.joints_rad is None:
@@ -98,7 +133,7 @@ class RobotArm:
         return (self.errors.effect(self.robot, values=values),)
 
     def without_errors(self, problem: Problem) -> Problem:
-        """A problem with this arm as stated."""
+        """A problem with this arm as reported."""
         mine = {it.name for it in self.effects()}
         rest = [it for it in problem.effects if it.name not in mine]
         return replace(problem, poses={**problem.poses, self.robot: self.reported}).with_effects(
@@ -112,11 +147,40 @@ class RobotArm:
             problem: The observations, with this arm as stated.
             fit: Their fit.
         """
-        known = self.matched is not None and self.joints_rad is not None
         found = find_arm_errors(
-            problem, fit.state, fit.noise, self.robot, self._any_errors(), of_links=known
+            problem, fit.state, fit.noise, self.robot, self.basis, of_links=self.is_modelled
         )
         return replace(self, errors=found)
+
+    def stated(self, problem: Problem) -> Problem | None:
+        """A problem with a lost zero where the model has it; None where none is lost.
+
+        Args:
+            problem: The observations, with the zero where it was found.
+        """
+        matched, q = self.matched, self.joints_rad
+        if matched is None or matched.zero is None or q is None:
+            return None
+        poses = problem.poses[self.robot].copy()
+        poses[self.stood] = moved_arm(poses[self.stood], q, matched.arm, matched.robot)
+        return replace(problem, poses={**problem.poses, self.robot: poses})
+
+    def reported_alike(self, agrees: Mask) -> Mask:
+        """(s,) where the reported poses are those of the joints, as much as where views agree.
+
+        A wrong report says nothing against joints and cameras, but would mislead the fit.
+
+        Args:
+            agrees: (s,) where they do.
+        """
+        if self.matched is None or self.joints_rad is None:
+            return agrees
+        nominal = self.matched.arm.base_from_flange(self.joints_rad)
+        tools, sound = invert(nominal) @ self.reported[self.stood], agrees[self.stood]
+        away = distances(tools, mean_transform(tools[sound]))
+        found = agrees.copy()
+        found[self.stood] = np.all([it <= 2.0 * it[sound].max() + _ROUNDED for it in away], axis=0)
+        return found
 
     def seen(
         self, problem: Problem, fit: Solution, spread: FloatArray, middles: Mapping[str, FloatArray]
@@ -129,13 +193,14 @@ class RobotArm:
             spread: (p, p) its covariance.
             middles: (3,) the middle of each printed target by its frame, in that [m].
         """
-        if self.model is None or self.errors is None or self.joints_rad is None:
+        columns = problem.effect_columns.get(f"arm of {self.robot}")
+        if self.model is None or self.errors is None or self.joints_rad is None or columns is None:
             return None
-        (effect,) = self.effects()
         stops, every = stops_of(problem, self.robot), np.arange(problem.size)
         rows = np.searchsorted(np.flatnonzero(self.stood), stops)
-        observed = ArmPair.of(problem, fit.state, self.robot).observed
-        edges = every[: 6 * len(problem.unknown)]
+        pair = ArmPair.of(problem, fit.state, self.robot)
+        # Readings of one point show its place and no rotation; several points make a frame.
+        shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
         return ArmData(
             problem,
             fit.state,
@@ -143,13 +208,14 @@ class RobotArm:
             spread,
             self.robot,
             self.model,
-            every[problem.effect_columns[effect.name]],
+            every[columns],
             self.errors.sigma,
             stops,
             self.joints_rad[rows],
             self.loads.chosen(rows),
-            middles.get(observed, np.zeros(3)),
-            edges[problem.counted[edges]],
+            middles.get(pair.observed, np.zeros(3)),
+            every[: 6 * len(problem.unknown)],
+            measured=np.repeat([shows_pose, True], 3),
         )
 
     def found(self, seen: ArmData | None, convention: Convention | None = None) -> ArmFound:
@@ -194,29 +260,43 @@ class RobotArm:
             stages["elastic"] = found.springs.document(views)
         return stages
 
-    def _any_errors(self) -> FloatArray:
-        """(s, 6, p) how small errors move its flange: of its links, where these are known."""
+    @property
+    def basis(self) -> FloatArray:
+        """(s, 6, p) how small errors move its flange.
+
+        They are those of its model where it is calibrated, or else of any of its links, where these
+        are known.
+        """
         if self.matched is None or self.joints_rad is None:
             return self._by_stop(pose_basis(self.reported[self.stood]))
-        return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
+        if self.model is None:
+            return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
+        return self._by_stop(self.model.basis(self.joints_rad, self.loads))
 
-    def with_level(self, problem: Problem, fit: Solution, asked: str) -> Self:
+    def with_level(
+        self, problem: Problem, start: State, asked: str, noise: Noise | None = None
+    ) -> Self:
         """Chooses how far it is calibrated.
 
         Args:
-            problem: The observations, with this arm as stated.
-            fit: Where to start.
+            problem: The observations, with this arm as reported.
+            start: Where to start.
             asked: A key of `stages.kinematics.ASKED`.
+            noise: The noise's levels to start from; those from above where None.
         """
-        observed = len(stops_of(problem, self.robot)) > 0
-        if self.matched is None or self.joints_rad is None or not observed:
+        stops = stops_of(problem, self.robot)
+        if self.matched is None or self.joints_rad is None or not len(stops):
             return self
-        q, loads = self.joints_rad, self.loads
-        model = ArmModel.of(self.matched.arm, q, self.reported[self.stood]).loaded(q, loads)
-        blocks = blocks_of(model.nominal, loads)
+        seen = self.at(stops)
+        q, loads = seen.joints_rad, seen.loads
+        if q is None:
+            return self
+        model = ArmModel.of(self.matched.arm, q, seen.reported).loaded(q, loads)
+        blocks = blocks_of(model.nominal, self.loads)
         bases = {name: self._columns(model, name) for name in blocks}
-        start = State(fit.state.edges, problem.start_values)
-        found = choose_level(problem, start, self.robot, bases, asked, noise=fit.noise)
+        found = choose_level(
+            problem, start, self.robot, bases, asked, self.stated(problem), noise=noise
+        )
         arm = replace(self, kinematics=found)
         return arm._bending(model.erring(found.errors)) if found.errors else arm
 
@@ -234,8 +314,11 @@ class RobotArm:
         """
         if self.model is None:
             return self, 0.0
-        (effect,) = self.effects()
-        step = problem.values_of(effect.name, state) - self.model.values
+        name = f"arm of {self.robot}"
+        start = [it.values for it in problem.effects if it.name == name]
+        if not start:
+            return self, 0.0
+        step = problem.values_of(name, state) - start[0]
         return self._bending(self.model.moved(step)), float(np.abs(step).max())
 
     def _bending(self, model: ArmModel) -> Self:
@@ -243,10 +326,8 @@ class RobotArm:
         if self.kinematics is None:
             return self
         found = self.kinematics.errors.values()
-        basis = [weight * self._columns(model, name) for name, weight in model.weights.items()]
-        gain = sum(it.gain for it in found)
-        errors = ArmErrors(np.concatenate(basis, axis=2), next(iter(found)).sigma, gain, True)
-        return replace(self, model=model, errors=errors)
+        arm, gain = replace(self, model=model), sum(it.gain for it in found)
+        return replace(arm, errors=ArmErrors(arm.basis, next(iter(found)).sigma, gain, True))
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:
         """(s, 6, p) of (m, 6, p): zero where the robot did not stand."""
@@ -259,3 +340,15 @@ def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterato
     """The errors of all arms that are unknowns; see `RobotArm.effects`."""
     for arm in arms.values():
         yield from arm.effects(freely=freely)
+
+
+def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
+    """Refuses loads that determine nothing.
+
+    Raises:
+        DataError: Springs are asked for that nothing bends.
+        DegenerateError: Loads change while an arm stands still.
+    """
+    for arm in arms.values():
+        check_poses(arm.loads, arm.reported[arm.stood])
+        check_elastic(asked, None if arm.matched is None else arm.matched.robot, arm.loads)

@@ -118,7 +118,7 @@ def choose_level(
         fits = {NOMINAL: fit_level(arm)}
         fits |= {name: fit_level(arm, blocks) for name, blocks in LEVELS.items()}
         if stated is not None:
-            nominal = fit_level(ArmTrials(stated, state, robot, bases))
+            nominal = fit_level(ArmTrials(stated, state, robot, bases, noise))
             fits = _with_lost_zero(fits, problem, stated, nominal, bases)
     found = {name: fit for name, fit in fits.items() if fit is not None}
     levels = tuple(_level(name, fit) for name, fit in found.items())

@@ -58,12 +58,6 @@ class Reported:
         kept = {it: pose for it, pose in self.base_from_flange.items() if it not in views}
         return replace(self, base_from_flange=kept)
 
-    def without_joints(self) -> Self:
-        """Leaves out the joints."""
-        if self.matched is None:
-            return self
-        return replace(self, matched=replace(self.matched, joints_rad={}))
-
     def with_zero(self, zero: JointReading) -> Self:
         """Takes a joint's zero for where it is, and the poses for those of the arm then."""
         before, joints = self.matched, self.joints_rad

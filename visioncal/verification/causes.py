@@ -101,7 +101,7 @@ def _joints(seen: Seen, footing: Footing) -> Iterator[Cause]:
 
 def _arm(seen: Seen, footing: Footing) -> ArmModel | None:
     """The arm that offsets are of; the nominal one where none was calibrated."""
-    robot, matched = footing.calibration.calibrated_robot, seen.known.matched
+    robot, matched = footing.calibration.calibrated_robot, seen.known.reported.matched
     if footing.model is not None or robot is None:
         return footing.model
     reported = np.eye(4) if matched is None else matched.flange_from_reported

@@ -56,9 +56,7 @@ class Seen:
     @property
     def joints_rad(self) -> FloatArray | None:
         """(s, n) joint angles of the stops [rad]; None where not all have them."""
-        if self.known.joints_rad is None or self.known.robot is None:
-            return None
-        return self.known.joints(self.known.first_of_stops(self.known.used))
+        return self.known.arm_at_stops.joints_rad
 
     @property
     def boards(self) -> IntArray:
@@ -157,10 +155,10 @@ def asked_of_boards(problem: Problem, state: State) -> FloatArray:
 
 def _with_arm(known: Known, footing: Footing) -> Known:
     """Takes the arm for what the calibration has it for."""
-    known = replace(known, arm_model=footing.model)
+    known = replace(known, calibrated=replace(known.robot_arm, model=footing.model))
     if footing.arm in ("none", "poses"):
         return known
-    if known.joints_rad is None:
+    if known.robot_arm.joints_rad is None:
         missing = [it.number for it in known.session.views if it.joints_rad is None]
         raise DataError(
             f"session {known.session.name!r}: the calibration is of an arm by its joints, and "
@@ -204,11 +202,11 @@ def _with_errors(known: Known, footing: Footing) -> Known:
     """Adds the arm's errors as unknowns, as the calibration's covariance has them."""
     if footing.arm == "none":
         return known
+    arm = known.robot_arm
     if footing.arm == "poses":
-        robots = {name: it.without_joints() for name, it in known.robots.items()}
-        known = replace(known, robots=robots)
-    errors = ArmErrors(known.arm_basis(known.used), 1.0, np.inf, of_links=True)
-    return replace(known, arm=errors)
+        arm = replace(arm, joints_rad=None)
+    errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
+    return replace(known, calibrated=replace(arm, errors=errors))
 
 
 def _noise_px(known: Known) -> float:
