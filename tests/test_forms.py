@@ -33,7 +33,7 @@ def calibrated(tmp_path_factory) -> str:
         (("solvers", "park", "rms_mm"), True, "solvers.park.rms_mm is True; a number"),
         (("frames", "flange_from_tool", "created"), [], "flange_from_tool.created is"),
         (("kinematics",), "nominal", "kinematics is 'nominal'; a table is needed"),
-        (("uncertainty",), {"noise_95": {}}, "uncertainty.budget_mm is missing"),
+        (("uncertainty",), {"budget_mm": {}}, "uncertainty.noise_95 is missing"),
         (("joint_covariance", "matrix", 2, 2), -1e-8, "matrix is no covariance"),
         (("joint_covariance", "matrix", 2, 3), 1.0, "matrix is no covariance"),
         (("transforms", "flange_from_cam", "matrix", 3, 0), 1.0, "not a rigid transform"),

@@ -13,6 +13,7 @@ from visioncal.calibration import Alignment, Calibration, RobotResult, to_docume
 from visioncal.camera import project
 from visioncal.errors import DataError
 from visioncal.figures import significant
+from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -88,6 +89,19 @@ def test_the_file_says_what_each_frame_is_uncertain_by(folder, found):
     html = (folder / "out" / "report.html").read_text()
     assert "Where the uncertainty comes from" in html
     assert f"{significant(of_hand['total'])}</td>" in html
+
+
+def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
+    written = json.loads((folder / "out" / "calibration.json").read_text())
+    for robot in ("a", "b"):
+        for name, (low, high) in written["uncertainty"]["noise_95"][robot].items():
+            assert 0.0 < low < written["noise"][robot][name] < high
+    # Two levels of 20 stops, some directions of which the frames have taken: not known exactly.
+    part = found.of("left", "b", "plate_b")
+    assert part.stages["uncertainty"]["noise_95"].keys() < part.noise.keys()
+    assert 20.0 < noise_freedom(part) < 120.0
+    low = written["uncertainty"]["noise_95"]["b"]["translation_mm"][0]
+    assert f"(95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
 
 
 def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, folder):

@@ -1,19 +1,18 @@
 """The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.arm import misfit_covariance, stops_of
-from visioncal.estimation.misfit import Drift, Neighbours, drift, inflation, neighbours
+from visioncal.estimation.arm import misfit_covariance
+from visioncal.estimation.misfit import inflation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution
 from visioncal.session import View
 from visioncal.session.loads import loads_of
 from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.cell import Cell, robot_key
-from visioncal.stages.diagnose import FEWEST_STOPS, misfit_words
+from visioncal.stages.diagnose import Misfit, misfit_words
 from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import ASKED, doubts, findings
 from visioncal.stages.reported import Reported
@@ -21,19 +20,6 @@ from visioncal.types import FloatArray
 
 # How far the arms of a whole cell may be calibrated.
 LEVELS = (*(it for it in ASKED if it != "thermal"), "hand-eye")
-
-
-@dataclass(frozen=True, eq=False)
-class Misfit:
-    """What the residuals of one robot's stops show beyond noise.
-
-    Attributes:
-        alike: Whether neighbouring stops err alike.
-        moved: How its base or what it looks at crept; None where noise explains it.
-    """
-
-    alike: Neighbours
-    moved: Drift | None
 
 
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
@@ -61,16 +47,6 @@ def _joints(views: Sequence[View], matched: Matched) -> FloatArray | None:
     known = [matched.joints_rad.get(it.number) for it in views]
     found = [it for it in known if it is not None]
     return np.array(found) if found and len(found) == len(known) else None
-
-
-def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
-    """Tests the residuals of each robot's stops for what is no noise."""
-    found = {}
-    for robot in problem.robots:
-        if len(stops_of(problem, robot)) >= FEWEST_STOPS:
-            fitted = (problem, fit.state, fit.noise, robot)
-            found[robot] = Misfit(neighbours(*fitted), drift(*fitted))
-    return found
 
 
 def covariance_of_arms(
@@ -123,7 +99,7 @@ def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
         yield from doubts(arm.kinematics)
     if found is not None:
         calibrated = arm.model is not None
-        yield from misfit_words(found.alike, found.moved, arm.errors, calibrated=calibrated)
+        yield from misfit_words(found, arm.errors, calibrated=calibrated)
 
 
 def _of_robot(robot: str, words: str) -> str:

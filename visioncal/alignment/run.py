@@ -10,10 +10,8 @@ import numpy as np
 
 from visioncal.alignment.arms import (
     LEVELS,
-    Misfit,
     covariance_of_arms,
     doubts_of_arms,
-    misfits,
     notes_on_arms,
 )
 from visioncal.alignment.faults import (
@@ -38,6 +36,7 @@ from visioncal.alignment.written import fit_sections
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
 from visioncal.estimation.arm import stops_of
+from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.solve import covariance_of
 from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
@@ -47,6 +46,7 @@ from visioncal.stages.cell import Cell, read_cell, robot_key
 from visioncal.stages.clock import Pair
 from visioncal.stages.clocks import set_clocks
 from visioncal.stages.delays import FoundDelay
+from visioncal.stages.diagnose import Misfit, misfits
 from visioncal.stages.judge import judge
 from visioncal.stages.measured import components
 from visioncal.stages.observed import Observed
@@ -193,7 +193,8 @@ def alignment_of(
         stages={
             **fit_sections(session, solved, spread, len(edges)),
             "uncertainty": {
-                "budget_mm": {f"{parents[it]}_from_{it}": mm for it, mm in budget.items()}
+                "budget_mm": {f"{parents[it]}_from_{it}": mm for it, mm in budget.items()},
+                "noise_95": _intervals(solved),
             },
         },
     )
@@ -328,6 +329,20 @@ def _noise(solved: Solved) -> dict[str, dict[str, float]]:
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=True):
         found[frame] = {**found.get(frame, {}), "level": level}
     return found
+
+
+def _intervals(solved: Solved) -> dict[str, dict[str, list[float]]]:
+    """95 % intervals of the levels of robots, as `_noise` names them."""
+    agreed = solved.agreed
+    part = agreed.problem.subset(agreed.used)
+    found = noise_intervals(part, agreed.fit.state, agreed.fit.noise)
+    return {
+        robot: {
+            "translation_mm": (1e3 * shift_m).tolist(),
+            "rotation_deg": np.rad2deg(turn_rad).tolist(),
+        }
+        for robot, (turn_rad, shift_m) in zip(part.robots, found, strict=True)
+    }
 
 
 def _cameras(

@@ -55,7 +55,7 @@ CALIBRATION: Form = MappingProxyType(
         "board?": _BOARD,
         "boards?": {"": _BOARD},
         "arm_errors?": {"sigma_mm": float, "sigma_deg": float},
-        "uncertainty?": {"noise_95": {"": [float]}, "budget_mm": {"": float}},
+        "uncertainty?": {"noise_95": {"": [float]}, "budget_mm?": {"": float}},
         "conditions?": {"": float},
         "joint_fit?": {"targets": {"": {}}, "looks": [int], "boards": [str]},
         "kinematics?": {
@@ -106,7 +106,7 @@ WHOLE: Form = MappingProxyType(
         "details": {},
         "boards?": {"": _BOARD},
         "validation?": {"method": str, "held_out": _RMS, "pairs": [_RMS]},
-        "uncertainty?": {"budget_mm": {"": {"": float}}},
+        "uncertainty?": {"budget_mm": {"": {"": float}}, "noise_95?": {"": {"": [float]}}},
         "joint_fit?": {"cameras": {"": [int]}, "targets": {"": [int]}, "covariance": [[float]]},
     }
 )

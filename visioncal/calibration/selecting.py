@@ -79,6 +79,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "stages": {
             **arm.stages,
             **_clock(cell, chosen),
+            **_intervals(cell, chosen),
             **_shapes(cell, chosen),
             **_joint_fit(cell, chosen, slopes),
         },
@@ -201,6 +202,13 @@ def _clock(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
     found = cell.details.get("clocks", {})
     pair = f"{chosen.camera} and robot {chosen.robot or 'robot'}"
     return {"clock": found[pair]} if pair in found else {}
+
+
+def _intervals(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+    """How well the robot's noise is known."""
+    found = cell.stages.get("uncertainty", {}).get("noise_95", {}).get(chosen.robot or "robot", {})
+    named = {f"robot_{name}": it for name, it in found.items()}
+    return {"uncertainty": {"noise_95": named}} if named else {}
 
 
 def _shapes(cell: Alignment, chosen: Chosen) -> dict[str, Any]:

@@ -18,7 +18,7 @@ _LONGEST_STEP, _SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
 # Twice the log-likelihood that a 95 % interval of one unknown gives away (chi-square), and how far
 # it is followed, in logarithms.
-_SURPRISE_95, _WIDEST = 3.84, 4.0
+_SURPRISE_95, _FIRST_WIDTH, _WIDEST = 3.84, 0.125, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,13 +143,16 @@ def profile_interval(
     def surprise(logarithm: float) -> float:
         return 2.0 * (profile(logarithm) - lowest) - _SURPRISE_95
 
-    def crossing(end: float, beyond: float) -> float:
-        if surprise(end) <= 0.0:
-            return beyond
-        return float(np.exp(brentq(surprise, middle, end, xtol=0.02)))
+    def crossing(side: float, beyond: float) -> float:
+        inner, outer = 0.0, _FIRST_WIDTH
+        while surprise(middle + side * outer) <= 0.0:
+            if outer == _WIDEST:
+                return beyond
+            inner, outer = outer, min(2.0 * outer, _WIDEST)
+        width = brentq(lambda it: surprise(middle + side * it), inner, outer, xtol=0.02)
+        return float(np.exp(middle + side * width))
 
-    low, high = middle - _WIDEST, middle + _WIDEST
-    return crossing(low, 0.0), crossing(high, float(np.exp(high)))
+    return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -199,7 +199,10 @@ def _arm(document: Mapping[str, Any]) -> Arm:
     )
 
 
-def _uncertainty(document: Mapping[str, Any]) -> Uncertainty:
+def _uncertainty(document: Mapping[str, Any]) -> Uncertainty | None:
+    """None of a part of a whole cell, of which its noise alone is known."""
+    if document.get("budget_mm") is None:
+        return None
     budget = {str(name): float(it) for name, it in document["budget_mm"].items()}
     total = budget.pop("total")
     if not budget:

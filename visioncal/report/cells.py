@@ -198,11 +198,15 @@ def source_table(found: Alignment) -> PairTable | None:
 
 def _noise_facts(found: Alignment) -> list[Fact]:
     units = {"mm": "mm", "deg": _DEG, "px": "px", "level": "times what is said of it"}
+    intervals = found.stages.get("uncertainty", {}).get("noise_95", {})
     facts = []
     for name, levels in found.noise.items():
-        words = [
-            f"{significant(value)} {units[key.rpartition('_')[2]]}" for key, value in levels.items()
-        ]
+        words = []
+        for key, value in levels.items():
+            words.append(f"{significant(value)} {units[key.rpartition('_')[2]]}")
+            if key in intervals.get(name, {}):
+                low, high = map(significant, intervals[name][key])
+                words[-1] += f" (95 %: {low} to {high})"
         label = f"robot {name}" if name in found.robots.values() else name
         facts.append(Fact(label, ", ".join(words)))
     return facts

@@ -6,25 +6,38 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.estimation.appearance import LENS_AND_BOARD, Free
-from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance
+from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, misfit_covariance, stops_of
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import ROBOT, Problem
-from visioncal.estimation.solve import fit_problem
+from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Mount
 
 # Fewer stops than this leave no residuals to be tested.
-FEWEST_STOPS = 6
+_FEWEST_STOPS = 6
 # Whose effects' uncertainty is, by their names; that of all others is the clock's.
 _OF_EFFECTS = {
     "points": "instrument",
     "temperature": "temperature",
     f"arm of {ROBOT}": "arm",
 }
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What the residuals of one robot's stops show beyond noise.
+
+    Attributes:
+        alike: Whether neighbouring stops err alike.
+        moved: How its base or what it looks at crept; None where noise explains it.
+    """
+
+    alike: Neighbours
+    moved: Drift | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +88,9 @@ def diagnose(
     """
     problem, state, noise = result.problem, result.state, result.noise
     with one_blas_thread():
-        alike, moved = Neighbours(1.0, False), None
-        if len(np.unique(problem.observations.stops)) >= FEWEST_STOPS:
-            # A closed form is not at rest, and that would pass for a misfit.
-            rest = fit_problem(problem, state)
-            fitted = (problem, rest.state, rest.noise, ROBOT)
-            alike, moved = neighbours(*fitted), drift(*fitted)
+        nothing = Misfit(Neighbours(1.0, is_significant=False), None)
+        # A closed form is not at rest, and that would pass for a misfit.
+        shown = misfits(problem, fit_problem(problem, state)).get(ROBOT, nothing)
         parts = covariance_by_source(problem, state, noise, _sources(problem, mount, free))
         size = 6 * len(problem.unknown)
         if arm is not None and not arm.is_estimated:
@@ -89,6 +99,7 @@ def diagnose(
         if result.held.any():
             parts["held_values"] = np.outer(result.held[:size], result.held[:size])
         intervals = noise_intervals(problem, state, noise)[0]
+    alike = shown.alike
     inflation = alike.factor if alike.is_significant else 1.0
     if inflation > 1.0:
         parts["misfit"] = (inflation - 1.0) * sum(parts.values(), np.zeros((size, size)))
@@ -107,8 +118,23 @@ def diagnose(
         _spectrum(inflation * result.covariance[:12, :12]),
         inflation,
         arm,
-        tuple(misfit_words(alike, moved, arm, calibrated=calibrated)),
+        tuple(misfit_words(shown, arm, calibrated=calibrated)),
     )
+
+
+def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
+    """Tests the residuals of each robot's stops for what is no noise; of few stops, none.
+
+    Args:
+        problem: The observations, their stops in the order of the session.
+        fit: Their fit, at rest.
+    """
+    found = {}
+    for robot in problem.robots:
+        if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
+            fitted = (problem, fit.state, fit.noise, robot)
+            found[robot] = Misfit(neighbours(*fitted), drift(*fitted))
+    return found
 
 
 def _sources(problem: Problem, mount: Mount, free: Free | None) -> Sources:
@@ -143,10 +169,9 @@ def _spectrum(spread: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(values, 0.0)))
 
 
-def misfit_words(
-    alike: Neighbours, moved: Drift | None, arm: ArmErrors | None, *, calibrated: bool
-) -> Iterator[str]:
+def misfit_words(found: Misfit, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[str]:
     """Words what of a robot's residuals is no noise, and what it probably is."""
+    alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated:
         size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
         told = (
