@@ -29,7 +29,7 @@ class CellSide:
         agreed: What its fit uses, and where it stands.
         arms: The robots' arms, and which of their errors were found.
         effects: All effects but lenses, boards and arms.
-        freely: Whether all errors that were found are free, and not those of known links alone.
+        freely: Whether all errors that were found are free, and not those alone that are estimated.
     """
 
     cell: Cell

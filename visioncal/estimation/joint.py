@@ -70,7 +70,7 @@ class Side(Protocol):
         """The side with those errors of its arms that a fit shows in which they are not free."""
 
     def freed(self, *, freely: bool) -> Self:
-        """The side with all errors of arms that were found free, or those alone of known links."""
+        """The side with all errors of arms that were found free, or only those estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class Arm:
         basis: (s, 6, p) how its errors move the flange at each stop.
         of_links: Whether these are errors of its own links.
         found: Its errors, where they are likely.
-        freely: Whether they are free whatever they are of.
+        freely: Whether they are free even where they are not estimated.
         priors: What was measured of frames by hand.
     """
 

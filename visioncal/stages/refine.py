@@ -131,11 +131,11 @@ def refined(
     under_stated = side.with_errors(stated)
     erring = (under_stated if under_stated.errors else found).freed(freely=True)
     answer = chosen(erring, _still_asked_for(erring, stated, answer))
-    if all(it.of_links for it in erring.errors):
-        return answer, erring
-    linked = erring.freed(freely=False)
-    fitted = settle(answer.looks, linked, answer.moving, answer.frames)
-    return fitted, linked.with_errors(fitted)
+    estimating = erring.freed(freely=False)
+    if all(it.is_estimated for it in erring.errors):
+        return answer, estimating
+    fitted = settle(answer.looks, estimating, answer.moving, answer.frames)
+    return fitted, estimating.with_errors(fitted)
 
 
 def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
