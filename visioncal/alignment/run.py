@@ -46,11 +46,11 @@ from visioncal.stages.cell import Cell, read_cell, robot_key
 from visioncal.stages.clock import Pair
 from visioncal.stages.clocks import set_clocks
 from visioncal.stages.delays import FoundDelay
-from visioncal.stages.diagnose import Misfit, misfits
+from visioncal.stages.diagnose import misfits
 from visioncal.stages.judge import judge
-from visioncal.stages.measured import components
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
+from visioncal.stages.priors import prior_words
 from visioncal.stages.readings import read_instruments
 from visioncal.stages.robots import check_joints, read_robots
 from visioncal.stages.validate import HeldOut
@@ -122,10 +122,10 @@ def alignment_of(
         DegenerateError: The observations leave a frame open.
     """
     session, agreed = looked.session, solved.agreed
-    problem = agreed.problem
-    found = misfits(problem.subset(agreed.used), agreed.fit)
-    parts = covariance_of_arms(problem.subset(agreed.used), agreed.fit, solved.arms, found)
-    spread = sum(parts.values(), covariance_of(problem.subset(agreed.used), agreed.fit))
+    problem, part = agreed.problem, agreed.problem.subset(agreed.used)
+    found = misfits(part, agreed.fit)
+    parts = covariance_of_arms(part, agreed.fit, solved.arms, found)
+    spread = sum(parts.values(), covariance_of(part, agreed.fit))
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
@@ -142,7 +142,10 @@ def alignment_of(
     held_out = left_out(solved)
     sights = _sights(cell, solved, held_out, faults)
     budget = {named[key].name: mm for key, mm in budget_mm(solved, parts).items()}
-    of_looks = [*solved.found_of_looks()]
+    of_rest = [
+        *prior_words(part, agreed.fit.state, spread, solved.cell.priors),
+        *solved.found_of_looks(),
+    ]
     findings = findings_of(
         solved,
         sights,
@@ -157,9 +160,11 @@ def alignment_of(
         },
         spared=looked.spared.keys() | looked.held_back,
         warnings=[
-            *_warnings(solved, looked, spread, found),
+            *doubts_of_arms(solved.arms, found, solved.asked),
+            *solved.cell.session.warnings,
+            *looked.warnings,
             *(f"Robot {name}: {words}" for name, it in told.items() for words in it.doubts()),
-            *(words for words, is_doubt in of_looks if is_doubt),
+            *(words for words, is_doubt in of_rest if is_doubt),
             *(moved_words(it) for it in moved),
             *(f"{it.frame} is tied to nothing. {it.remedy}" for it in untied),
         ],
@@ -167,7 +172,7 @@ def alignment_of(
             *looked.notes,
             *_clock_words(looked, solved, spread),
             *notes_on_arms(solved.arms, told),
-            *(words for words, is_doubt in of_looks if not is_doubt),
+            *(words for words, is_doubt in of_rest if not is_doubt),
         ),
     )
     return Alignment(
@@ -230,21 +235,6 @@ def _arms(session: Session, solved: Solved, told: Mapping[str, ArmFound]) -> dic
         stages = arm.documents(told[name], [first[it] for it in stops])
         found[name] = replace(found[name], stages=stages)
     return found
-
-
-def _warnings(
-    solved: Solved, looked: Observed, spread: FloatArray, found: Mapping[str, Misfit]
-) -> list[str]:
-    """Reasons for doubt that are no figure of the result."""
-    agreed = solved.agreed
-    used = agreed.problem.subset(agreed.used)
-    measured = components(used, agreed.fit.state, spread, solved.cell.priors)
-    return [
-        *doubts_of_arms(solved.arms, found, solved.asked),
-        *solved.cell.session.warnings,
-        *looked.warnings,
-        *(it.doubt for it in measured if it.is_contradicted),
-    ]
 
 
 def _details(looked: Observed, solved: Solved, spread: FloatArray) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
-from visioncal.estimation.solve import fit_problem
+from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.stages.cell import Cell
 from visioncal.stages.choose import chosen
@@ -189,7 +189,8 @@ def _with_repeats(agreed: Agreed) -> Agreed:
 def _without_contradicted(agreed: Agreed) -> Agreed:
     """Leaves out priors that the observations contradict, the worst first: it misleads the rest."""
     for _ in agreed.problem.priors:
-        worst = most_contradicted(agreed.problem.subset(agreed.used), agreed.fit)
+        part = agreed.problem.subset(agreed.used)
+        worst = most_contradicted(part, agreed.fit.state, covariance_of(part, agreed.fit))
         if worst is None:
             break
         kept = tuple(it for it in agreed.problem.priors if it is not worst)

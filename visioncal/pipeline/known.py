@@ -45,6 +45,7 @@ class Known(Observed):
         used: The views in the fit, in the session's order.
         candidates: The views that could be in the fit, if they agree.
         agreed: Which of them do.
+        contradicted: Names of priors that they contradict, which are left out.
         free: Lens and board as all views see them together; None without corners.
         level: How far to go: `auto`, `hand-eye`, `offsets` or `kinematics`.
         convention: Of the joint table in which the arm is told; None for the stated one.
@@ -66,6 +67,7 @@ class Known(Observed):
     used: tuple[int, ...] = ()
     candidates: tuple[int, ...] = ()
     agreed: Agreed | None = None
+    contradicted: frozenset[str] = frozenset()
     free: Free | None = None
     level: str = "auto"
     convention: Convention | None = None
@@ -193,7 +195,12 @@ class Known(Observed):
 
     @property
     def priors(self) -> tuple[FramePrior, ...]:
-        """What is known of the edges besides; a closed form has no use for it."""
+        """What is known of the edges besides, as far as views do not contradict it."""
+        return tuple(it for it in self.stated_priors if it.name not in self.contradicted)
+
+    @property
+    def stated_priors(self) -> tuple[FramePrior, ...]:
+        """What is stated of the edges besides; a closed form has no use for it."""
         tables = self.session.declaration.prior if self.solver == "joint" else {}
         return tuple(
             prior_of(it, tables[it]) for it in self.edge_names(self.boards) if it in tables

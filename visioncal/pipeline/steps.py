@@ -13,7 +13,7 @@ from visioncal.errors import DataError
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.joint import Arm
 from visioncal.estimation.observability import directions, refuse_too_few
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.problem import ROBOT, Problem, State
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, middles_of, without_lost_boards
 from visioncal.pipeline.thermal import with_drift
@@ -33,15 +33,15 @@ from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked, doubts, findings
 from visioncal.stages.loads import check_stops
-from visioncal.stages.measured import components
 from visioncal.stages.observed import all_held_back, nothing_seen
 from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.priors import most_contradicted, prior_words
 from visioncal.stages.readings import mounted, read_instrument
 from visioncal.stages.refine import arm_errors, held, look, refine
 from visioncal.stages.robots import check_joints, read_robots
 from visioncal.transforms import invert, rotation_angle
-from visioncal.types import Rejection
+from visioncal.types import FloatArray, Rejection
 
 # Views move in and out of the fit at most so often; they settle after one or two, as does the
 # linearisation of the arm's errors, to a step far below any arm's repeatability. A rotation that is
@@ -284,6 +284,30 @@ def _with_views_back(stated: Known, calibrated: Known) -> Known | None:
 
 
 def _hand_eye(known: Known) -> Known:
+    """Solves for all edges, without priors that the views contradict."""
+    known = _solved(known)
+    while (worst := most_contradicted(*_answer(known))) is not None:
+        known = _solved(_without_prior(known, worst.name))
+    words = list(prior_words(*_answer(known), known.stated_priors))
+    notes = (it for it, is_doubt in words if not is_doubt)
+    known = replace(known, notes=(*known.notes, *notes))
+    return known.noting((), (it for it, is_doubt in words if is_doubt))
+
+
+def _answer(known: Known) -> tuple[Problem, State, FloatArray]:
+    return known.solved.problem, known.solved.state, known.solved.covariance
+
+
+def _without_prior(known: Known, name: str) -> Known:
+    """Leaves a prior out, and looks again which views agree."""
+    known = replace(known, contradicted=known.contradicted | {name})
+    all_of, before = known.candidates, known.agreed
+    mask = None if before is None else before.mask
+    again = agree(known.problem(all_of), all_of, known.session.mount, known.frames, mask)
+    return without_lost_boards(known.agreeing(again))
+
+
+def _solved(known: Known) -> Known:
     """Solves for all edges, with the arm linearised anew until it stays.
 
     With it go the rotations that were supplied to readings of points.
@@ -308,10 +332,7 @@ def _hand_eye(known: Known) -> Known:
             known = replace(known, calibrated=moved)
         if readings is not None:
             known = known.with_readings(readings.moved(result.state))
-    found = components(result.problem, result.state, result.covariance)
-    notes = (it.remark for it in found if not it.is_contradicted)
-    known = replace(known, notes=(*known.notes, *notes))
-    return known.noting((), (it.doubt for it in found if it.is_contradicted))
+    return known
 
 
 def _is_aimed(known: Known) -> bool:

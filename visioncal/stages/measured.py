@@ -38,7 +38,6 @@ class Component:
     sigma_m: float
     seen_m: float
     seen_sigma_m: float
-    is_used: bool = True
 
     @property
     def is_told(self) -> bool:
@@ -92,9 +91,8 @@ class Component:
         return (
             f"The measured {self.label} = {1e3 * self.stated_m:g} mm, known to "
             f"{figure(1e3 * self.sigma_m)} mm, is contradicted by the views, which alone say "
-            f"{1e3 * self.seen_m:.4g} mm to {figure(1e3 * self.seen_sigma_m)} mm; "
-            f"{'both count in the answer' if self.is_used else 'it is not used'}. Measure it "
-            "again, or leave it out."
+            f"{1e3 * self.seen_m:.4g} mm to {figure(1e3 * self.seen_sigma_m)} mm; it is not used. "
+            "Measure it again, or leave it out."
         )
 
 
@@ -102,7 +100,7 @@ def components(
     problem: Problem,
     state: State,
     spread: FloatArray,
-    priors: Sequence[FramePrior] | None = None,
+    priors: Sequence[FramePrior],
 ) -> tuple[Component, ...]:
     """The measured components of priors beside what the observations alone say of them.
 
@@ -110,16 +108,16 @@ def components(
         problem: The observations in the fit.
         state: The answer.
         spread: (p, p) covariance of the unknowns.
-        priors: Priors, in the problem or left out of it; None for those in it.
+        priors: Priors, in the problem or left out of it.
     """
-    chosen = problem.priors if priors is None else priors
-    return tuple(it for prior in chosen for it in _components(prior, problem, state, spread))
+    return tuple(it for prior in priors for it in _components(prior, problem, state, spread))
 
 
 def _components(
     prior: FramePrior, problem: Problem, state: State, spread: FloatArray
 ) -> Iterator[Component]:
     away, slopes = problem.prior_rows(prior, state)
+    used = {it.name for it in problem.priors}
     sigmas = np.sqrt(np.einsum("dp,pq,dq->d", slopes, spread, slopes)) * prior.sigma_m
     # Behind those of the rotation, which no word is said of.
     places = slice(len(away) - len(prior.axes), len(away))
@@ -131,7 +129,7 @@ def _components(
         strict=True,
     ):
         label = f"{_COMPONENTS[axis]} of {prior.name}"
-        if prior in problem.priors:
+        if prior.name in used:
             yield Component.beside(label, stated, prior.sigma_m, off, sigma)
         else:
-            yield Component(label, stated, prior.sigma_m, stated + off, sigma, False)
+            yield Component(label, stated, prior.sigma_m, stated + off, sigma)

@@ -1,14 +1,14 @@
 """What a session knows of a cell's frames beforehand: `[prior.A_from_B]`, and what became of it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from visioncal.errors import DataError
-from visioncal.estimation.problem import FramePrior, Problem
-from visioncal.estimation.solve import Solution, covariance_of
+from visioncal.estimation.problem import FramePrior, Problem, State
 from visioncal.estimation.tree import Tree
 from visioncal.files import did_you_mean
 from visioncal.session.tables import PriorTable
 from visioncal.stages.measured import components, prior_of
+from visioncal.types import FloatArray
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
@@ -48,20 +48,38 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     return found
 
 
-def most_contradicted(problem: Problem, solution: Solution) -> FramePrior | None:
+def most_contradicted(problem: Problem, state: State, spread: FloatArray) -> FramePrior | None:
     """The prior that the observations contradict most; None where they contradict none.
 
     Args:
         problem: The observations in the fit.
-        solution: The fit.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
     """
-    if not problem.priors:
-        return None
-    spread = covariance_of(problem, solution)
     found = [
         (it.contradiction, at)
         for at, prior in enumerate(problem.priors)
-        for it in components(problem, solution.state, spread, [prior])
+        for it in components(problem, state, spread, [prior])
         if it.is_contradicted
     ]
     return problem.priors[max(found)[1]] if found else None
+
+
+def prior_words(
+    problem: Problem, state: State, spread: FloatArray, stated: Iterable[FramePrior]
+) -> Iterator[tuple[str, bool]]:
+    """Says what became of priors, and whether that is a reason for doubt.
+
+    Args:
+        problem: The observations in the fit, with the priors that these do not contradict.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
+        stated: All priors.
+    """
+    used = {it.name for it in problem.priors}
+    for prior in stated:
+        found = components(problem, state, spread, [prior])
+        if prior.name in used:
+            yield from ((it.remark, False) for it in found)
+        elif found:
+            yield max(found, key=lambda it: it.contradiction).doubt, True
