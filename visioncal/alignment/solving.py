@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.alignment.arms import arms_of, with_errors
-from visioncal.alignment.lenses import CellSide, settled_looks, with_looks
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
+from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import covariance_of, fit_problem
@@ -22,6 +22,8 @@ from visioncal.stages.observed import Observed
 from visioncal.stages.pairwise import Candidates
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.priors import most_contradicted
+from visioncal.stages.refine import refined
+from visioncal.stages.side import FramesSide
 from visioncal.stages.sighted import Sighted
 from visioncal.stages.tie import pick, tie
 from visioncal.stages.validate import chain_rms_px
@@ -63,7 +65,7 @@ class Solved:
         """Says what was found of lenses and boards; see `stages.found`."""
         if self.seen is not None:
             part = self.agreed.problem.subset(self.agreed.used)
-            side = CellSide(self.cell, self.agreed, self.arms, self.late)
+            side = _side(self.cell, self.agreed, self.arms, self.late)
             yield from found_of_looks(side, Fitted(self.seen, part, self.agreed.fit))
 
     @property
@@ -126,7 +128,10 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     check_arms(arms, asked)
     seen, late = None, clock_effects(cell, looked.clocks)
     if looked.scenes:
-        agreed, seen, arms = with_looks(cell, looked, views, agreed, arms, late)
+        side = _side(cell, agreed, arms, late)
+        looks = side.looks(looked.scenes, _views_by_camera(looked, views))
+        fitted, side = refined(side, looks, _frames(agreed))
+        agreed, seen, arms = _settled(agreed, side, fitted), fitted.seen, side.arms
     else:
         arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
         others = (*late, *effects_of(arms))
@@ -168,12 +173,39 @@ def _at_rest(
         if seen is None:
             agreed = _with_effects(agreed, (*late, *effects_of(arms)))
         else:
-            agreed, seen = settled_looks(cell, seen, agreed, arms, late)
+            side = _side(cell, agreed, arms, late)
+            fitted = settle_looks(seen.looks, side, seen.moving, _frames(agreed))
+            agreed, seen = _settled(agreed, side, fitted), fitted.seen
         moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
         arms = {name: arm for name, (arm, _) in moved.items()}
         if max(step for _, step in moved.values()) < _AT_REST_RAD:
             break
     return agreed, seen, arms
+
+
+def _side(
+    cell: Cell, agreed: Agreed, arms: Mapping[str, RobotArm], late: Sequence[Effect]
+) -> FramesSide:
+    views = [it.view for it in cell.rows]
+    return FramesSide(agreed.problem, agreed.used, views, arms, late, agreed.fit.noise)
+
+
+def _frames(agreed: Agreed) -> dict[str, FloatArray]:
+    """Where the unknown frames are."""
+    return dict(zip(agreed.problem.unknown, agreed.fit.state.edges, strict=True))
+
+
+def _settled(agreed: Agreed, side: FramesSide, fitted: Fitted) -> Agreed:
+    return replace(agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
+
+
+def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:
+    """The views of each camera's images that some fit may use, each with its one pose."""
+    known = {**looked.poses, **{it.view: it for it in views}}
+    return {
+        frame: [known[it] for it in look.corners if it in known and it not in looked.held_back]
+        for frame, look in looked.cameras.items()
+    }
 
 
 def _with_repeats(agreed: Agreed) -> Agreed:

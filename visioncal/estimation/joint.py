@@ -6,19 +6,18 @@ the answer, until it stays, is Gauss-Newton's method on the whole problem.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.errors import ConvergenceError
-from visioncal.estimation.arm import ArmErrors, find_arm_errors
-from visioncal.estimation.chain import chain
+from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import ROBOT, FramePrior, Noise, Problem, State
+from visioncal.estimation.problem import Noise, Problem, State
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,
@@ -27,7 +26,7 @@ from visioncal.estimation.solve import (
     normal_equations,
     score_gain,
 )
-from visioncal.types import FloatArray, IntArray, Mask, Mount
+from visioncal.types import FloatArray, IntArray, Mask
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -71,80 +70,6 @@ class Side(Protocol):
 
     def freed(self, *, freely: bool) -> Self:
         """The side with all errors of arms that were found free, or only those estimated."""
-
-
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """The frames' side of one robot and one camera.
-
-    Attributes:
-        mount: Where the camera is.
-        poses: (s, 4, 4) `base_from_flange` at each stop.
-        stops: (m,) the stop of each view, numbered from 0.
-        targets: (m,) the frame of the target that each view shows.
-        basis: (s, 6, p) how its errors move the flange at each stop.
-        of_links: Whether these are errors of its own links.
-        found: Its errors, where they are likely.
-        freely: Whether they are free even where they are not estimated.
-        priors: What was measured of frames by hand.
-    """
-
-    mount: Mount
-    poses: FloatArray
-    stops: IntArray
-    targets: tuple[str, ...]
-    basis: FloatArray
-    of_links: bool
-    found: ArmErrors | None = None
-    freely: bool = False
-    priors: tuple[FramePrior, ...] = ()
-
-    @property
-    def noise(self) -> None:
-        """Levels are sought from above."""
-
-    @property
-    def errors(self) -> tuple[ArmErrors, ...]:
-        """Its errors, where they were found."""
-        return () if self.found is None else (self.found,)
-
-    @property
-    def has_errors(self) -> bool:
-        """Whether its errors are free."""
-        return self.found is not None and (self.freely or self.found.is_estimated)
-
-    @property
-    def has_links(self) -> bool:
-        """Whether those of its own links are."""
-        return self.has_errors and self.of_links
-
-    def problem(self, seen: Seen) -> Problem:
-        """The chain of frames at its stops; see `Side`."""
-        effects = [seen.effect(np.arange(len(self.stops)))]
-        if self.found is not None and self.has_errors:
-            effects.append(self.found.effect(ROBOT))
-        return chain(
-            self.mount,
-            self.poses,
-            seen.looks.poses,
-            seen.spread,
-            stops=self.stops,
-            targets=self.targets,
-            effects=effects,
-            priors=self.priors,
-        )
-
-    def with_errors(self, fitted: "Fitted") -> Self:
-        """Looks for its errors; see `Side`."""
-        fit = fitted.fit
-        found = find_arm_errors(
-            fitted.problem, fit.state, fit.noise, ROBOT, self.basis, of_links=self.of_links
-        )
-        return replace(self, found=found, freely=False)
-
-    def freed(self, *, freely: bool) -> Self:
-        """Frees its errors; see `Side`."""
-        return replace(self, freely=freely)
 
 
 @dataclass(frozen=True, eq=False)

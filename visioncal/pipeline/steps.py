@@ -11,9 +11,9 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.estimation.chain import robot_part
-from visioncal.estimation.joint import Arm
 from visioncal.estimation.observability import directions, refuse_too_few
 from visioncal.estimation.problem import ROBOT, Problem, State
+from visioncal.estimation.solve import fit_problem
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, middles_of, without_lost_boards
 from visioncal.pipeline.thermal import with_drift
@@ -38,8 +38,9 @@ from visioncal.stages.place import lay_out
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.priors import most_contradicted, prior_words
 from visioncal.stages.readings import mounted, read_instrument
-from visioncal.stages.refine import arm_errors, held, look, refine
+from visioncal.stages.refine import held, look, refine
 from visioncal.stages.robots import check_joints, read_robots
+from visioncal.stages.side import FramesSide
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Rejection
 
@@ -167,7 +168,7 @@ def _look(known: Known) -> Known:
         return known
     if any(view.corners is None for view in views):
         return replace(known, free=held(scene))
-    return known.seeing(look(scene, views, known.stops, closed_form=known.solver != "joint"))
+    return known.seeing(look(scene, views, _side(known), closed_form=known.solver != "joint"))
 
 
 def _agree(known: Known) -> Known:
@@ -201,12 +202,13 @@ def _refine(known: Known) -> Known:
         return known
     if scene is None or free is None or any(it is None for it in known.seen(known.used)):
         problem = known.problem(known.used).merged()
-        errors = arm_errors(_arm(known), problem, known.frames)
+        fit = fit_problem(problem, problem.start(known.frames))
+        errors = known.arm_at_stops.with_errors(problem, fit).errors
         return replace(known, calibrated=known.robot_arm.erring(errors))
     notes = known.notes
     for _ in range(_ROUNDS):
         views = [known.poses[view] for view in known.used]
-        result = refine(scene, views, _arm(known), known.frames)
+        result = refine(scene, views, _side(known), known.frames)
         known = replace(known.seeing(result), notes=(*notes, *result.notes))
         before, all_of = agreed.mask, known.candidates
         problem = known.problem(all_of)
@@ -218,17 +220,10 @@ def _refine(known: Known) -> Known:
     return known.noting((), result.warnings)
 
 
-def _arm(known: Known) -> Arm:
-    arm = known.arm_at_stops
-    return Arm(
-        known.session.mount,
-        known.flange_poses(known.first_of_stops(known.used)),
-        known.stops,
-        known.targets(known.used),
-        arm.basis,
-        arm.is_modelled,
-        priors=known.priors,
-    )
+def _side(known: Known) -> FramesSide:
+    problem = known.problem(known.used).with_effects(())
+    arm = known.arm_at_stops.erring(None)
+    return FramesSide(problem, np.ones(len(problem), dtype=bool), known.used, {ROBOT: arm})
 
 
 def _thermal(known: Known) -> Known:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from visioncal.estimation.appearance import (
     boards_basis,
     compress,
 )
-from visioncal.estimation.arm import ArmErrors, find_arm_errors
+from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import (
-    Arm,
     Fitted,
     MeasuredScale,
     Scores,
@@ -31,16 +29,15 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem import ROBOT, Problem, State
-from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem, Scene, repeat_shares
-from visioncal.estimation.solve import covariance_of, fit_problem, left_out_residuals
+from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.scene import ONLY_CAMERA, Scene
+from visioncal.estimation.solve import covariance_of, left_out_residuals
 from visioncal.stages.found import found_of_looks
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.side import FramesSide
 from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, IntArray
-
-AnySide = TypeVar("AnySide", bound=Side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,49 +62,53 @@ class Refined:
 
 
 def look(
-    scene: Scene, views: Sequence[ViewPoses], stops: IntArray, *, closed_form: bool = False
+    scene: Scene, views: Sequence[ViewPoses], side: FramesSide, *, closed_form: bool = False
 ) -> Refined:
     """Lens and board as they are given or were estimated, with what is open about them.
 
     Args:
         scene: What is looked at, and with what.
         views: The views, each with its one pose and its corners.
-        stops: (m,) the stop of each.
+        side: The frames' side.
         closed_form: Whether nothing will move, because the edges will come from a closed form.
 
     Returns:
         The views with how they move when lens and board do.
     """
     with one_blas_thread():
-        looks = _looks(scene, views, stops)
+        looks = side.looks({ONLY_CAMERA: scene}, {ONLY_CAMERA: views})
         seen = looks.seen(looks.first[:0] if closed_form else looks.first)
     return _told(seen, views, None)
 
 
 def refine(
-    scene: Scene, views: Sequence[ViewPoses], arm: Arm, frames: Mapping[str, FloatArray]
+    scene: Scene,
+    views: Sequence[ViewPoses],
+    side: FramesSide,
+    frames: Mapping[str, FloatArray],
 ) -> Refined:
     """Fits lens, board and edges to all corners together; see `refined`.
 
     Args:
         scene: What is looked at, and with what.
         views: The views in the fit, each with its one pose and its corners.
-        arm: The robot's side.
+        side: The frames' side.
         frames: Where the unknown frames are thought to be.
     """
     with one_blas_thread():
-        answer, arm = refined(arm, _looks(scene, views, arm.stops), frames)
-        found = [*found_of_looks(arm, answer)]
+        looks = side.looks({ONLY_CAMERA: scene}, {ONLY_CAMERA: views})
+        answer, side = refined(side, looks, frames)
+        found = [*found_of_looks(side, answer)]
     return replace(
-        _told(answer.seen, views, arm.found),
+        _told(answer.seen, views, side.arms[ROBOT].errors),
         warnings=tuple(words for words, is_doubt in found if is_doubt),
         notes=tuple(words for words, is_doubt in found if not is_doubt),
     )
 
 
 def refined(
-    side: AnySide, looks: Looks, frames: Mapping[str, FloatArray]
-) -> tuple[Fitted, AnySide]:
+    side: FramesSide, looks: Looks, frames: Mapping[str, FloatArray]
+) -> tuple[Fitted, FramesSide]:
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
     Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
@@ -167,32 +168,6 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
     restated = stated.looks.without_prior(unstated.tolist())
     restated = restated.with_values(places, wide.looks.values[places])
     return settle(restated, erring, np.unique(places), answer.frames)
-
-
-def _looks(scene: Scene, views: Sequence[ViewPoses], stops: IntArray) -> Looks:
-    """The corners of one camera, and lens and board as they are stated.
-
-    Corners of one stop and one board count as one view.
-    """
-    shown = {it.view: (stop, it.board) for it, stop in zip(views, stops.tolist(), strict=True)}
-    problem = CornerProblem.of(scene, _corners(views), repeat_shares(shown))
-    poses = np.array([view.cam_from_target[0] for view in views])
-    return Looks.of({ONLY_CAMERA: problem}, {ONLY_CAMERA: poses})
-
-
-def arm_errors(arm: Arm, problem: Problem, frames: Mapping[str, FloatArray]) -> ArmErrors | None:
-    """Finds errors that follow the arm's posture.
-
-    Args:
-        arm: The robot's side.
-        problem: What was observed at its stops.
-        frames: Where the unknown frames are under white noise, or a start.
-
-    Returns:
-        The errors; None where white noise explains the residuals as well.
-    """
-    fit = fit_problem(problem, problem.start(frames))
-    return find_arm_errors(problem, fit.state, fit.noise, ROBOT, arm.basis, of_links=arm.of_links)
 
 
 def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
