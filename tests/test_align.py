@@ -9,7 +9,7 @@ from cells import calibrated, session_of
 from commands import visioncal
 
 from visioncal.alignment import align, calibrate
-from visioncal.calibration import Alignment, Calibration
+from visioncal.calibration import Alignment, Calibration, to_document
 from visioncal.errors import DataError, DegenerateError
 from visioncal.exports import Selection, document
 from visioncal.robot import Robot, load_robot
@@ -461,6 +461,19 @@ def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
     for name, edge in without.edges.items():
         np.testing.assert_array_equal(kept.edges[name].matrix, edge.matrix)
         np.testing.assert_array_equal(kept.edges[name].covariance, edge.covariance)
+    # Their residuals are told all the same: three pixels in each coordinate.
+    px = [it.rms_px for it in kept.sights if not it.used]
+    assert np.sqrt(np.mean(np.square(px))) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.1)
+    sound = align(replace(session, views=tuple(views)), corners=corners)
+    found = Calibration.whole(sound)
+    written = to_document(found)["validation"]
+    # Left out once or in turn is the same to chance, of so many views; in its pair, of some.
+    assert written["holdout"]["px"] == pytest.approx(written["held_out"]["px"], rel=0.3)
+    assert written["holdout"]["mm"] == pytest.approx(written["held_out"]["mm"], rel=0.5)
+    assert found.of("left", "b").validation.holdout is not None
+    assert sound.verdict.status == "good"
+    assert kept.verdict.status == "check"
+    assert any("that the session holds back are missed by" in it for it in kept.verdict.reasons)
 
 
 def with_elbow_of_b(session, change):

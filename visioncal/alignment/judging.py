@@ -7,8 +7,8 @@ import numpy as np
 from visioncal.alignment.faults import PoseFault, by_way_of
 from visioncal.alignment.solving import Solved
 from visioncal.alignment.ties import robot_motion
-from visioncal.calibration import Edge, Sight
-from visioncal.calibration.whole import left_out_rms, rms_of, view_results
+from visioncal.calibration import HELD_BACK, Edge, Sight
+from visioncal.calibration.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
 from visioncal.estimation.observability import (
@@ -83,6 +83,7 @@ def _pairs(sights: Sequence[Sight], explained: Collection[int]) -> list[Pair]:
             view_results(mine),
             rms_of(mine),
             left_out_rms(mine),
+            holdout_rms(mine),
             disagreeing=[
                 Rejection(it.view, it.reason)
                 for it in mine
@@ -96,7 +97,7 @@ def _pairs(sights: Sequence[Sight], explained: Collection[int]) -> list[Pair]:
 
 def _disagrees(sight: Sight) -> bool:
     """Whether an observation was left out although its chain could be closed."""
-    return not sight.used and sight.residual_mm is not None
+    return not sight.used and sight.residual_mm is not None and sight.reason != HELD_BACK
 
 
 def _sensors(

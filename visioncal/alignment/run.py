@@ -24,6 +24,7 @@ from visioncal.alignment.faults import (
     residuals,
     versions,
 )
+from visioncal.alignment.held import held_sights
 from visioncal.alignment.judging import (
     check_cell,
     findings_of,
@@ -140,7 +141,7 @@ def alignment_of(
     untied = tuple(Untied(it, untied_words(cell, it)) for it in solved.untied)
     moved, noise, faults = movements(solved), _noise(solved), pose_faults(solved)
     held_out = left_out(solved)
-    sights = _sights(cell, solved, held_out, faults)
+    sights = _sights(looked, cell, solved, held_out, faults)
     budget = {named[key].name: mm for key, mm in budget_mm(solved, parts).items()}
     of_rest = [
         *prior_words(part, agreed.fit.state, spread, solved.cell.priors),
@@ -364,7 +365,7 @@ def _cameras(
 
 
 def _sights(
-    cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
+    looked: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
 ) -> tuple[Sight, ...]:
     """What became of each observation, in the order of the session's rows."""
     rows, used = solved.cell.rows, solved.agreed.used
@@ -391,6 +392,7 @@ def _sights(
             px,
             *_known(unseen[at]),
         )
+    found |= held_sights(solved, looked)
     lost = solved.cell.reasons
     for it in cell.session.observations:
         number = it.view.number

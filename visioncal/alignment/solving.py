@@ -304,7 +304,7 @@ def _started(
     cell: Cell, views: Sequence[ViewPoses]
 ) -> tuple[Cell, list[ViewPoses], Problem, State, tuple[str, ...]]:
     """Finds a start, and gives each view its one pose by it."""
-    targets = _targets(cell)
+    targets = targets_of(cell)
     tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets), cell.priors)
     if tied.untied:
         untied_robots(cell, tied.untied, seen=True)
@@ -315,16 +315,16 @@ def _started(
         raise ambiguous_error(cell, tied.ambiguous)
     edges = np.array([tied.edges[it] for it in cell.tree.unknown]).reshape(-1, 4, 4)
     state = State(edges, np.zeros(0))
-    rough = _problem(cell, [chosen(it, 0, None) for it in views])
+    rough = problem_of(cell, [chosen(it, 0, None) for it in views])
     picks = pick(rough.predicted(state), _sighted(cell, views, targets))
     views = [
         chosen(view, at, targets.get(row.seen))
         for view, at, row in zip(views, picks.tolist(), cell.rows, strict=True)
     ]
-    return cell, views, _problem(cell, views), state, tied.untied
+    return cell, views, problem_of(cell, views), state, tied.untied
 
 
-def _targets(cell: Cell) -> dict[str, Target]:
+def targets_of(cell: Cell) -> dict[str, Target]:
     """The printed targets by their frames."""
     return {f"target_{name}" if name else "target": it for name, it in cell.session.plates.items()}
 
@@ -349,7 +349,7 @@ def _places(cell: Cell) -> Mask:
     return np.array([it.is_place for it in cell.rows], dtype=bool)
 
 
-def _problem(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
+def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
     """The problem of views with one pose each, lenses and boards as they are taken to be."""
     given = np.array([not it.covariance.any() for it in views])
     levels = {it: at for at, it in enumerate(sensors_of(cell, views))}

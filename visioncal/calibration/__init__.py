@@ -5,6 +5,7 @@ from visioncal.calibration.document import to_document
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame, FrameFile, Observation
 from visioncal.calibration.parts import (
+    HELD_BACK,
     CameraResult,
     Rms,
     RobotResult,
@@ -18,6 +19,7 @@ from visioncal.calibration.picking import picked
 from visioncal.calibration.result import Calibration
 
 __all__ = [
+    "HELD_BACK",
     "Alignment",
     "Calibration",
     "CameraResult",

@@ -105,7 +105,7 @@ WHOLE: Form = MappingProxyType(
         "frames?": {"": FRAME},
         "details": {},
         "boards?": {"": _BOARD},
-        "validation?": {"method": str, "held_out": _RMS, "pairs": [_RMS]},
+        "validation?": {"method": str, "held_out": _RMS, "holdout?": _RMS, "pairs": [_RMS]},
         "uncertainty?": {"budget_mm": {"": {"": float}}, "noise_95?": {"": {"": [float]}}},
         "joint_fit?": {"cameras": {"": [int]}, "targets": {"": [int]}, "covariance": [[float]]},
     }

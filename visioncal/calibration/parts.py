@@ -10,6 +10,8 @@ from visioncal.robot import Robot
 from visioncal.types import Camera, FloatArray
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
+# Why a view is in no fit although nothing is wrong with it.
+HELD_BACK = "held out of the fit by the session (role = holdout)"
 
 
 @dataclass(frozen=True, eq=False)

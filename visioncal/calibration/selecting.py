@@ -11,7 +11,7 @@ from visioncal.calibration.alignment import Alignment, Sight
 from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame
 from visioncal.calibration.parts import CameraResult, Rms, RobotResult, Validation, Verdict
-from visioncal.calibration.whole import left_out_rms, rms_of, view_results
+from visioncal.calibration.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
 from visioncal.transforms import adjoint, invert
@@ -90,8 +90,8 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
 def _validation(cell: Alignment, sights: Sequence[Sight]) -> Validation:
     """Residuals of some observations by fits that were made without them."""
     if not cell.left_out:
-        return Validation(NOT_LEFT_OUT, rms_of(sights))
-    return Validation(cell.left_out, left_out_rms(sights))
+        return Validation(NOT_LEFT_OUT, rms_of(sights), holdout_rms(sights))
+    return Validation(cell.left_out, left_out_rms(sights), holdout_rms(sights))
 
 
 def placed_name(cell: Alignment, choice: Choice, needs: Collection[Part], name: str) -> str:

@@ -21,7 +21,14 @@ from visioncal.calibration.edge import edge_document, read_covariance, read_edge
 from visioncal.calibration.forms import SCHEMA, WHOLE, check
 from visioncal.calibration.frame import frames_document, present, read_frames
 from visioncal.calibration.lens import camera_document, read_camera
-from visioncal.calibration.parts import Rms, RobotResult, Verdict, VerdictStatus, ViewResult
+from visioncal.calibration.parts import (
+    HELD_BACK,
+    Rms,
+    RobotResult,
+    Verdict,
+    VerdictStatus,
+    ViewResult,
+)
 from visioncal.robot import Robot
 from visioncal.session import frame_name
 from visioncal.session.frames import frames_of_kind, robots_between, thing_name
@@ -123,9 +130,11 @@ def _validation_document(cell: Alignment) -> dict[str, Any]:
     for it in cell.sights:
         if it.left_out_mm is not None:
             pairs.setdefault((it.seer, it.seen), []).append(it)
+    holdout = holdout_rms(cell.sights)
     return {
         "method": cell.left_out,
         "held_out": present(vars(left_out_rms(cell.sights))),
+        **({} if holdout is None else {"holdout": present(vars(holdout))}),
         "pairs": [
             {
                 **_seer_and_seen(mine[0]),
@@ -151,6 +160,16 @@ def left_out_rms(sights: Iterable[Sight]) -> Rms:
         for it in sights
     )
     return rms_of(unseen)
+
+
+def holdout_rms(sights: Iterable[Sight]) -> Rms | None:
+    """Root mean square residuals of what the session holds back; None where that is nothing."""
+    held = [
+        replace(it, used=True)
+        for it in sights
+        if it.reason == HELD_BACK and it.residual_mm is not None
+    ]
+    return rms_of(held) if held else None
 
 
 def rms_of(sights: Iterable[Sight]) -> Rms:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration import Calibration, Frame, Observation, picked
+from visioncal.calibration import HELD_BACK, Calibration, Frame, Observation, picked
 from visioncal.errors import DataError
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
@@ -28,7 +28,7 @@ from visioncal.frames.sighting import (
 from visioncal.frames.verdicts import Doubt, verdict_of, weak_directions
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
-from visioncal.stages.observed import HELD_BACK, by_reason
+from visioncal.stages.observed import by_reason
 from visioncal.types import FloatArray, Progress
 
 # The detail of a frame by which its camera's calibration is known.

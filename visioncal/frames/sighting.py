@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import HELD_BACK, Calibration
 from visioncal.errors import DataError
 from visioncal.frames.chain import Eye
 from visioncal.frames.sight import Parent, Sight, needs_robot
@@ -14,7 +14,7 @@ from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
 from visioncal.session.single import check_one_of_each
 from visioncal.stages.detect import detect, image_of
-from visioncal.stages.observed import HELD_BACK, by_reason
+from visioncal.stages.observed import by_reason
 from visioncal.stages.reported import Reported, reported_poses
 from visioncal.types import FloatArray, Progress, Rejection, Target
 

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration import Rms, ViewResult
+from visioncal.calibration import HELD_BACK, Rms, ViewResult
 from visioncal.estimation.chain import scatter
 from visioncal.estimation.problem import Problem, State
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import own_numbers
 from visioncal.session import View
-from visioncal.stages.observed import HELD_BACK
 from visioncal.stages.validate import chain_rms_px, predict_corners
 from visioncal.types import Corners, FloatArray
 

@@ -7,12 +7,13 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from visioncal.calibration import HELD_BACK
 from visioncal.errors import DataError
 from visioncal.estimation.problem import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen
-from visioncal.stages.observed import HELD_BACK, Observed
+from visioncal.stages.observed import Observed
 from visioncal.stages.priors import priors_of
 from visioncal.stages.reported import Reported
 from visioncal.types import FloatArray
@@ -44,6 +45,7 @@ class Cell:
         reasons: Why others cannot, by view.
         stops: What the session calls each station: its stop's number, or its first view's.
         priors: Where frames were measured to be, beside the observations.
+        held: The observations that could be used, and that the session keeps from every fit.
     """
 
     session: Session
@@ -54,6 +56,7 @@ class Cell:
     reasons: Mapping[int, str] = field(default_factory=dict)
     stops: tuple[int, ...] = ()
     priors: tuple[FramePrior, ...] = ()
+    held: tuple[Row, ...] = ()
 
     def without(self, reasons: Mapping[int, str]) -> "Cell":
         """Returns the cell without some views."""
@@ -117,8 +120,10 @@ def read_cell(seen: Observed) -> Cell:
             not is_seen(it.view) and it.view.instrument_from_probe() is None,
         )
         for it in observations
-        if it.view.number not in seen.held_back and _is_known(it, seen.robots)
+        if _is_known(it, seen.robots)
     ]
+    held = tuple(it for it in rows if it.view in seen.held_back)
+    rows = [it for it in rows if it.view not in seen.held_back]
     reasons = {**seen.reasons, **dict.fromkeys(seen.held_back, HELD_BACK), **seen.spared}
     stations: dict[int, int] = {}
     for it in observations:
@@ -127,7 +132,7 @@ def read_cell(seen: Observed) -> Cell:
     tree = Tree(_CELL, branches)
     priors = priors_of(session.declaration.prior, tree)
     poses = _poses(seen, observations)
-    cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors)
+    cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
     cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
     return cell.held_to(_reference(cell))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
-from visioncal.calibration import CameraResult
+from visioncal.calibration import HELD_BACK, CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.scene import Scene
 from visioncal.files import some_of
@@ -19,8 +19,6 @@ from visioncal.types import Corners, Progress, Rejection
 
 # So many views of one reason are named.
 _LISTED = 40
-# Why a view is in no fit although nothing is wrong with it.
-HELD_BACK = "held out of the fit by the session (role = holdout)"
 
 
 @dataclass(frozen=True, eq=False)
