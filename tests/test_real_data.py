@@ -59,9 +59,9 @@ def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     assert result.verdict.status != "good"
     assert any("8 views" in it for it in result.verdict.reasons)
     assert any("disagree with the others by" in it for it in result.verdict.reasons)
-    # The stated side of 23.6 mm does not fit the robot's motion, by about 14 %.
+    # The stated side of 23.6 mm does not fit the robot's motion, by 14.5 %.
     (size,) = [it for it in result.verdict.reasons if "By the robot's motion" in it]
-    assert "14 % larger than stated" in size
+    assert "squares of 27.0" in size
     assert result.camera.estimated
     assert any("The given intrinsics do not fit" in it for it in result.verdict.reasons)
     away = result.transforms["flange_from_cam"].translation - [0.0582, -0.0342, -0.0426]

@@ -12,6 +12,7 @@ import numpy as np
 
 from visioncal.camera import project_with_jacobian
 from visioncal.chance import chi2_limit
+from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
 
 # Stated noise is contradicted by residuals that chance gives in one session of ten thousand, where
@@ -90,6 +91,19 @@ class CornerStack:
     def with_points(self, points: FloatArray) -> "CornerStack":
         """Returns the stack with its corners elsewhere on the target, (n, 3) [m]."""
         return replace(self, points=points)
+
+    def weighed(self, residuals: FloatArray) -> "CornerStack":
+        """Returns the stack with views weighing as their residuals ask for, if noise is not stated.
+
+        Args:
+            residuals: (n, 2) by the weights that the corners have [px].
+        """
+        squares = self.sum_by_view(np.sum(residuals**2, axis=1))
+        by_view = weights_by_view(squares, np.asarray(2 * self.counts - 6, float))
+        if by_view is None or self.stated_px is not None:
+            return self
+        before = 1.0 if self.weights is None else self.weights
+        return replace(self, weights=before * by_view[self.view_of])
 
     @property
     def counts(self) -> IntArray:

@@ -87,13 +87,17 @@ class CornerProblem:
     ) -> "CornerProblem":
         """Puts the problem together from the corners by view, and the shares of those that repeat.
 
-        Where a view has no share, it counts as one.
+        Where a view has no share, it counts as one. Weights that nobody has stated are left to
+        `Looks.weighed`: what lens and board do to a view had passed for its noise.
         """
         positions = numbered_positions(scene.targets)
+        stack = CornerStack.of(corners, positions)
+        if stack.stated_px is None:
+            stack = replace(stack, weights=None)
         priors = [board_prior(it) for it in scene.targets]
         return cls(
             scene,
-            CornerStack.of(corners, positions),
+            stack,
             positions,
             boards_basis(scene.targets),
             np.concatenate([lens_prior(scene), *priors]),

@@ -104,6 +104,9 @@ def estimate_poses(
             reasons |= passed.reasons
             stack, starts = _started(stack.keep(passed.mask), camera, reasons)
             fit = fit_poses(stack, camera, starts[0])
+        weighed = stack.weighed(fit.residuals)
+        if weighed is not stack:
+            stack, fit = weighed, fit_poses(weighed, camera, fit.cam_from_target)
         sigma_px = stack.sigma_px(fit.residuals, 6 * len(stack.views) + lens_unknowns)
         views = _with_rivals(stack, camera, fit, starts[1], sigma_px, targets)
     return Poses(views, tuple(Rejection(*item) for item in reasons.items()), sigma_px)

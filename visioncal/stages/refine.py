@@ -77,7 +77,8 @@ def look(
     """
     with one_blas_thread():
         looks = side.looks({ONLY_CAMERA: scene}, {ONLY_CAMERA: views})
-        seen = looks.seen(looks.first[:0] if closed_form else looks.first)
+        moving = looks.first[:0] if closed_form else looks.first
+        seen = looks.weighed(looks.seen(moving)).seen(moving)
     return _told(seen, views, None)
 
 
@@ -111,10 +112,8 @@ def refined(
 ) -> tuple[Fitted, FramesSide]:
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
-    Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
-    passed for another lens or board: all is then chosen once more with them free. Errors of any
-    arm's shape tell which values are free, but are not estimated. Their size is that under the
-    stated lenses and boards: a board that changes its size with the arm hides a part of it.
+    Once these are as the corners ask for, the residuals tell the noise of each view, and all is
+    fitted once more by it.
 
     Args:
         side: The frames' side.
@@ -123,6 +122,25 @@ def refined(
 
     Returns:
         The fit, and the side with the errors of its arms.
+    """
+    answer, side = _equally_weighed(side, looks, frames)
+    looks = answer.looks.weighed(answer.seen)
+    if any(
+        it.stack is not answer.looks.problems[name].stack for name, it in looks.problems.items()
+    ):
+        answer = again(answer, side, answer.moving, looks)
+    return answer, side
+
+
+def _equally_weighed(
+    side: FramesSide, looks: Looks, frames: Mapping[str, FloatArray]
+) -> tuple[Fitted, FramesSide]:
+    """Fits all with the weights that the corners have.
+
+    Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
+    passed for another lens or board: all is then chosen once more with them free. Errors of any
+    arm's shape tell which values are free, but are not estimated. Their size is that under the
+    stated lenses and boards: a board that changes its size with the arm hides a part of it.
     """
     stated = settle(looks, side, looks.first, frames)
     answer = chosen(side, stated)
@@ -172,12 +190,23 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
 
 def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
     (compressed,), (sigma_px,) = seen.compressed, seen.sigmas_px
+    (problem,) = seen.looks.problems.values()
+    views = [_weighing(view, problem.stack) for view in views]
     return Refined(
         _free(seen),
         tuple(_remade(view, compressed, seen.free, sigma_px, at) for at, view in enumerate(views)),
         sigma_px,
         errors,
     )
+
+
+def _weighing(view: ViewPoses, stack: CornerStack) -> ViewPoses:
+    """A view whose corners weigh as they do in a fit."""
+    if view.corners is None:
+        return view
+    rows = stack.view_of == stack.views.index(view.view)
+    mine = None if stack.weights is None else stack.weights[rows]
+    return replace(view, corners=replace(view.corners, weights=mine))
 
 
 def _free(seen: Seen) -> Free:

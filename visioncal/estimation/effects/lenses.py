@@ -159,6 +159,14 @@ class Looks:
         }
         return replace(self, problems=problems)
 
+    def weighed(self, seen: "Seen") -> "Looks":
+        """The same, views weighing as the residuals of all corners ask for."""
+        problems = {
+            name: replace(it, stack=it.stack.weighed(own.residuals))
+            for (name, it), own in zip(self.problems.items(), seen.compressed, strict=True)
+        }
+        return replace(self, problems=problems)
+
     def camera(self, name: str) -> Camera:
         """A camera with its lens as it is taken to be."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
