@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from visioncal.alignment.arms import LEVELS
 from visioncal.alignment.run import align
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
@@ -32,7 +31,7 @@ def calibrate(
         solver: `joint` for the fit of both edges, or the name of a closed form.
         level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
             arm, `offsets` of its joints, its `kinematics`, `elastic` for joints that bend, too, or
-            `thermal` for its drift with temperature, too, which a whole cell does not have.
+            `thermal` for its drift with temperature, too.
         convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         progress: Told of long work.
@@ -47,7 +46,7 @@ def calibrate(
     """
     loaded = session if isinstance(session, Session) else Session.load(session)
     if is_whole_cell(loaded):
-        check_whole(solver, level)
+        check_whole(solver)
         found = align(loaded, level=level, convention=convention, progress=progress)
         return Calibration.whole(found)
     return run(
@@ -55,21 +54,15 @@ def calibrate(
     ).calibration
 
 
-def check_whole(solver: SolverName, level: str) -> None:
+def check_whole(solver: SolverName) -> None:
     """Refuses what is not asked of a whole cell.
 
     Raises:
         DataError: A whole cell is not calibrated that way.
     """
-    given = {
-        "solver": solver if solver != "joint" else "",
-        "level": level if level not in LEVELS else "",
-    }
-    wrong = [f"{name} {it}" for name, it in given.items() if it]
-    if wrong:
+    if solver != "joint":
         raise DataError(
-            f"{' and '.join(wrong)} cannot be asked of a whole cell: it has the joint solver, and "
-            f"the levels {', '.join(LEVELS)}.",
-            culprits=[f"--{name}" for name, it in given.items() if it],
+            f"solver {solver} cannot be asked of a whole cell: it has the joint solver.",
+            culprits=["--solver"],
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )

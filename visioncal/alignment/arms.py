@@ -4,22 +4,22 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.arm import misfit_covariance
 from visioncal.estimation.misfit import inflation
-from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import Solution
 from visioncal.session import View
 from visioncal.session.loads import loads_of
+from visioncal.stages import thermal
 from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.cell import Cell, robot_key
 from visioncal.stages.diagnose import Misfit, misfit_words
 from visioncal.stages.joints import Matched
-from visioncal.stages.kinematics import ASKED, doubts, findings
+from visioncal.stages.kinematics import doubts, findings
 from visioncal.stages.reported import Reported
+from visioncal.stages.thermal import Heat
 from visioncal.types import FloatArray
-
-# How far the arms of a whole cell may be calibrated.
-LEVELS = (*(it for it in ASKED if it != "thermal"), "hand-eye")
 
 
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
@@ -34,12 +34,18 @@ def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
 def _arm(cell: Cell, name: str, matched: Matched | None) -> RobotArm:
     session, key = cell.session, robot_key(name)
     rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
+    stamps = {it.station: it.view.stamp_s for it in session.observations}
     reported = cell.poses[key]
     stood = np.isfinite(reported[:, 0, 0])
     views = [rows[it] for it in np.flatnonzero(stood).tolist()]
     loads = loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views])
     joints = None if matched is None else _joints(views, matched)
-    return RobotArm(key, reported, stood, joints, loads, matched)
+    heat = None
+    if matched is not None and joints is not None:
+        at_s = [stamps[it] for it in np.flatnonzero(stood).tolist()]
+        told = np.array([it.number for it in views]), np.array(at_s, dtype=float)
+        heat = Heat(session, name, matched.robot.joint_count, *told)
+    return RobotArm(key, reported, stood, joints, loads, matched, heat)
 
 
 def _joints(views: Sequence[View], matched: Matched) -> FloatArray | None:
@@ -87,14 +93,17 @@ def doubts_of_arms(
 def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
     """Words what was found of the arms and is no reason for doubt."""
     for robot, arm in arms.items():
+        drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        for words in (*chosen, *told[robot].notes()):
+        for words in (*drifts, *chosen, *told[robot].notes()):
             yield _of_robot(robot, words)
 
 
 def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
         yield "It stays as it reports itself: its errors take joint angles and a known model."
+    elif arm.thermal is None and asked == thermal.LEVEL:
+        yield "Nothing tells how it drifts with its temperature: that stays in its noise."
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)
     if found is not None:
@@ -104,6 +113,29 @@ def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
 
 def _of_robot(robot: str, words: str) -> str:
     return f"Robot {robot}: {words[0].lower()}{words[1:]}"
+
+
+def with_drifts(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, asked: str
+) -> dict[str, RobotArm]:
+    """Looks for drift with temperature, one arm after the other, beside the errors of the others.
+
+    Raises:
+        DataError: It is asked for, and no arm has what it takes.
+        DegenerateError: Likewise, and all was observed about equally warm.
+    """
+    found, refused = dict(arms), []
+    for name, arm in arms.items():
+        bare = arm.without_errors(problem)
+        start = State(fit.state.edges, bare.start_values)
+        try:
+            found[name] = arm.with_drift(bare, start, asked)
+        except (DataError, DegenerateError) as error:
+            refused.append(error.within(f"robot {name}"))
+        problem = found[name].put_into(problem)
+    if refused and len(refused) == len(found):
+        raise refused[0]
+    return found
 
 
 def with_errors(

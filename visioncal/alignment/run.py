@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from visioncal.alignment.arms import (
-    LEVELS,
     covariance_of_arms,
     doubts_of_arms,
     notes_on_arms,
@@ -49,6 +48,7 @@ from visioncal.stages.clocks import set_clocks
 from visioncal.stages.delays import FoundDelay
 from visioncal.stages.diagnose import misfits
 from visioncal.stages.judge import judge
+from visioncal.stages.kinematics import check_level
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.priors import prior_words
@@ -87,8 +87,7 @@ def align(
         DataError: The input is wrong or shows no target.
         DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
     """
-    if level not in LEVELS:
-        raise DataError(f"level {level!r} is not one of {', '.join(LEVELS)}.")
+    check_level(level)
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
@@ -216,7 +215,7 @@ def _found_of_arms(
     }
     part = agreed.problem.subset(agreed.used)
     return {
-        name: arm.found(arm.seen(part, agreed.fit, spread, middles), convention)
+        name: arm.found(part, agreed.fit, spread, middles, convention)
         for name, arm in solved.arms.items()
     }
 
@@ -232,8 +231,8 @@ def _arms(session: Session, solved: Solved, told: Mapping[str, ArmFound]) -> dic
         first.setdefault(row.station, row.view)
     part = solved.agreed.problem.subset(solved.agreed.used)
     for name, arm in solved.arms.items():
-        stops = stops_of(part, name).tolist()
-        stages = arm.documents(told[name], [first[it] for it in stops])
+        stops = stops_of(part, name)
+        stages = arm.at(stops).documents(told[name], [first[it] for it in stops.tolist()])
         found[name] = replace(found[name], stages=stages)
     return found
 

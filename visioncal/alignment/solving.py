@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.alignment.arms import arms_of, with_errors
+from visioncal.alignment.arms import arms_of, with_drifts, with_errors
 from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
@@ -109,7 +109,7 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     Args:
         cell: The cell.
         looked: What was observed in it.
-        asked: How far the robots' arms are to be calibrated, one of `arms.LEVELS`.
+        asked: How far the robots' arms are to be calibrated; see `stages.kinematics.check_level`.
 
     Raises:
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
@@ -126,16 +126,11 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     agreed = agree(problem, state, _movable(problem))
     arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
     check_arms(arms, asked)
-    seen, late = None, clock_effects(cell, looked.clocks)
-    if looked.scenes:
-        side = _side(cell, agreed, arms, late)
-        looks = side.looks(looked.scenes, _views_by_camera(looked, views))
-        fitted, side = refined(side, looks, _frames(agreed))
-        agreed, seen, arms = _settled(agreed, side, fitted), fitted.seen, side.arms
-    else:
-        arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
-        others = (*late, *effects_of(arms))
-        agreed = _with_effects(agreed, others) if others else agreed
+    late = clock_effects(cell, looked.clocks)
+    agreed, seen, arms = _with_looks(cell, looked, views, agreed, arms, late)
+    arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
+    if any(it.drift is not None for it in arms.values()):
+        agreed, seen, arms = _with_looks(cell, looked, views, agreed, arms, late)
     agreed = _levelled(cell, views, agreed)
     if asked != "hand-eye":
         arms = _levels(agreed, arms, asked)
@@ -146,6 +141,30 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
     return Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
 
 
+def _with_looks(
+    cell: Cell,
+    looked: Observed,
+    views: Sequence[ViewPoses],
+    agreed: Agreed,
+    arms: Mapping[str, RobotArm],
+    late: Sequence[Effect],
+) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+    """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
+    arms = {name: it.erring(None) for name, it in arms.items()}
+    poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
+    agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
+    if looked.scenes:
+        side = _side(cell, agreed, arms, late)
+        looks = side.looks(looked.scenes, _views_by_camera(looked, views))
+        fitted, side = refined(side, looks, _frames(agreed))
+        return _settled(agreed, side, fitted), fitted.seen, side.arms
+    drifts = tuple(effects_of(arms))
+    agreed = _with_effects(agreed, drifts) if drifts else agreed
+    arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
+    others = (*late, *effects_of(arms))
+    return _with_effects(agreed, others) if others else agreed, None, arms
+
+
 def _levels(agreed: Agreed, arms: Mapping[str, RobotArm], asked: str) -> dict[str, RobotArm]:
     """Chooses how far each arm is calibrated, beside the errors of the others."""
     problem, chosen = agreed.problem.subset(agreed.used), dict(arms)
@@ -153,9 +172,7 @@ def _levels(agreed: Agreed, arms: Mapping[str, RobotArm], asked: str) -> dict[st
         stated = arm.without_errors(problem)
         start = State(agreed.fit.state.edges, stated.start_values)
         chosen[name] = arm.with_level(stated, start, asked, agreed.fit.noise)
-        poses = {**problem.poses, name: chosen[name].poses}
-        effects = [*stated.effects, *chosen[name].effects()]
-        problem = replace(problem, poses=poses).with_effects(effects)
+        problem = chosen[name].put_into(problem)
     return chosen
 
 

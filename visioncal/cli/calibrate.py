@@ -62,7 +62,7 @@ def calibrate_command(
     """
     loaded = Session.load(session)
     if is_whole_cell(loaded):
-        check_whole(solver, level)
+        check_whole(solver)
         found = align_into(loaded, out, level=level, convention=convention, quiet=as_json)
         document = whole_document(found)
         if as_json:

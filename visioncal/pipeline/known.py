@@ -28,8 +28,8 @@ from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.reported import Reported
+from visioncal.stages.thermal import Heat
 from visioncal.stages.validate import HeldOut
-from visioncal.thermal import Inputs, Stops, ThermalFit
 from visioncal.types import Corners, FloatArray, IntArray, SolverName
 
 
@@ -50,8 +50,6 @@ class Known(Observed):
         level: How far to go: `auto`, `hand-eye`, `offsets` or `kinematics`.
         convention: Of the joint table in which the arm is told; None for the stated one.
         calibrated: The robot's arm, as far as it was calibrated; None for not at all.
-        thermal: How the arm drifts with its temperature; None where that is not told.
-        heated_by: What heats it.
         hand_eye: Both unknown edges.
         diagnosis: What the residuals show beyond noise.
         arm_found: What the stops tell of a calibrated arm.
@@ -72,8 +70,6 @@ class Known(Observed):
     level: str = "auto"
     convention: Convention | None = None
     calibrated: RobotArm | None = None
-    thermal: ThermalFit | None = None
-    heated_by: Inputs | None = None
     hand_eye: HandEyeResult | None = None
     diagnosis: Diagnosis | None = None
     arm_found: ArmFound = field(default_factory=ArmFound)
@@ -157,6 +153,7 @@ class Known(Observed):
         if self.calibrated is not None:
             return self.calibrated
         views, joints = tuple(self.base_from_flange), self.reported.joints_rad
+        stamps = {it.number: it.stamp_s for it in self.session.views}
         return RobotArm(
             ROBOT,
             np.array([*self.base_from_flange.values()]).reshape(-1, 4, 4),
@@ -164,6 +161,15 @@ class Known(Observed):
             None if joints is None else np.array([joints[it] for it in views]),
             self.loads(views),
             self.reported.matched,
+            None
+            if self.robot is None
+            else Heat(
+                self.session,
+                next(iter(self.robots)),
+                self.robot.joint_count,
+                np.array(views, dtype=np.int64),
+                np.array([stamps[it] for it in views], dtype=float),
+            ),
         )
 
     def arm_at(self, views: Sequence[int]) -> RobotArm:
@@ -230,8 +236,6 @@ class Known(Observed):
         if self.clock is not None and self.clock.speeds:
             of_stops = np.isin(views, first)
             effects += [it.of_stops(of_stops) for it in self.clock.effects(views)]
-        if self.thermal is not None and self.heated_by is not None:
-            effects.append(self.thermal.effect(self._thermal_stops(first), self.heated_by))
         effects += self.arm_at(first).effects()
         return chain(
             self.session.mount,
@@ -274,22 +278,7 @@ class Known(Observed):
 
     def flange_poses(self, views: Sequence[int]) -> FloatArray:
         """(m, 4, 4) `base_from_flange`: as reported, or as the calibrated arm has it."""
-        return np.asarray(self.arm_at(views).poses @ self.drift(views))
-
-    def drift(self, views: Sequence[int]) -> FloatArray:
-        """(m, 4, 4) how far the flange of some views had moved by its arm's temperature."""
-        if self.thermal is None or self.heated_by is None or not views:
-            return np.broadcast_to(np.eye(4), (len(views), 4, 4))
-        stops, model = self._thermal_stops(views), self.thermal.model
-        return model.motion(stops.q, model.heating.links_c(self.heated_by, stops.stamps_s))
-
-    def _thermal_stops(self, views: Sequence[int]) -> Stops:
-        stamps = {view.number: view.stamp_s or 0.0 for view in self.session.views}
-        at_s = np.array([stamps[it] for it in views])
-        joints = self.arm_at(views).joints_rad
-        if joints is None:
-            raise RuntimeError("a drift is told by joints")
-        return Stops(ROBOT, np.arange(len(views)), joints, at_s)
+        return self.arm_at(views).poses
 
     def loads(self, views: Sequence[int]) -> Loads:
         """What the flange carried at some views, and from which side the joints came."""

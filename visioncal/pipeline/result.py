@@ -15,21 +15,18 @@ from visioncal.pipeline.fit import conditions_document, fit_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
-from visioncal.pipeline.thermal import thermal_document
 from visioncal.pipeline.unseen import unseen_views
 from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES, compare_solvers
-from visioncal.stages.kinematics import ASKED
+from visioncal.stages.kinematics import check_level
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Mask, Progress, SolverName
-
-_LEVELS = (*ASKED, "hand-eye")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +53,7 @@ def run(
     """Calibrates a session and keeps the evidence; see `calibrate`."""
     if solver not in SOLVER_NAMES:
         raise DataError(f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.")
-    if level not in _LEVELS:
-        raise DataError(f"level {level!r} is not one of {', '.join(_LEVELS)}.")
+    check_level(level)
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
@@ -189,11 +185,10 @@ def _further(known: Known) -> dict[str, Any]:
 def _arm(known: Known) -> dict[str, Any]:
     """What was found of the arm."""
     arm, found = known.robot_arm, known.arm_found
-    documents = arm.documents(found, known.first_of_stops(known.used))
+    documents = known.arm_at(known.used).documents(found, known.first_of_stops(known.used))
     if arm.kinematics is not None and found.telling is not None:
         documents["kinematics"] |= unseen_views(known, arm.kinematics)
-    thermal = thermal_document(known)
-    return documents if thermal is None else documents | {"thermal": thermal}
+    return documents
 
 
 def _instrument(known: Known, readings: Readings) -> dict[str, Any]:

@@ -16,12 +16,12 @@ from visioncal.estimation.problem import ROBOT, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, middles_of, without_lost_boards
-from visioncal.pipeline.thermal import with_drift
 from visioncal.pipeline.unseen import left_out
 from visioncal.pipeline.unused import not_used
 from visioncal.pipeline.views import holdout_rms, used_rms, view_results
 from visioncal.session import STREAMS
 from visioncal.session.single import check_one_of_each
+from visioncal.stages import thermal
 from visioncal.stages.agree import agree
 from visioncal.stages.arms import check_arms
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
@@ -228,9 +228,16 @@ def _side(known: Known) -> FramesSide:
 
 def _thermal(known: Known) -> Known:
     """Takes up the arm's drift, and refines again without it."""
-    drifting = with_drift(known)
-    if drifting.thermal is None:
-        return drifting
+    bare = replace(known, calibrated=known.robot_arm.erring(None))
+    arm = bare.arm_at_stops if known.solver == "joint" else replace(bare.arm_at_stops, matched=None)
+    problem = bare.problem(known.used).merged()
+    fit = arm.with_drift(problem, problem.start(known.frames), known.level).thermal
+    if fit is None:
+        return known
+    known = replace(known, notes=(*known.notes, *thermal.findings(fit)))
+    if not thermal.is_found(fit):
+        return known
+    drifting = replace(known, calibrated=replace(known.robot_arm, thermal=fit))
     refined = _refine(drifting)
     warnings = tuple(dict.fromkeys(refined.warnings))
     notes = tuple(dict.fromkeys((*drifting.notes, *refined.notes)))
@@ -361,9 +368,9 @@ def _validate(known: Known) -> Known:
 
 
 def _tell(known: Known) -> Known:
-    result, arm = known.solved, known.arm_at_stops
-    seen = arm.seen(result.problem, result.fit, result.covariance, middles_of(known))
-    found = arm.found(seen, known.convention)
+    result = known.solved
+    fitted = (result.problem, result.fit, result.covariance)
+    found = known.arm_at_stops.found(*fitted, middles_of(known), known.convention)
     known = replace(known, arm_found=found, notes=(*known.notes, *found.notes()))
     return known.noting((), found.doubts())
 

@@ -10,6 +10,7 @@ from visioncal.session.columns import SELECTORS, is_number
 from visioncal.session.document import KINDS
 from visioncal.session.kinds import is_seen, name_of, tells_robot
 from visioncal.session.observations import standing
+from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
 if TYPE_CHECKING:
@@ -65,10 +66,13 @@ def select(
         robot_document=models.get(chosen.robot),
         corners=None if table is None else table.of_views(tuple(rows)).without_targets(),
     )
-    mine = {None, chosen.robot or "robot"}
-    return found.with_streams(
-        {name: it for name, it in session.streams.items() if _robot_of(session, name) in mine}
-    )
+    return found.with_streams(streams_of(session, chosen.robot))
+
+
+def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
+    """The streams of one robot, and those of none, by name."""
+    mine = {None, robot or "robot"}
+    return {name: it for name, it in session.streams.items() if _robot_of(session, name) in mine}
 
 
 def _robot_of(session: "Session", stream: str) -> str | None:

@@ -25,6 +25,7 @@ class RobotAt:
         offset_sigma_rad: Departure of its joint offsets from the nominal ones [rad].
         dh_sigma_m: Departure of its lengths [m].
         dh_sigma_rad: Departure of its angles [rad].
+        warms_up: Whether it is cold at the first stop, and warms up by work.
     """
 
     name: str
@@ -35,6 +36,7 @@ class RobotAt:
     offset_sigma_rad: float = 0.0
     dh_sigma_m: float = 0.0
     dh_sigma_rad: float = 0.0
+    warms_up: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +190,7 @@ class NetworkOptions:
         instruments: Instruments, if there are any.
         points: The points that these read.
         stops: How often all robots stand still together.
+        pace_s: Time from one stop to the next [s]; 0 for rows without a time.
         share_seen: Share of what could be seen that is recorded; the rest is left out by chance.
         lens_views: Images of each camera that are of its lens alone, as the board is held by hand.
         pixel_sigma_px: Noise of the corners, per axis [px].
@@ -205,6 +208,7 @@ class NetworkOptions:
     instruments: tuple[InstrumentAt, ...] = ()
     points: tuple[PointAt, ...] = ()
     stops: int = 30
+    pace_s: float = 0.0
     share_seen: float = 1.0
     lens_views: int = 0
     pixel_sigma_px: float = 0.05
@@ -218,6 +222,8 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         if self.stops < 1:
             raise DataError(f"simulation: stops is {self.stops}, at least 1 is needed.")
+        if any(it.warms_up for it in self.robots) and self.pace_s <= 0.0:
+            raise DataError("simulation: a robot that warms up needs pace_s, from stop to stop.")
         for moved in self.moved:
             if moved.from_stop is not None and moved.from_stop >= self.stops:
                 raise DataError(

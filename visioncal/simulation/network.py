@@ -25,6 +25,7 @@ from visioncal.simulation.seen import (
 )
 from visioncal.simulation.standing import Stream, mounted, parents_of, postures, sheet_of, stream
 from visioncal.simulation.swept import sweep_network
+from visioncal.simulation.warmup import Heat, heated_poses, warm_up
 from visioncal.transforms import exp, invert
 from visioncal.types import Corners, FloatArray, IntArray, Target
 
@@ -44,14 +45,21 @@ def simulate_network(options: NetworkOptions) -> Network:
     parents, transforms = parents_of(options), mounted(options)
     joints = postures(options, transforms)
     arms = {it.name: arm_named(it.robot) for it in options.robots}
-    true_arms, flanges = {}, {}
+    true_arms, flanges, heat = {}, {}, {}
+    stamps_s = np.arange(options.stops, dtype=np.float64) * options.pace_s
     for at, robot in enumerate(options.robots):
         errors = ArmErrors(robot.dh_sigma_m, robot.dh_sigma_rad, robot.offset_sigma_rad)
         true = disturb(arms[robot.name], errors, stream(options, Stream.ARM, at))
         sigma = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
         jitter = stream(options, Stream.ROBOT, at).standard_normal((options.stops, 6)) * sigma
         true_arms[robot.name] = true
-        flanges[robot.name] = forward(true, joints[robot.name]) @ exp(jitter)
+        stood = forward(true, joints[robot.name])
+        if robot.warms_up:
+            heats, hours = Heat.drawn(options.seed + at), stamps_s[-1] / 3600.0
+            warming = warm_up(heats, hours, seed=options.seed + at)
+            stood = heated_poses(true, heats, joints[robot.name], warming.at(stamps_s))
+            heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
+        flanges[robot.name] = stood @ exp(jitter)
     cell = Network(
         options=options,
         parents=parents,
@@ -65,6 +73,7 @@ def simulate_network(options: NetworkOptions) -> Network:
         readings=(),
         told=(),
         wrong_views=(),
+        streams=heat,
     )
     cell = with_faults(_observed(cell))
     last = {name: it[-1] for name, it in _hanging(cell).items()}

@@ -189,10 +189,11 @@ def _view(
     image: str = "",
 ) -> View:
     """A row of a stop, with what it tells of a robot."""
-    told: dict[str, float] = {}
+    pace_s = cell.options.pace_s
+    told: dict[str, float] = {"stamp_s": stop * pace_s} if pace_s else {}
     named: dict[str, str] = {}
     if robot is not None:
-        told = pose_row(cell.base_from_flange[robot][stop])
+        told |= pose_row(cell.base_from_flange[robot][stop])
         joints = cell.joints[robot][stop].tolist()
         told |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
         named = {"robot": robot}

@@ -74,7 +74,7 @@ class Network:
         told: The row that tells where a robot stood, for those that no other row of their stop
             tells: (view, stop, robot).
         wrong_views: Rows with another row's image, ascending.
-        streams: What robots' controllers told in sweeps, by the robots' names.
+        streams: What robots' controllers told in sweeps, by the robots' names, and of temperatures.
     """
 
     options: NetworkOptions

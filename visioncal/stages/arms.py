@@ -18,7 +18,7 @@ from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Effect, Noise, Problem, State
 from visioncal.estimation.solve import Solution
 from visioncal.robot import Convention, Loads
-from visioncal.stages import backlash, elastic
+from visioncal.stages import backlash, elastic, thermal
 from visioncal.stages.backlash import Play, plays_of
 from visioncal.stages.elastic import Elastic, springs_of
 from visioncal.stages.joints import Matched
@@ -26,6 +26,8 @@ from visioncal.stages.kinematics import Kinematics, choose_level
 from visioncal.stages.loads import check_elastic, check_poses
 from visioncal.stages.reported import moved_arm
 from visioncal.stages.tell import Telling, tell
+from visioncal.stages.thermal import Heat, drift_by_view, drift_document, find_drift, heating
+from visioncal.thermal import Stops, ThermalFit
 from visioncal.transforms import distances, invert, mean_transform
 from visioncal.types import FloatArray, IntArray, Mask
 
@@ -41,11 +43,13 @@ class ArmFound:
         telling: Of its numbers; None where it stands as stated.
         springs: Of its joints as springs; None for a rigid one.
         plays: Of the play in its joints; empty where stops did not come from both sides.
+        drift: Its drift with temperature, as calibration.json has it; None for none.
     """
 
     telling: Telling | None = None
     springs: Elastic | None = None
     plays: tuple[Play, ...] = ()
+    drift: Mapping[str, Any] | None = None
 
     def notes(self) -> Iterator[str]:
         """Words what is no reason for doubt."""
@@ -72,6 +76,8 @@ class RobotArm:
         joints_rad: (m, n) its joints there; None where they are missing or belong to no model.
         loads: What it carried there.
         matched: Its model, beside poses and joints; None where none is known.
+        heat: What heats it; None where its joints are not known.
+        thermal: How it drifts with that; None where that was not asked or cannot be.
         errors: Errors that follow its posture, where they are likely.
         kinematics: Which levels were compared; None where that was not asked or cannot be.
         model: The arm with the errors of the level that was taken; None where it stays as stated.
@@ -83,6 +89,8 @@ class RobotArm:
     joints_rad: FloatArray | None
     loads: Loads
     matched: Matched | None = None
+    heat: Heat | None = None
+    thermal: ThermalFit | None = None
     errors: ArmErrors | None = None
     kinematics: Kinematics | None = None
     model: ArmModel | None = None
@@ -103,8 +111,23 @@ class RobotArm:
             stood=stood,
             joints_rad=None if joints is None else joints[kept],
             loads=self.loads.chosen(kept),
+            heat=None if self.heat is None else self.heat.at(kept),
             errors=None if errors is None else replace(errors, basis=errors.basis[stops]),
         )
+
+    @property
+    def drift(self) -> ThermalFit | None:
+        """How it drifts with its temperature; None where it does not beyond chance."""
+        return None if self.thermal is None or not thermal.is_found(self.thermal) else self.thermal
+
+    @property
+    def warming(self) -> Stops:
+        """Where it stood, and when; a stop without a time counts as at the start."""
+        if self.joints_rad is None or self.heat is None or self.thermal is None:
+            raise RuntimeError("an arm drifts by its joints and what heats them")
+        start_s = self.thermal.inputs.stamps_s[0]
+        stamps_s = np.nan_to_num(self.heat.stamps_s, nan=start_s)
+        return Stops(self.robot, np.flatnonzero(self.stood), self.joints_rad, stamps_s)
 
     def erring(self, errors: ArmErrors | None) -> Self:
         """The arm with errors that were found at some of its stops, none of them estimated yet."""
@@ -119,26 +142,58 @@ class RobotArm:
     @property
     def poses(self) -> FloatArray:
         """(s, 4, 4) where the flange stood, by the calibrated arm where there is one."""
-        if self.model is None or self.joints_rad is None:
-            return self.reported
         poses = self.reported.copy()
-        poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
+        if self.model is not None and self.joints_rad is not None:
+            poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
+        if self.drift is not None:
+            poses[self.stood] = poses[self.stood] @ self.drift.motion(self.warming)
         return poses
 
+    def frees_errors(self, *, freely: bool = False) -> bool:
+        """Whether its errors are unknowns: those that are estimated, or freely all found."""
+        return self.errors is not None and (freely or self.errors.is_estimated)
+
     def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
-        """Its errors as unknowns: those that are estimated, or freely all that were found."""
-        if self.errors is None or not (freely or self.errors.is_estimated):
-            return ()
-        values = None if self.model is None else self.model.values
-        return (self.errors.effect(self.robot, values=values),)
+        """What moves its flange at all stops: what is open about its drift, and its errors."""
+        drift, found = self.drift, []
+        if drift is not None:
+            found.append(drift.effect(self.warming, len(self.stood)))
+        if self.errors is not None and self.frees_errors(freely=freely):
+            values = None if self.model is None else self.model.values
+            found.append(self.errors.effect(self.robot, values=values))
+        return tuple(found)
+
+    def put_into(self, problem: Problem) -> Problem:
+        """A problem with this arm in the place of what it has of it."""
+        mine = {f"{it} of {self.robot}" for it in ("arm", "temperature")}
+        rest = [it for it in problem.effects if it.name not in mine]
+        moved = replace(problem, poses={**problem.poses, self.robot: self.poses})
+        return moved.with_effects([*rest, *self.effects()])
 
     def without_errors(self, problem: Problem) -> Problem:
-        """A problem with this arm as reported."""
-        mine = {it.name for it in self.effects()}
-        rest = [it for it in problem.effects if it.name not in mine]
-        return replace(problem, poses={**problem.poses, self.robot: self.reported}).with_effects(
-            rest
-        )
+        """A problem with this arm as reported, but for its drift."""
+        return self.erring(None).put_into(problem)
+
+    def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
+        """Looks for how it drifts with its temperature, where the session tells.
+
+        Args:
+            problem: The observations, with this arm as reported.
+            start: Where to start.
+            asked: A key of `stages.kinematics.ASKED`.
+
+        Raises:
+            DataError: The level asks for it, and the session lacks what it takes.
+            DegenerateError: The level asks for it, and all views were taken about equally warm.
+        """
+        seen = self.at(stops_of(problem, self.robot))
+        inputs = heating(seen.heat if self.is_modelled else None, asked)
+        if inputs is None or seen.heat is None or seen.joints_rad is None or self.matched is None:
+            return self
+        places = stops_of(problem, self.robot)
+        stops = Stops(self.robot, places, seen.joints_rad, seen.heat.stamps_s)
+        found = find_drift(problem, start, stops, inputs, self.matched.arm)
+        return replace(self, thermal=found)
 
     def with_errors(self, problem: Problem, fit: Solution) -> Self:
         """Looks for errors that follow its posture.
@@ -182,17 +237,10 @@ class RobotArm:
         found[self.stood] = np.all([it <= 2.0 * it[sound].max() + _ROUNDED for it in away], axis=0)
         return found
 
-    def seen(
+    def _seen(
         self, problem: Problem, fit: Solution, spread: FloatArray, middles: Mapping[str, FloatArray]
     ) -> ArmData | None:
-        """What was seen of it; None where it stands as stated.
-
-        Args:
-            problem: The observations that agree, with its errors among the unknowns.
-            fit: Their fit.
-            spread: (p, p) its covariance.
-            middles: (3,) the middle of each printed target by its frame, in that [m].
-        """
+        """What was seen of its errors; None where it stands as stated."""
         columns = problem.effect_columns.get(f"arm of {self.robot}")
         if self.model is None or self.errors is None or self.joints_rad is None or columns is None:
             return None
@@ -218,21 +266,39 @@ class RobotArm:
             measured=np.repeat([shows_pose, True], 3),
         )
 
-    def found(self, seen: ArmData | None, convention: Convention | None = None) -> ArmFound:
+    def found(
+        self,
+        problem: Problem,
+        fit: Solution,
+        spread: FloatArray,
+        middles: Mapping[str, FloatArray],
+        convention: Convention | None = None,
+    ) -> ArmFound:
         """What the stops tell of it.
 
         Args:
-            seen: What was seen of it; None where it stands as stated.
+            problem: The observations that agree, with its errors among the unknowns.
+            fit: Their fit.
+            spread: (p, p) its covariance.
+            middles: (3,) the middle of each printed target by its frame, in that [m].
             convention: Of the table that is wanted; see `stages.tell`.
         """
-        if seen is None or self.kinematics is None:
-            return ArmFound()
+        drift = None
+        if self.drift is not None and self.heat is not None:
+            seen = self.at(stops_of(problem, self.robot))
+            stops = replace(seen.warming, places=stops_of(problem, self.robot))
+            views = [] if seen.heat is None else seen.heat.views.tolist()
+            drift = drift_document(self.drift, stops, views, problem, fit)
+        data = self._seen(problem, fit, spread, middles)
+        if data is None or self.kinematics is None:
+            return ArmFound(drift=drift)
         # With nothing but play and springs its numbers are as stated.
-        erring = seen.model.weights.keys() & set(RIGID)
+        erring = data.model.weights.keys() & set(RIGID)
         return ArmFound(
-            tell(seen, convention) if erring else None,
-            springs_of(seen, self.kinematics.errors),
-            plays_of(seen.model, seen.spread),
+            tell(data, convention) if erring else None,
+            springs_of(data, self.kinematics.errors),
+            plays_of(data.model, data.spread),
+            drift,
         )
 
     def documents(self, found: ArmFound, views: Sequence[int]) -> dict[str, Any]:
@@ -245,6 +311,9 @@ class RobotArm:
         stages: dict[str, Any] = {}
         if self.errors is not None:
             stages["arm_errors"] = self.errors.document()
+        if found.drift is not None and self.drift is not None and self.heat is not None:
+            rows = drift_by_view(self.drift, self.warming, self.heat.views.tolist())
+            stages["thermal"] = {**found.drift, "views": rows}
         if self.kinematics is None:
             return stages
         stages["kinematics"] = self.kinematics.document()

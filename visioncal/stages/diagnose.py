@@ -22,7 +22,7 @@ _FEWEST_STOPS = 6
 # Whose effects' uncertainty is, by their names; that of all others is the clock's.
 _OF_EFFECTS = {
     "points": "instrument",
-    "temperature": "temperature",
+    f"temperature of {ROBOT}": "temperature",
     f"arm of {ROBOT}": "arm",
 }
 

@@ -187,6 +187,17 @@ def _rms(residuals: FloatArray, turned: Mask) -> Rms:
     return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
 
 
+def check_level(asked: str) -> None:
+    """Refuses a level that is none.
+
+    Raises:
+        DataError: It is not known.
+    """
+    levels = (*ASKED, "hand-eye")
+    if asked not in levels:
+        raise DataError(f"level {asked!r} is not one of {', '.join(levels)}.")
+
+
 def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
     """Refuses a level that the session cannot give.
 

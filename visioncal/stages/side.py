@@ -46,7 +46,7 @@ class FramesSide:
     @property
     def has_errors(self) -> bool:
         """Whether errors of an arm are free."""
-        return any(it.effects(freely=self.freely) for it in self.arms.values())
+        return any(it.frees_errors(freely=self.freely) for it in self.arms.values())
 
     @property
     def has_links(self) -> bool:
@@ -71,7 +71,7 @@ class FramesSide:
 
     def with_errors(self, fitted: Fitted) -> Self:
         """Looks for errors of the arms; see `joint.Side`."""
-        free = {name for name, it in self.arms.items() if it.effects(freely=self.freely)}
+        free = {name for name, it in self.arms.items() if it.frees_errors(freely=self.freely)}
         arms = {
             name: it if name in free else it.with_errors(fitted.problem, fitted.fit)
             for name, it in self.arms.items()

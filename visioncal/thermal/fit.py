@@ -76,6 +76,7 @@ class ThermalFit:
         before_m: Residual of the views without drift, as a root mean square [m].
         after_m: The same with it [m].
         rises_k: (n,) range of each link's temperature over the views [K].
+        inputs: What heated the arm.
     """
 
     model: ThermalModel
@@ -86,6 +87,7 @@ class ThermalFit:
     before_m: float
     after_m: float
     rises_k: FloatArray
+    inputs: Inputs
 
     @property
     def not_told(self) -> tuple[str, ...]:
@@ -93,14 +95,21 @@ class ThermalFit:
         names = parameter_names(self.model)
         return tuple(it for it, share in zip(names, self.told, strict=True) if share > _TOLD)
 
-    def effect(self, stops: Stops, inputs: Inputs) -> Effect:
-        """What is open about the parameters, as unknowns of the chain of some stops.
+    def links_c(self, stops: Stops) -> FloatArray:
+        """(m, n) temperatures of the links at some stops [deg C]."""
+        return self.model.heating.links_c(self.inputs, stops.stamps_s)
+
+    def motion(self, stops: Stops) -> FloatArray:
+        """(m, 4, 4) how far the flange had moved at some stops, in its own frame."""
+        return self.model.motion(stops.q, self.links_c(stops))
+
+    def effect(self, stops: Stops, count: int) -> Effect:
+        """What is open about the parameters, as unknowns of the chain at all of so many stops.
 
         They stay where they were found, and count in the covariance with what was known of them
         beforehand: what the stops tell of them the chain says itself.
         """
-        count = len(stops.places)
-        free = _effect(self.model, self.values, self.sigmas, stops, inputs, count)
+        free = _effect(self.model, self.values, self.sigmas, stops, self.inputs, count)
         nothing = np.zeros(len(self.values))
         return replace(free, values=nothing, held=nothing == 0.0)
 
@@ -163,6 +172,7 @@ def fit_thermal(
         before_m,
         after_m,
         np.ptp(model.heating.links_c(inputs, stops.stamps_s), axis=0),
+        inputs,
     )
 
 
@@ -270,7 +280,8 @@ def _effect(
     basis[stops.places] = model.basis(stops.q, links, heated) * sigmas
     known = Knowledge(np.eye(len(values)), values)
     nothing = np.zeros(len(values), dtype=bool)
-    return Effect("temperature", values, known, nothing, by_flange={stops.robot: basis})
+    name = f"temperature of {stops.robot}"
+    return Effect(name, values, known, nothing, by_flange={stops.robot: basis})
 
 
 def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:

@@ -6,6 +6,8 @@ import numpy as np
 
 from visioncal.files import some_of
 from visioncal.session import Session
+from visioncal.session.kinds import name_of
+from visioncal.session.selecting import streams_of
 from visioncal.session.streams import STAMP, Stream
 from visioncal.thermal.heating import Inputs, Kind
 from visioncal.types import FloatArray
@@ -17,17 +19,18 @@ _AMBIENT = "ambient_c"
 _FORMS: Mapping[Kind, str] = {"temperatures": "temp{}_c", "currents": "current{}_a"}
 
 
-def inputs_of(session: Session, joints: int) -> tuple[Inputs | None, str]:
+def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | None, str]:
     """Takes what heats an arm out of a session; temperatures come before currents.
 
     Args:
         session: The session.
         joints: How many joints the arm has.
+        robot: Its name, where the session has several.
 
     Returns:
         What heats it; or None, and what is missing.
     """
-    tables = [*session.streams.values(), _of_views(session)]
+    tables = [*streams_of(session, robot).values(), _of_views(session, robot)]
     for kind, form in _FORMS.items():
         names = [form.format(at + 1) for at in range(joints)]
         for table in tables:
@@ -64,11 +67,10 @@ def _bunched(inputs: Inputs) -> Inputs:
     )
 
 
-def _of_views(session: Session) -> Stream:
-    """The views that have a time, as a stream of their numbers."""
-    rows = sorted(
-        {it.stamp_s: it.numbers for it in session.views if it.stamp_s is not None}.items()
-    )
+def _of_views(session: Session, robot: str) -> Stream:
+    """A robot's views that have a time, as a stream of their numbers."""
+    mine = [it for it in session.views if name_of(session.declaration, "robot", it) == robot]
+    rows = sorted({it.stamp_s: it.numbers for it in mine if it.stamp_s is not None}.items())
     names = sorted({name for _, row in rows for name in row} - {STAMP})
     values = [[stamp_s, *(row.get(name, np.nan) for name in names)] for stamp_s, row in rows]
     return Stream((STAMP, *names), np.array(values).reshape(len(rows), len(names) + 1))
