@@ -8,7 +8,7 @@ import pytest
 from boards import charuco, checkerboard
 from rendered import Shot, photograph
 
-from visioncal.finders import Seen, board, find_target
+from visioncal.finders import Seen, blur_of, board, find_target
 from visioncal.finders.charuco import find_charuco
 from visioncal.finders.checkerboard import find_checkerboard
 from visioncal.finders.template import refine
@@ -216,3 +216,19 @@ def test_what_the_small_copy_misses_is_searched_in_the_image_itself(large, monke
     seen = find_target(part, CHARUCO)
     assert sizes == [(500, part.shape[1] // 2)]
     assert 4 <= len(seen.ids) < len(truth)
+
+
+@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+def test_a_smear_in_one_direction_counts_as_blur(target):
+    # A line of 8 px has a standard deviation of 2.3 px; the sharp direction stays sharp.
+    still = find_target(photograph(target, replace(SMALL, square_px=40), 1)[0], target)
+    smear = np.zeros((9, 9), np.float32)
+    smear[4] = 1 / 9
+    image = photograph(target, replace(SMALL, square_px=40, tilt_deg=0), 2)[0]
+    moved = cv2.filter2D(image, -1, smear)
+    assert still.blur_px < 0.8
+    seen = find_target(image, target)
+    assert seen.blur_px < 0.8
+    assert 1.4 < blur_of(moved, target, seen.ids, seen.px) < 3.2
+    # Nothing of a print: the gradients are left.
+    assert np.isfinite(blur_of(np.full_like(image, 90), target, seen.ids, seen.px))

@@ -10,7 +10,7 @@ from visioncal.capture.options import CaptureOptions
 from visioncal.capture.still import Look, grey, why_arm_moves, why_image_moves
 from visioncal.drivers.protocols import ArmState, Frame
 from visioncal.errors import DriverError
-from visioncal.finders.imaging import blur_at_corners
+from visioncal.finders import blur_of
 from visioncal.stages.detect import look_for
 from visioncal.types import Corners, Image, Rejection, Target
 
@@ -156,7 +156,8 @@ def _chosen(
     if isinstance(first, Missed):
         return first
     # The board stands still: the corners of one frame are those of all.
-    blurs = [blur_at_corners(grey(it.frame.image), first.corners.px) for it in looks]
+    found = first.corners
+    blurs = [blur_of(grey(it.frame.image), target, found.ids, found.px) for it in looks]
     sharpest = int(np.argmin(blurs))
     return first if sharpest == 0 else _taken(looks[sharpest], target, view, moved)
 

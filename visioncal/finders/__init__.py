@@ -1,12 +1,16 @@
 """Finding a target's corners in an image: one module a kind of target."""
 
+import numpy as np
+
 from visioncal.finders.board import find_board
 from visioncal.finders.charuco import fitting_layouts
+from visioncal.finders.imaging import blur_at_corners
 from visioncal.finders.marker import find_marker
 from visioncal.finders.result import NotFound, Seen
-from visioncal.types import Image, Target
+from visioncal.finders.template import refine
+from visioncal.types import FloatArray, Image, IntArray, Target
 
-__all__ = ["NotFound", "Seen", "find_target", "fitting_layouts"]
+__all__ = ["NotFound", "Seen", "blur_of", "find_target", "fitting_layouts"]
 
 
 def find_target(image: Image, target: Target) -> Seen | NotFound:
@@ -29,3 +33,23 @@ def find_target(image: Image, target: Target) -> Seen | NotFound:
                 f"target {target.name} is a rig of points, which no image is searched for: "
                 "corners.csv has no rows of this view"
             )
+
+
+def blur_of(image: Image, target: Target, ids: IntArray, px: FloatArray) -> float:
+    """Measures how wide edges are at corners that were found, in another image of them or the same.
+
+    Args:
+        image: (h, w) grey image.
+        target: What was found.
+        ids: (n,) the corners' numbers, n >= 1.
+        px: (n, 2) where they are, to a pixel or so [px].
+
+    Returns:
+        The width as a Gaussian's sigma, on a board in the direction in which edges are wider: what
+        moves is smeared in one alone [px].
+    """
+    if target.kind in ("charuco", "checkerboard"):
+        blur_px = float(refine(image, target, ids, px).blur_px.max())
+        if np.isfinite(blur_px):
+            return blur_px
+    return blur_at_corners(image, px)

@@ -54,7 +54,7 @@ def _refined(image: Image, target: Target, seen: Seen) -> Seen:
     fitted = np.array([not it for it in refined.reasons])
     if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
         return replace(seen, weights=np.full(len(fitted), _DETECTED_WEIGHT))
-    return Seen(seen.ids[fitted], refined.px[fitted])
+    return Seen(seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max()))
 
 
 def _shrunk(image: Image, by: int) -> Image:

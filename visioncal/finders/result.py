@@ -14,11 +14,14 @@ class Seen:
         px: (n, 2) positions [px].
         weights: (n,) by how much more than usual each is known, as the ratio of standard
             deviations; None where all are as usual.
+        blur_px: Width of the edges, as a Gaussian's sigma, in the direction in which they are wider
+            [px]; None where it is not measured.
     """
 
     ids: IntArray
     px: FloatArray
     weights: FloatArray | None = None
+    blur_px: float | None = None
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,8 @@ def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
             f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
             culprits=[label],
         )
-    return Corners(0, seen.ids, seen.px, blur_at_corners(image, seen.px), seen.weights)
+    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
+    return Corners(0, seen.ids, seen.px, blur, seen.weights)
 
 
 def _check(corners: Corners, target: Target, label: str) -> None:

@@ -224,7 +224,7 @@ def look_for(
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
         reason = f"{reason} (looked for target {name})" if name else reason
         return Rejection(view, reason), seen.misfit
-    blur = blur_at_corners(image, seen.px)
+    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
     trouble = _trouble(target, seen.ids, blur, options)
     if trouble:
         return Rejection(view, trouble), False
