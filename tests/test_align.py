@@ -223,6 +223,12 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     # What is open about it counts where that camera is.
     edges = found.edges["cell_from_cam_left"], right.edges["cell_from_cam_left"]
     assert edges[0].sigma_mm > 2.0 * edges[1].sigma_mm
+    # Corners pull at it: the camera is a centimetre away, which is within what that counts for.
+    away, squared = off(cell, found, "base_a", "cam_left")
+    assert np.linalg.norm(away[3:]) > 5e-3
+    assert squared < 22.0
+    budget = found.stages["uncertainty"]["budget_mm"]["cell_from_cam_left"]
+    assert budget["held values"] > 0.9 * budget["total"]
 
 
 def test_cameras_in_the_hand_and_poses_that_are_given():

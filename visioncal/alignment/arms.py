@@ -8,7 +8,7 @@ from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.arm import misfit_covariance
 from visioncal.estimation.misfit import inflation
 from visioncal.estimation.problem import Problem, State
-from visioncal.estimation.solve import Solution
+from visioncal.estimation.solve import Solution, held_shift
 from visioncal.session import View
 from visioncal.session.loads import loads_of
 from visioncal.stages import thermal
@@ -55,13 +55,13 @@ def _joints(views: Sequence[View], matched: Matched) -> FloatArray | None:
     return np.array(found) if found and len(found) == len(known) else None
 
 
-def covariance_of_arms(
+def covariance_beside_noise(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
     found: Mapping[str, Misfit],
 ) -> dict[str, FloatArray]:
-    """Covariances (p, p) that a fit has of what is no noise of its robots, by their source.
+    """Covariances (p, p) that a fit has of what is no noise, by their source.
 
     Args:
         problem: The observations that agree.
@@ -69,7 +69,9 @@ def covariance_of_arms(
         arms: The arms; errors that are no unknowns count.
         found: What their residuals show.
     """
-    parts = {}
+    parts, shift = {}, held_shift(problem, fit)
+    if shift.any():
+        parts["held values"] = np.outer(shift, shift)
     for robot, arm in arms.items():
         if arm.errors is not None and not arm.errors.is_estimated:
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.alignment.arms import (
-    covariance_of_arms,
+    covariance_beside_noise,
     doubts_of_arms,
     notes_on_arms,
 )
@@ -124,7 +124,7 @@ def alignment_of(
     session, agreed = looked.session, solved.agreed
     problem, part = agreed.problem, agreed.problem.subset(agreed.used)
     found = misfits(part, agreed.fit)
-    parts = covariance_of_arms(part, agreed.fit, solved.arms, found)
+    parts = covariance_beside_noise(part, agreed.fit, solved.arms, found)
     spread = sum(parts.values(), covariance_of(part, agreed.fit))
     named = versions(solved)
     edges = _edges(solved, named, spread)

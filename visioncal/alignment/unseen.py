@@ -27,17 +27,17 @@ def left_out(solved: Solved) -> HeldOut:
     return validate(solved.agreed.problem.subset(solved.agreed.used), again, pixels)
 
 
-def budget_mm(solved: Solved, of_arms: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
     """Sigmas of each unknown frame's place in its parent, by source and as a `total` [mm].
 
     Args:
         solved: The fit.
-        of_arms: (p, p) what counts beside its noise, by source.
+        beside: (p, p) what counts beside its noise, by source.
     """
     fit, part = solved.agreed.fit, solved.agreed.problem.subset(solved.agreed.used)
     parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
     size = 6 * len(part.unknown)
-    parts |= {name: it[:size, :size] for name, it in of_arms.items()}
+    parts |= {name: it[:size, :size] for name, it in beside.items()}
     parts["total"] = sum(parts.values(), np.zeros((size, size)))
     found: dict[str, dict[str, float]] = {}
     for key in part.unknown:
@@ -58,10 +58,12 @@ def _sources(solved: Solved) -> Sources:
         for name, it in problem.effect_columns.items()
         if name != LENSES
     }
+    # One that moved is one sensor all the same.
+    seers = {it: it.partition("@")[0] for it in problem.observations.observers}
     return Sources(
         {
-            frame: f"pixels of {frame}" if frame in of_corners else f"readings of {frame}"
-            for frame in problem.observations.observers
+            key: f"pixels of {frame}" if frame in of_corners else f"readings of {frame}"
+            for key, frame in seers.items()
         },
         {robot: f"robot {robot}" for robot in problem.robots},
         columns | _looks(solved),

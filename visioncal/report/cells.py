@@ -8,7 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from visioncal.calibration import Alignment, Calibration, CameraResult, Sight
+from visioncal.calibration import HELD_BACK, Alignment, Calibration, CameraResult, Sight
 from visioncal.figures import significant
 from visioncal.files import write_atomically
 from visioncal.recording import cellmap
@@ -257,7 +257,7 @@ def residuals(found: Alignment) -> Markup:
 
 
 def _bar(sight: Sight) -> Bar:
-    far = sight.residual_mm is not None
+    far = sight.residual_mm is not None and sight.reason != HELD_BACK
     colour = svg.ACCENT if sight.used else svg.BAD if far else svg.MUTED
     return Bar(str(sight.view), sight.residual_mm, sight.used, colour)
 
