@@ -322,6 +322,16 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         zeros = [it for it in kinematics["parameters"] if it["name"] == "theta_rad"]
         surprises = ([it["change"] for it in zeros] - true) / [it["sigma"] for it in zeros]
         assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
+        seen = {it.view for it in found.sights if it.seen == f"target_plate_{robot}" and it.used}
+        rows = kinematics["left_out"]
+        assert {it["view"] for it in rows} == seen
+        before, after = (
+            np.sqrt(np.mean([it[of] ** 2 for it in rows])) for of in ("nominal_mm", "mm")
+        )
+        held_out = {it["level"]: it["held_out_mm"] for it in kinematics["levels"]}
+        # The same residuals, written twice.
+        assert before == pytest.approx(held_out["nominal"], rel=1e-9)
+        assert after == pytest.approx(held_out["offsets"], rel=1e-9)
         one = Calibration.whole(found).of("cam_left", robot, f"target_plate_{robot}")
         np.testing.assert_allclose(
             one.standing(cell.joints[robot]), arm.base_from_flange(cell.joints[robot]), atol=1e-12

@@ -133,7 +133,7 @@ def solve(cell: Cell, looked: Observed, asked: str = "auto") -> Solved:
         agreed, seen, arms = _with_looks(cell, looked, views, agreed, arms, late)
     agreed = _levelled(cell, views, agreed)
     if asked != "hand-eye":
-        arms = _levels(agreed, arms, asked)
+        arms = _levels(cell, agreed, arms, asked)
         agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
     agreed = _without_contradicted(settle(agreed, _movable(agreed.problem)))
     agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
@@ -165,13 +165,16 @@ def _with_looks(
     return _with_effects(agreed, others) if others else agreed, None, arms
 
 
-def _levels(agreed: Agreed, arms: Mapping[str, RobotArm], asked: str) -> dict[str, RobotArm]:
+def _levels(
+    cell: Cell, agreed: Agreed, arms: Mapping[str, RobotArm], asked: str
+) -> dict[str, RobotArm]:
     """Chooses how far each arm is calibrated, beside the errors of the others."""
     problem, chosen = agreed.problem.subset(agreed.used), dict(arms)
+    views = [cell.rows[it].view for it in np.flatnonzero(agreed.used)]
     for name, arm in arms.items():
         stated = arm.without_errors(problem)
         start = State(agreed.fit.state.edges, stated.start_values)
-        chosen[name] = arm.with_level(stated, start, asked, agreed.fit.noise)
+        chosen[name] = arm.with_level(stated, start, asked, views, agreed.fit.noise)
         problem = chosen[name].put_into(problem)
     return chosen
 

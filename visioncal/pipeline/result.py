@@ -15,7 +15,7 @@ from visioncal.pipeline.fit import conditions_document, fit_document
 from visioncal.pipeline.guessing import is_suspect, reading_hint
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
-from visioncal.pipeline.unseen import unseen_views
+from visioncal.pipeline.unseen import held_back
 from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
@@ -186,8 +186,8 @@ def _arm(known: Known) -> dict[str, Any]:
     """What was found of the arm."""
     arm, found = known.robot_arm, known.arm_found
     documents = known.arm_at(known.used).documents(found, known.first_of_stops(known.used))
-    if arm.kinematics is not None and found.telling is not None:
-        documents["kinematics"] |= unseen_views(known, arm.kinematics)
+    if arm.kinematics is not None and found.telling is not None and known.measurable_held_back:
+        documents["kinematics"]["holdout"] = held_back(known, arm.kinematics)
     return documents
 
 

@@ -261,9 +261,12 @@ def _with_level(known: Known) -> Known:
     if not can or known.level == "hand-eye":
         return known
     stated = replace(known, calibrated=arm.erring(None))
-    problem = stated.problem(known.used).merged()
+    problem = stated.problem(known.used)
+    # What one stop shows of a target goes by its first view.
+    first = np.unique(problem.of_one_stop, return_index=True)[1].tolist()
+    problem, views = problem.merged(), [known.used[it] for it in first]
     start = problem.start(known.frames)
-    arm = arm.calibrated_as(known.arm_at_stops.with_level(problem, start, known.level))
+    arm = arm.calibrated_as(known.arm_at_stops.with_level(problem, start, known.level, views))
     known = replace(known, calibrated=arm)
     if arm.kinematics is None:
         return known

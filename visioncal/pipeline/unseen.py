@@ -1,8 +1,6 @@
 """Views that no fit has seen: left out in turn, and held back, by the arm as stated and by ours."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +9,7 @@ from visioncal.estimation.problem import Problem, State
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.views import chain_px
 from visioncal.stages.handeye import refit
-from visioncal.stages.kinematics import Kinematics
+from visioncal.stages.kinematics import Kinematics, unseen_rows
 from visioncal.stages.validate import HeldOut, apart, validate
 from visioncal.types import FloatArray, IntArray
 
@@ -32,54 +30,14 @@ def left_out(known: Known) -> HeldOut:
     return validate(problem, again, pixels, f", of the {fit}")
 
 
-def unseen_views(known: Known, found: Kinematics) -> dict[str, list[dict[str, Any]]]:
-    """How far such views are off by both arms: left out in turn, and held back by the session.
-
-    What one stop shows of a target goes by its first view.
-    """
-    before, after = (_lengths(fit.left_out) for fit in found.fits)
-    first = np.unique(known.problem(known.used).of_one_stop, return_index=True)[1]
-    left_out = [known.used[int(at)] for at in first]
-    rows = partial(_rows, turned=known.readings is None or known.readings.are_poses)
-    documents = {"left_out": list(rows(left_out, before, after))}
+def held_back(known: Known, found: Kinematics) -> list[dict[str, Any]]:
+    """How far views that no fit may use are off: by the nominal arm with its own edges, by ours."""
     views = sorted(known.measurable_held_back)
-    if views:
-        before, after = _held_back(known, found, views)
-        documents["holdout"] = list(rows(views, before, after))
-    return documents
-
-
-def _held_back(
-    known: Known, found: Kinematics, views: Sequence[int]
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals of views that no fit may use: by the nominal arm with its own edges, and by ours.
-
-    Returns:
-        Twice (m, 2) rotation [rad] and distance [m].
-    """
     stated = replace(known, calibrated=known.robot_arm.erring(None))
     problem = stated.problem(views)
     lost = stated.arm_at(stated.first_of_stops(views)).stated(problem)
     before = apart(problem if lost is None else lost, found.fits[0].fit.state)
     after = apart(known.problem(views), known.solved.state)
-    return np.stack(before[::-1], axis=1), np.stack(after[::-1], axis=1)
-
-
-def _lengths(twists: FloatArray) -> FloatArray:
-    """(m, 2) angles [rad] and distances [m] of (m, 6) residuals."""
-    return np.asarray(np.linalg.norm(twists.reshape(-1, 2, 3), axis=2))
-
-
-def _rows(
-    views: Sequence[int], before: FloatArray, after: FloatArray, *, turned: bool
-) -> Iterator[dict[str, Any]]:
-    """One row a view; without degrees where places alone were read."""
-    for view, was, now in zip(views, before, after, strict=True):
-        row: dict[str, Any] = {
-            "view": view,
-            "nominal_mm": 1e3 * float(was[1]),
-            "nominal_deg": float(np.rad2deg(was[0])),
-            "mm": 1e3 * float(now[1]),
-            "deg": float(np.rad2deg(now[0])),
-        }
-        yield {name: it for name, it in row.items() if turned or not name.endswith("deg")}
+    turned = np.full(len(views), not problem.points)
+    was, now = (np.stack(it[::-1], axis=1) for it in (before, after))
+    return list(unseen_rows(views, was, now, turned))

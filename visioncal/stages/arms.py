@@ -11,6 +11,7 @@ from visioncal.estimation.arm import (
     find_arm_errors,
     link_basis,
     pose_basis,
+    rows_of,
     stops_of,
 )
 from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
@@ -325,6 +326,7 @@ class RobotArm:
         if found.telling is not None:
             zero = None if self.matched is None else self.matched.zero
             stages["kinematics"] |= found.telling.document(self.model.nominal, views, zero)
+            stages["kinematics"]["left_out"] = self.kinematics.left_out()
         if found.springs is not None:
             stages["elastic"] = found.springs.document(views)
         return stages
@@ -343,7 +345,12 @@ class RobotArm:
         return self._by_stop(self.model.basis(self.joints_rad, self.loads))
 
     def with_level(
-        self, problem: Problem, start: State, asked: str, noise: Noise | None = None
+        self,
+        problem: Problem,
+        start: State,
+        asked: str,
+        views: Sequence[int],
+        noise: Noise | None = None,
     ) -> Self:
         """Chooses how far it is calibrated.
 
@@ -351,6 +358,7 @@ class RobotArm:
             problem: The observations, with this arm as reported.
             start: Where to start.
             asked: A key of `stages.kinematics.ASKED`.
+            views: (n,) by which view each observation goes.
             noise: The noise's levels to start from; those from above where None.
         """
         stops = stops_of(problem, self.robot)
@@ -366,7 +374,8 @@ class RobotArm:
         found = choose_level(
             problem, start, self.robot, bases, asked, self.stated(problem), noise=noise
         )
-        arm = replace(self, kinematics=found)
+        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
+        arm = replace(self, kinematics=replace(found, views=tuple(views[it] for it in mine)))
         return arm._bending(model.erring(found.errors)) if found.errors else arm
 
     def _columns(self, model: ArmModel, name: str) -> FloatArray:

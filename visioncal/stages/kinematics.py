@@ -76,6 +76,7 @@ class Kinematics:
         errors: Its errors by block.
         was_asked: Whether the user named the level.
         fits: The fits of the nominal arm and of that level.
+        views: (m,) by which view each residual of these goes.
     """
 
     level: str
@@ -83,10 +84,35 @@ class Kinematics:
     errors: Mapping[str, ArmErrors]
     was_asked: bool
     fits: tuple[LevelFit, LevelFit]
+    views: tuple[int, ...] = ()
+
+    def left_out(self) -> list[dict[str, Any]]:
+        """How far stops that are left out in turn are off by both arms, by view."""
+        before, after = (np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2) for it in self.fits)
+        return list(unseen_rows(self.views, before, after, self.fits[0].has_rotation))
 
     def document(self) -> dict[str, Any]:
         """The levels that were compared, as calibration.json has them."""
         return {"level": self.level, "levels": [it.document() for it in self.levels]}
+
+
+def unseen_rows(
+    views: Sequence[int], before: FloatArray, after: FloatArray, turned: Mask
+) -> Iterator[dict[str, Any]]:
+    """Writes how far views that no fit has seen are off by the nominal arm and by the calibrated.
+
+    Args:
+        views: (m,) the views.
+        before: (m, 2) by the one, rotation [rad] and distance [m].
+        after: (m, 2) by the other.
+        turned: (m,) whether a rotation was measured.
+    """
+    columns = zip(views, before.tolist(), after.tolist(), turned.tolist(), strict=True)
+    for view, (was_rad, was_m), (now_rad, now_m), has_rotation in columns:
+        row = {"view": view, "nominal_mm": 1e3 * was_m, "mm": 1e3 * now_m}
+        if has_rotation:
+            row |= {"nominal_deg": np.rad2deg(was_rad).item(), "deg": np.rad2deg(now_rad).item()}
+        yield row
 
 
 def choose_level(
