@@ -231,6 +231,20 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     assert budget["held values"] > 0.9 * budget["total"]
 
 
+def test_lenses_that_the_views_do_not_determine_are_refused():
+    cell = simulate_network(NetworkOptions(stops=6, pixel_sigma_px=1.0))
+    session = network_session(cell, "cell", seen="names")
+    given = ("matrix", "distortion", "matrix_sigma_px")
+    cameras = {
+        name: {key: it for key, it in table.items() if key not in given}
+        for name, table in session.document["cameras"].items()
+    }
+    session = replace(session, document={**session.document, "cameras": cameras})
+    with pytest.raises(DegenerateError, match="do not determine lens and board") as refused:
+        align(session, corners={it.view: it for it in cell.corners})
+    assert refused.value.next_step.startswith("Give matrix and distortion")
+
+
 def test_cameras_in_the_hand_and_poses_that_are_given():
     cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
     cell = simulate_network(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import visioncal
-from whole_cells import FLOOR, LATER, misfit, part, recorded, saved, simulated, truth
+from whole_cells import FLOOR, LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
 import visioncal as package
 from visioncal.calibration import Alignment, Calibration, RobotResult, to_document
@@ -309,3 +309,13 @@ def test_the_result_of_one_pair_replaces_that_of_the_cell(folder, tmp_path):
 def test_what_a_whole_cell_does_not_have_is_refused(cell):
     with pytest.raises(DataError, match="solver park cannot be asked"):
         package.calibrate(part(recorded(cell), 0, LATER), solver="park")
+
+
+def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
+    cell = simulate_network(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
+    session = recorded(cell)
+    found = package.calibrate(session)
+    assert {it.view for it in found.cell.sights if not it.used} == set(cell.wrong_views)
+    check = verify(session, found, camera="left", robot="b", target="plate_b")
+    assert check.passed
+    assert set(check.seen.known.reasons) < set(cell.wrong_views)

@@ -17,7 +17,7 @@ from visioncal.estimation.observability import (
     check_determined,
     edge_directions,
 )
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
@@ -145,11 +145,12 @@ def _arms(
     ]
 
 
-def check_cell(solved: Solved) -> None:
+def check_cell(solved: Solved, *, looks: bool = False) -> None:
     """Refuses a cell in which the motion does not determine a frame well enough for anybody.
 
     Args:
         solved: The fit.
+        looks: Whether its views have to tell lens and board.
 
     Raises:
         DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
@@ -174,8 +175,7 @@ def check_cell(solved: Solved) -> None:
         )
 
     scene = Scene("align", names, motion, advice)
-    state = State(agreed.fit.state.edges, np.zeros(0))
-    check_determined(part.with_effects(()), state, agreed.fit.noise, scene)
+    check_determined(part, agreed.fit.state, agreed.fit.noise, scene, looks=looks)
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:

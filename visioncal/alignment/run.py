@@ -129,7 +129,7 @@ def alignment_of(
     named = versions(solved)
     edges = _edges(solved, named, spread)
     last = {it.frame: edges[it.frame] for it in named.values() if it.name == it.frame}
-    check_cell(solved)
+    check_cell(solved, looks=any(it.estimated for it in looked.scenes.values()))
     parents = {name: problem.tree.branches[it.key].parent for name, it in _by_name(named).items()}
     kept = {
         name: it.parent

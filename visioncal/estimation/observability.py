@@ -88,16 +88,7 @@ def check_observability(
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    scene = _scene(problem, mount)
-    check_determined(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
-    if looks and problem.effects:
-        cause, advice = _UNTOLD["instrument" if mount == "instrument" else "camera"]
-        _refuse_vague(
-            problem.with_effects(problem.effects[:1]),
-            State(state.edges, state.values[: len(problem.effects[0])]),
-            noise,
-            replace(scene, motion=lambda _: cause, advice=lambda *_: advice),
-        )
+    check_determined(problem, state, noise, _scene(problem, mount), looks=looks)
 
 
 @dataclass(frozen=True)
@@ -110,26 +101,44 @@ class Scene:
         motion: Says what is wrong with the motion, given the frame that it leaves open.
         advice: Says what to do, given that frame and what of it is not determined at all, in words;
             that may be nothing.
+        untold: What is wrong where the first effect is not determined, and what to do.
     """
 
     title: str
     names: Mapping[str, tuple[str, str]]
     motion: Callable[[str], str]
     advice: Callable[[str, str], str]
+    untold: tuple[str, str] = _UNTOLD["camera"]
 
 
-def check_determined(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
+def check_determined(
+    problem: Problem, state: State, noise: Noise, scene: Scene, *, looks: bool = False
+) -> None:
     """Refuses motion that leaves a direction of an unknown frame open.
 
     Args:
-        problem: The observations; effects that need not be determined are left out.
+        problem: The observations.
         state: The answer.
         noise: Of the residuals; see `check_observability`.
         scene: The words.
+        looks: Whether the first effect has to be determined, too.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
+    _refuse_open(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
+    if looks and problem.effects:
+        cause, advice = scene.untold
+        _refuse_vague(
+            problem.with_effects(problem.effects[:1]),
+            State(state.edges, state.values[: len(problem.effects[0])]),
+            noise,
+            replace(scene, motion=lambda _: cause, advice=lambda *_: advice),
+        )
+
+
+def _refuse_open(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
+    """Refuses frames that are not determined at all, or not well enough."""
     counted = problem.counted
     found = spectrum(fisher_information(problem, state, noise)[np.ix_(counted, counted)])
     if found.ratio < _NULL_RATIO:
@@ -202,7 +211,7 @@ def _scene(problem: Problem, mount: Mount) -> Scene:
             return f"Add views of {names[frame][0][4:]}, or take it out of the session."
         return f"{_or_measured(mount, open_part)}{_advice(mount)}"
 
-    return Scene(title(mount), names, motion, advice)
+    return Scene(title(mount), names, motion, advice, _UNTOLD[_sensor(mount)])
 
 
 def directions(
