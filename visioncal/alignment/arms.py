@@ -1,6 +1,6 @@
 """The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -9,50 +9,26 @@ from visioncal.estimation.arm import misfit_covariance
 from visioncal.estimation.misfit import inflation
 from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import Solution, held_shift
-from visioncal.session import View
-from visioncal.session.loads import loads_of
 from visioncal.stages import thermal
 from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.cell import Cell, robot_key
 from visioncal.stages.diagnose import Misfit, misfit_words
-from visioncal.stages.joints import Matched
 from visioncal.stages.kinematics import doubts, findings
 from visioncal.stages.reported import Reported
-from visioncal.stages.thermal import Heat
 from visioncal.types import FloatArray
 
 
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
     """Reads the arms of a cell, as they are stated."""
-    return {
-        robot_key(name): _arm(cell, name, it.matched)
-        for name, it in robots.items()
-        if robot_key(name) in cell.poses
-    }
-
-
-def _arm(cell: Cell, name: str, matched: Matched | None) -> RobotArm:
-    session, key = cell.session, robot_key(name)
-    rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
-    stamps = {it.station: it.view.stamp_s for it in session.observations}
-    reported = cell.poses[key]
-    stood = np.isfinite(reported[:, 0, 0])
-    views = [rows[it] for it in np.flatnonzero(stood).tolist()]
-    loads = loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views])
-    joints = None if matched is None else _joints(views, matched)
-    heat = None
-    if matched is not None and joints is not None:
-        at_s = [stamps[it] for it in np.flatnonzero(stood).tolist()]
-        told = np.array([it.number for it in views]), np.array(at_s, dtype=float)
-        heat = Heat(session, name, matched.robot.joint_count, *told)
-    return RobotArm(key, reported, stood, joints, loads, matched, heat)
-
-
-def _joints(views: Sequence[View], matched: Matched) -> FloatArray | None:
-    """(m, n) joints of some views; None where one has none that belong to the model."""
-    known = [matched.joints_rad.get(it.number) for it in views]
-    found = [it for it in known if it is not None]
-    return np.array(found) if found and len(found) == len(known) else None
+    found, session = {}, cell.session
+    for name, it in robots.items():
+        key = robot_key(name)
+        if key in cell.poses:
+            rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
+            stood = np.flatnonzero(np.isfinite(cell.poses[key][:, 0, 0])).tolist()
+            views = [rows[it] for it in stood]
+            found[key] = RobotArm.of(key, cell.poses[key], views, it.matched, (session, name))
+    return found
 
 
 def covariance_beside_noise(

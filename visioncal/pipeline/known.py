@@ -28,7 +28,6 @@ from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.readings import Readings
 from visioncal.stages.refine import Refined, remade
 from visioncal.stages.reported import Reported
-from visioncal.stages.thermal import Heat
 from visioncal.stages.validate import HeldOut
 from visioncal.types import Corners, FloatArray, IntArray, SolverName
 
@@ -152,24 +151,13 @@ class Known(Observed):
         """The robot's arm; its stops are all views with a pose, in their order."""
         if self.calibrated is not None:
             return self.calibrated
-        views, joints = tuple(self.base_from_flange), self.reported.joints_rad
-        stamps = {it.number: it.stamp_s for it in self.session.views}
-        return RobotArm(
+        rows = {it.number: it for it in self.session.views}
+        return RobotArm.of(
             ROBOT,
             np.array([*self.base_from_flange.values()]).reshape(-1, 4, 4),
-            np.ones(len(views), dtype=bool),
-            None if joints is None else np.array([joints[it] for it in views]),
-            self.loads(views),
+            [rows[it] for it in self.base_from_flange],
             self.reported.matched,
-            None
-            if self.robot is None
-            else Heat(
-                self.session,
-                next(iter(self.robots)),
-                self.robot.joint_count,
-                np.array(views, dtype=np.int64),
-                np.array([stamps[it] for it in views], dtype=float),
-            ),
+            (self.session, next(iter(self.robots), "")),
         )
 
     def arm_at(self, views: Sequence[int]) -> RobotArm:

@@ -19,6 +19,8 @@ from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Effect, Noise, Problem, State
 from visioncal.estimation.solve import Solution
 from visioncal.robot import Convention, Loads
+from visioncal.session import Session, View
+from visioncal.session.loads import loads_of
 from visioncal.stages import backlash, elastic, thermal
 from visioncal.stages.backlash import Play, plays_of
 from visioncal.stages.elastic import Elastic, springs_of
@@ -95,6 +97,41 @@ class RobotArm:
     errors: ArmErrors | None = None
     kinematics: Kinematics | None = None
     model: ArmModel | None = None
+
+    @classmethod
+    def of(
+        cls,
+        robot: str,
+        reported: FloatArray,
+        views: Sequence[View],
+        matched: Matched | None,
+        recorded: tuple[Session, str],
+    ) -> Self:
+        """Reads an arm, as it is stated.
+
+        Args:
+            robot: The robot, as the problem has it.
+            reported: (s, 4, 4) `base_from_flange`; not a number at stops at which it was not.
+            views: The rows that tell of it at the m stops at which it was.
+            matched: Its model, beside poses and joints; None where none is known.
+            recorded: The session, and the robot's name there.
+        """
+        joints = [] if matched is None else [matched.joints_rad.get(it.number) for it in views]
+        q = [it for it in joints if it is not None]
+        known, heat = 0 < len(q) == len(views), None
+        if known:
+            stamps_s = np.array([it.stamp_s for it in views], dtype=float)
+            numbers = np.array([it.number for it in views])
+            heat = Heat(*recorded, len(q[0]), numbers, stamps_s)
+        return cls(
+            robot,
+            reported,
+            np.isfinite(reported[:, 0, 0]),
+            np.array(q) if known else None,
+            loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views]),
+            matched,
+            heat,
+        )
 
     @property
     def is_modelled(self) -> bool:
