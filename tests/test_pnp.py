@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from visioncal.estimation.chain import chain
 from visioncal.simulation import (
     CellOptions,
     checkerboard_target,
@@ -13,7 +14,8 @@ from visioncal.simulation import (
     wide_camera,
 )
 from visioncal.solvers import SOLVERS
-from visioncal.stages.choose import choose_poses, chosen
+from visioncal.stages.choose import chosen
+from visioncal.stages.place import place
 from visioncal.stages.pnp import estimate_poses
 from visioncal.targets import corner_positions, rotations
 from visioncal.transforms import exp, invert, log
@@ -28,6 +30,13 @@ def corners_of(cell):
 
 def poses_of(cell, corners=None):
     return estimate_poses(corners or corners_of(cell), [cell.options.target], cell.options.camera)
+
+
+def chosen_of(result, cell):
+    """The views with the one pose that the robot's motion leaves to each."""
+    first = np.array([it.cam_from_target[0] for it in result.views])
+    problem = chain("eye-in-hand", cell.base_from_flange, first)
+    return place(problem, result.views, {"target": cell.options.target})
 
 
 def test_poses_follow_their_stated_covariance():
@@ -59,7 +68,7 @@ def test_both_planar_solutions_are_kept_while_ambiguous():
     result = poses_of(cell)
     rivals = [view for view in result.views if len(view.cam_from_target) == 2]
     assert len(rivals) >= 3
-    choice = choose_poses(result.views, cell.base_from_flange, cell.options.target)
+    choice = chosen_of(result, cell)
     wrong_by_image = 0
     for view in choice.views:
         candidates = result.views[view.view].cam_from_target
@@ -104,7 +113,7 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
         order = np.argsort(ids)
         corners[it.view] = Corners(it.view, ids[order], it.px[order], it.blur_px)
     result = poses_of(cell, corners)
-    choice = choose_poses(result.views, cell.base_from_flange, target)
+    choice = chosen_of(result, cell)
     assert not choice.rejections
     camera = np.array([view.cam_from_target[0] for view in choice.views])
     answer = SOLVERS["park"](cell.base_from_flange, camera)
@@ -137,7 +146,7 @@ def test_corners_of_a_turned_board_behind_another_stay_among_its_own():
 def test_a_turn_of_all_views_alike_is_only_a_change_of_the_targets_frame():
     target = replace(checkerboard_target(), name="symmetric", columns=9, rows=7)
     cell = simulate(CellOptions(views=8, seed=9, target=target, pixel_sigma_px=0.1))
-    choice = choose_poses(poses_of(cell).views, cell.base_from_flange, target)
+    choice = chosen_of(poses_of(cell), cell)
     assert len({view.turns for view in choice.views}) == 1
 
 

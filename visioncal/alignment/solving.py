@@ -15,20 +15,16 @@ from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.stages.cell import Cell
-from visioncal.stages.choose import chosen
 from visioncal.stages.clocks import clock_effects
 from visioncal.stages.found import found_of_looks
 from visioncal.stages.observed import Observed
-from visioncal.stages.pairwise import Candidates
+from visioncal.stages.place import place
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.priors import most_contradicted
 from visioncal.stages.refine import refined
 from visioncal.stages.side import FramesSide
-from visioncal.stages.sighted import Sighted
-from visioncal.stages.tie import pick, tie
 from visioncal.stages.validate import chain_rms_px
-from visioncal.targets import rotation_transforms
-from visioncal.types import FloatArray, IntArray, Mask, Target
+from visioncal.types import FloatArray, IntArray, Target
 
 # Arms are linearised anew so often, or until their errors move by less, which is far below any
 # arm's repeatability.
@@ -324,49 +320,22 @@ def _started(
     cell: Cell, views: Sequence[ViewPoses]
 ) -> tuple[Cell, list[ViewPoses], Problem, State, tuple[str, ...]]:
     """Finds a start, and gives each view its one pose by it."""
-    targets = targets_of(cell)
-    tied = tie(cell.tree, cell.poses, _sighted(cell, views, targets), cell.priors)
+    placed = place(problem_of(cell, views), views, targets_of(cell))
+    tied, clear = placed.tied, {it.view: it for it in placed.views}
     if tied.untied:
         untied_robots(cell, tied.untied, seen=True)
-        kept = _without_frames(cell, tied.untied)
-        rows = {it.view for it in kept.rows}
-        cell, views = kept, [it for it in views if it.view in rows]
+        cell = _without_frames(cell, tied.untied)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
-    edges = np.array([tied.edges[it] for it in cell.tree.unknown]).reshape(-1, 4, 4)
-    state = State(edges, np.zeros(0))
-    rough = problem_of(cell, [chosen(it, 0, None) for it in views])
-    picks = pick(rough.predicted(state), _sighted(cell, views, targets))
-    views = [
-        chosen(view, at, targets.get(row.seen))
-        for view, at, row in zip(views, picks.tolist(), cell.rows, strict=True)
-    ]
-    return cell, views, problem_of(cell, views), state, tied.untied
+    cell, lost = _tied_part(cell.without({it.view: it.reason for it in placed.rejections}))
+    views = [clear[it.view] for it in cell.rows]
+    problem = problem_of(cell, views)
+    return cell, views, problem, problem.start(tied.edges), (*tied.untied, *lost)
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:
     """The printed targets by their frames."""
     return {f"target_{name}" if name else "target": it for name, it in cell.session.plates.items()}
-
-
-def _sighted(cell: Cell, views: Sequence[ViewPoses], targets: Mapping[str, Target]) -> Sighted:
-    return Sighted(
-        tuple(it.seer for it in cell.rows),
-        tuple(it.seen for it in cell.rows),
-        np.array([it.station for it in cell.rows]),
-        Candidates.of(views),
-        {
-            frame: turned
-            for frame, it in targets.items()
-            if len(turned := rotation_transforms(it)) > 1
-        },
-        _places(cell),
-    )
-
-
-def _places(cell: Cell) -> Mask:
-    """(n,) whether each observation tells a place alone."""
-    return np.array([it.is_place for it in cell.rows], dtype=bool)
 
 
 def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
@@ -377,7 +346,8 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
         levels[row.seer] if is_sensed(row.seer, view) else -1
         for row, view in zip(cell.rows, views, strict=True)
     ]
-    spread, places = np.array([it.covariance[0] for it in views]), _places(cell)
+    spread = np.array([it.covariance[0] for it in views])
+    places = np.array([it.is_place for it in cell.rows], dtype=bool)
     spread[given] = _NOMINAL
     turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
     return Problem(

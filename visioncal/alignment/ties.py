@@ -43,9 +43,7 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
             f"the observations that link {robots} to the rest of the cell are too few, too much "
             f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(told)}"
         )
-        parts = [
-            part for it in bases if (part := _open_part(cell, it, it if it in lost else untied[0]))
-        ]
+        parts = [part for it in bases if it in lost and (part := _open_part(cell, it))]
         if parts:
             why += f", which does not determine {' and '.join(parts)}"
             words = [
@@ -60,15 +58,12 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     )
 
 
-def _open_part(cell: Cell, base: str, frame: str) -> str:
-    """What of a frame the motion of the robot on a base leaves open, where it turns too little."""
-    stations, robot = _stations(cell, base), _robot_on(cell, base)
+def _open_part(cell: Cell, base: str) -> str:
+    """What the motion of the robot on a base leaves open, where it turns about one axis alone."""
+    stations = _stations(cell, base)
     if len(stations) < 2:
         return ""
-    poses, body = cell.poses[robot][stations], cell.tree.body(frame)
-    if body == cell.tree.root:
-        return open_offset(invert(poses), frame, base)
-    return open_offset(poses, frame, body)
+    return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
 
 
 def _robot_on(cell: Cell, base: str) -> str:

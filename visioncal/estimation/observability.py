@@ -22,8 +22,6 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # A direction this close to an axis is called by the axis.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
-# Poses that turn by less than this differ in position only [deg].
-_NO_TURN_DEG = 0.5
 _PAIRED = 300
 # What is wrong where unknowns that all views share are not told, and what to do.
 _UNTOLD = {
@@ -372,17 +370,14 @@ def _lone_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:
 
 
 def open_offset(robot: FloatArray, thing: str, frame: str) -> str:
-    """What a robot that turns about one axis or none leaves open, in words; else empty.
+    """What the turns of a robot about one axis leave open, in words; empty where there are more.
 
     Args:
         robot: (m, 4, 4) the robot's part of a chain, by whose differences it turns.
         thing: What hangs by it.
         frame: In which frame the robot's part turns, in words.
     """
-    turns = _turns(robot)
-    if np.rad2deg(np.linalg.norm(turns, axis=1).max()) < _NO_TURN_DEG:
-        return f"{thing}'s offset from {frame}"
-    main, _, is_lone = _lone_axis(turns)
+    main, _, is_lone = _lone_axis(_turns(robot))
     return _words(thing, frame, main, is_rotation=False) if is_lone else ""
 
 
@@ -398,9 +393,9 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
     turns = _turns(robot)
     largest = np.rad2deg(np.linalg.norm(turns, axis=1).max())
     spread_mm = 1e3 * np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0))
-    if largest < _NO_TURN_DEG and spread_mm < 1.0:
+    if largest < 0.5 and spread_mm < 1.0:
         return f"the {stops} are all from one pose of the robot"
-    if largest < _NO_TURN_DEG:
+    if largest < 0.5:
         return (
             f"the {stops} differ in position only (largest rotation between two of "
             f"them: {largest:.1g} deg)"

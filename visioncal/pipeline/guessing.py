@@ -9,16 +9,16 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.conventions import PoseNumbers, Reading
 from visioncal.errors import VisioncalError
-from visioncal.estimation.chain import robot_part
+from visioncal.estimation.chain import chain
 from visioncal.guess import Guess, guess_reading
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
-from visioncal.stages.choose import choose_poses
 from visioncal.stages.clocks import waits_for_clock
 from visioncal.stages.judge import is_scattered
+from visioncal.stages.place import place
 from visioncal.types import FloatArray, Progress
 
 # What the camera's poses need; the robot has no part in it, so that it can be wrong.
@@ -188,12 +188,15 @@ def _chosen(seen: Known, robot: PoseNumbers) -> Known:
         zip((it.number for it in seen.session.views), robot.poses(), strict=True)
     )
     both = [it for it in seen.poses.values() if np.isfinite(base_from_flange[it.view]).all()]
-    part = robot_part(
-        np.array([base_from_flange[it.view] for it in both]).reshape(-1, 4, 4), seen.session.mount
+    problem = chain(
+        seen.session.mount,
+        np.array([base_from_flange[it.view] for it in both]).reshape(-1, 4, 4),
+        np.array([it.cam_from_target[0] for it in both]).reshape(-1, 4, 4),
     )
-    # Nothing asks for the corners any more, so that no target is needed to renumber them.
-    choice = choose_poses(both, part, None)
-    return replace(seen, poses={it.view: it for it in choice.views})
+    boards = [*seen.session.boards.values()]
+    targets = {it: boards[both[0].board] for it in problem.observations.observed if boards}
+    found = place(problem, both, targets)
+    return replace(seen, poses={it.view: it for it in found.views})
 
 
 def _camera_numbers(seen: Known) -> PoseNumbers:

@@ -4,14 +4,14 @@ A stage is one file in `visioncal.stages`. Its adapter here hands it what it nee
 and adds what it gives.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.chain import robot_part
-from visioncal.estimation.observability import directions, refuse_too_few
+from visioncal.estimation.observability import FEWEST_VIEWS, directions, refuse_too_few
 from visioncal.estimation.problem import ROBOT, Problem, State
 from visioncal.estimation.solve import fit_problem
 from visioncal.pipeline.known import Known, rms_of
@@ -34,7 +34,7 @@ from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked, doubts, findings
 from visioncal.stages.loads import check_stops
 from visioncal.stages.observed import all_held_back, nothing_seen
-from visioncal.stages.place import lay_out
+from visioncal.stages.place import place
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.priors import most_contradicted, prior_words
 from visioncal.stages.readings import mounted, read_instrument
@@ -141,25 +141,43 @@ def _choose(known: Known) -> Known:
         and view.number in known.base_from_flange
         and view.number not in known.held_back
     ]
-    layout = lay_out(
-        [known.poses[view] for view in views],
-        robot_part(known.flange_poses(views), known.session.mount),
-        known.session.boards,
-    )
-    choice = layout.choice
-    known = replace(known, boards=layout.boards)
-    if layout.edges is not None:
-        known = replace(known, frames=known.framed(layout.edges))
-    poses = {**known.poses, **{view.view: view for view in choice.views}}
-    used = tuple(view.view for view in choice.views)
-    # A view whose image failed may still be used by the pose that the session gives.
-    reasons = {view: reason for view, reason in known.reasons.items() if view not in used}
-    known = replace(known, poses=poses, used=used, reasons=reasons).noting(choice.rejections)
+    known = _placed(known, views)
     names = tuple(known.session.boards) if known.session.targets else ()
     unseen = [name for at, name in enumerate(names) if at not in known.boards]
     return known.noting(
         (), [f"No usable view shows target {name}: it has no place." for name in unseen]
     )
+
+
+def _placed(known: Known, views: Sequence[int]) -> Known:
+    """Leaves one pose to each of some views, and finds where boards are, if there are several."""
+    shown = [known.poses[view].board for view in views]
+    counts = sorted((-shown.count(it), it) for it in set(shown)) or [(0, 0)]
+    known, names = replace(known, boards=tuple(it for _, it in counts)), [*known.session.boards]
+    several = len(counts) > 1
+    if several and -counts[0][0] < FEWEST_VIEWS:
+        told = ", ".join(f"{names[it]} in {-count}" for count, it in counts)
+        raise DegenerateError(
+            f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
+            f"begin with; here {told}.",
+            culprits=[f"target {names[it]}" for _, it in counts],
+            next_step="Add views of one of them, tilted about different axes.",
+        )
+    poses = [known.poses[view] for view in views]
+    targets = {known.frame_of(at): it for at, it in enumerate(known.session.boards.values())}
+    if several or any(len(it.cam_from_target) > 1 for it in poses):
+        placed = place(known.problem(views), poses, targets)
+        poses = [*placed.views]
+        known = known.noting(placed.rejections)
+        boards = {it.board for it in poses}
+        known = replace(known, boards=tuple(it for it in known.boards if it in boards))
+        if several:
+            frames = (known.camera_frame, *map(known.frame_of, known.boards))
+            known = replace(known, frames={it: placed.tied.edges[it] for it in frames})
+    used = tuple(it.view for it in poses)
+    # A view whose image failed may still be used by the pose that the session gives.
+    reasons = {view: reason for view, reason in known.reasons.items() if view not in used}
+    return replace(known.posed(poses), used=used, reasons=reasons)
 
 
 def _look(known: Known) -> Known:

@@ -1,111 +1,140 @@
-"""Which pose each view allows and where its board is, with several boards.
+"""Where all frames are to begin with, and by which of its poses each view goes.
 
-The board with the most views comes first: its views alone say where the camera is. What every other
-board's views say of that board's place is then compared, candidate by candidate, and the place on
-which the better half agrees is taken (Rousseeuw 1984: the least trimmed sum of distances).
+The mirrored solutions of a planar target, and the turns of a board with a rotational symmetry, look
+alike in one image; the robots' motion tells them apart.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.observability import FEWEST_VIEWS
-from visioncal.stages.choose import Choice, choose_by, choose_poses, has_rival
-from visioncal.stages.pairwise import Candidates, consensus, trimmed
+from visioncal.estimation.problem import Problem
+from visioncal.stages.choose import chosen, has_rival, settled
+from visioncal.stages.pairwise import FEWEST, Candidates
 from visioncal.stages.pnp import ViewPoses
+from visioncal.stages.sighted import Sighted
+from visioncal.stages.tie import Tied, tie
+from visioncal.targets import rotation_transforms
 from visioncal.transforms import invert
-from visioncal.types import FloatArray, Mask, Rejection, Target
+from visioncal.types import FloatArray, IntArray, Mask, Rejection, Target
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """The views with one pose each, and where their boards are.
+class Placed:
+    """A start.
 
     Attributes:
-        choice: The views, and those that stay ambiguous.
-        boards: Places of the boards that were seen among the session's, the one with the most views
-            first.
-        edges: (1 + b, 4, 4) the camera's and the boards' in that order, to begin with; None for one
-            board, whose views say it by themselves.
+        tied: Where the frames are.
+        views: The views that are clear, with one pose each; where a turned pose was chosen, the
+            corners are renumbered to match.
+        rejections: The others.
     """
 
-    choice: Choice
-    boards: tuple[int, ...]
-    edges: FloatArray | None = None
+    tied: Tied
+    views: tuple[ViewPoses, ...]
+    rejections: tuple[Rejection, ...]
 
 
-def lay_out(
-    views: Sequence[ViewPoses],
-    robot: FloatArray,
-    targets: Mapping[str, Target],
-) -> Layout:
-    """Chooses each view's pose, and finds where the boards are.
+def place(problem: Problem, views: Sequence[ViewPoses], targets: Mapping[str, Target]) -> Placed:
+    """Finds where the frames are, and which pose of each view goes with that.
 
     Args:
+        problem: What the views measured, one observation a view, each by any of its poses.
         views: The views with their candidates.
-        robot: (m, 4, 4) the robot's part of the chain, one a view.
-        targets: The session's targets by name.
+        targets: The printed targets by their frames.
 
     Raises:
-        DegenerateError: The motion leaves most views ambiguous, or no board has enough views to
-            begin with.
+        DegenerateError: The motion leaves most views ambiguous.
     """
-    shown = np.array([it.board for it in views], dtype=np.int64)
-    boards = sorted(set(shown.tolist()), key=lambda it: (-int(np.sum(shown == it)), it))
-    stated: list[Target | None] = [*targets.values()] or [None]
-    parts = {it: [view for view in views if view.board == it] for it in boards}
-    if len(boards) < 2:
-        board = boards[0] if boards else 0
-        choice = choose_poses(views, robot, stated[board])
-        return Layout(choice, (board,))
-    first = boards[0]
-    if len(parts[first]) < FEWEST_VIEWS:
-        raise _too_few(parts, tuple(targets))
-    choice = choose_poses(parts[first], robot[shown == first], stated[first])
-    views_of = [it.view for it in parts[first]]
-    rows = [views_of.index(it.view) for it in choice.views]
-    _, found = trimmed(robot[shown == first][rows], Candidates.of(choice.views))
-    typical = float(np.median(found.away.min(axis=1)))
-    chosen, rejections, placed = [*choice.views], [*choice.rejections], [found.z]
-    for board in boards[1:]:
-        part, mine = parts[board], robot[shown == board]
-        z, clear = _place_of(part, mine, found.x, typical)
-        for view, predicted, it in zip(part, invert(mine @ found.x) @ z, clear, strict=True):
-            if it:
-                chosen.append(choose_by(view, predicted, stated[board]))
-            else:
-                why = "ambiguous: two poses of the target fit image and motion alike"
-                rejections.append(Rejection(view.view, why))
-        placed.append(z)
-    order = {view.view: at for at, view in enumerate(views)}
-    chosen.sort(key=lambda it: order[it.view])
-    kept = [at for at, it in enumerate(boards) if any(view.board == it for view in chosen)]
-    return Layout(
-        Choice(tuple(chosen), tuple(rejections)),
-        tuple(boards[at] for at in kept),
-        np.array([found.x, *(placed[at] for at in kept)]),
+    seen, candidates = problem.observations, Candidates.of(views)
+    turned = {
+        frame: turns for frame, it in targets.items() if len(turns := rotation_transforms(it)) > 1
+    }
+    sighted = Sighted(
+        seen.observers,
+        seen.observed,
+        seen.stops,
+        candidates,
+        turned,
+        ~seen.has_rotation,
+    )
+    tied = tie(problem.tree, problem.poses, sighted, problem.priors)
+    away = _distances(problem, candidates, tied)
+    unclear = _unclear(problem, candidates, tied, away)
+    tied, picks = _numbered_as_first(problem, tied, away.argmin(axis=1), turned)
+    if unclear.sum() > len(views) / 2:
+        raise DegenerateError(
+            f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
+            "robot's motion cannot tell apart.",
+            culprits=[f"view {view.view}" for view, it in zip(views, unclear, strict=True) if it],
+            next_step="Add views tilted about different axes, or use a board without symmetry "
+            "(ChArUco, or an odd sum of columns and rows).",
+        )
+    rows = list(zip(views, picks.tolist(), unclear.tolist(), seen.observed, strict=True))
+    return Placed(
+        tied,
+        tuple(chosen(view, pick, targets.get(frame)) for view, pick, it, frame in rows if not it),
+        tuple(
+            Rejection(view.view, "ambiguous: two poses of the target fit image and motion alike")
+            for view, _, it, _ in rows
+            if it
+        ),
     )
 
 
-def _too_few(parts: Mapping[int, Sequence[ViewPoses]], names: Sequence[str]) -> DegenerateError:
-    counts = ", ".join(f"{names[board]} in {len(part)}" for board, part in parts.items())
-    return DegenerateError(
-        f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
-        f"begin with; here {counts}.",
-        culprits=[f"target {names[board]}" for board in parts],
-        next_step="Add views of one of them, tilted about different axes.",
-    )
+def _distances(problem: Problem, candidates: Candidates, tied: Tied) -> FloatArray:
+    """(n, k) how far the views' candidates are from what the start predicts [m].
+
+    Of views of frames that are not tied, they say nothing.
+    """
+    frames = {it: tied.edges.get(it, np.eye(4)) for it in problem.unknown}
+    away = candidates.distances(problem.predicted(problem.start(frames)))
+    for group in problem.groups:
+        rows, robots = group.rows, [it for it in group.path if it.robot]
+        if not candidates.valid[rows, 1:].any():
+            continue
+        if len(robots) == 1 and max(FEWEST, len(away) / 2) <= len(rows):
+            # What most views say by themselves is nearer than what the earliest say.
+            robot = problem.poses[robots[0].robot][problem.observations.stops[rows]]
+            robot = robot if robots[0].is_up else invert(robot)
+            away[rows] = settled(robot, candidates.take(rows), away[rows].argmin(axis=1))
+    return away
 
 
-def _place_of(
-    views: Sequence[ViewPoses], robot: FloatArray, x: FloatArray, typical: float
-) -> tuple[FloatArray, Mask]:
-    """Where a board is, (4, 4), and for which of its views the pose is clear."""
-    candidates = Candidates.of(views).carried(robot @ x, np.eye(4)[None])
-    z, away, _ = consensus(candidates)
-    if len(views) == 1:
-        # It has nothing that speaks for one of its poses.
-        return z, np.array([np.sum(candidates.valid & (candidates.turns == 0)) == 1])
-    return z, ~has_rival(candidates.distances(z[None]), max(away, typical))
+def _unclear(problem: Problem, candidates: Candidates, tied: Tied, away: FloatArray) -> Mask:
+    """(n,) for which views another pose is as likely as the nearest."""
+    seen, unclear = problem.observations, np.zeros(len(away), dtype=bool)
+    least = away.min(axis=1)
+    for group in problem.groups:
+        if not any(step.frame in tied.untied for step in group.path):
+            typical = max(float(np.median(least[group.rows])), float(np.median(least)))
+            unclear[group.rows] = has_rival(away[group.rows], typical)
+    poses = (candidates.valid & (candidates.turns == 0)).sum(axis=1)
+    for frame in tied.edges.keys() - _measured(problem):
+        rows = seen.involves(frame)
+        # Nothing else speaks for one of the poses of the only view.
+        unclear |= rows & (rows.sum() == 1) & (poses > 1)
+    return unclear
+
+
+def _numbered_as_first(
+    problem: Problem, tied: Tied, picks: IntArray, turned: Mapping[str, FloatArray]
+) -> tuple[Tied, IntArray]:
+    """Turns boards that look the same turned so that their first views keep their numbering.
+
+    Those stay that were measured to be somewhere.
+    """
+    edges, picks = dict(tied.edges), picks.copy()
+    for frame in edges.keys() & turned.keys() - _measured(problem):
+        rows, turns = problem.observations.involves(frame), turned[frame]
+        # A target's turns are powers of the first, and candidates come in blocks of all turns.
+        planar, turn = np.divmod(picks[rows], len(turns))
+        picks[rows] = planar * len(turns) + (turn - turn[0]) % len(turns)
+        edges[frame] = edges[frame] @ invert(turns[turn[0]])
+    return replace(tied, edges=edges), picks
+
+
+def _measured(problem: Problem) -> set[str]:
+    return {it for prior in problem.priors for it in (prior.first, prior.second)}

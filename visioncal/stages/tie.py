@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.estimation.problem import FramePrior
-from visioncal.estimation.tree import Step, Tree
+from visioncal.estimation.tree import Tree
 from visioncal.stages.grow import grow
-from visioncal.stages.pairwise import FEWEST, consensus, hand_eye
+from visioncal.stages.pairwise import FEWEST, Candidates, consensus, hand_eye, trimmed
 from visioncal.stages.placing import mounted_points
 from visioncal.stages.sighted import Growth, Pair, Relation, Sighted
 from visioncal.transforms import invert
@@ -61,22 +61,16 @@ def tie(
     for pair in growth.oriented:
         relations += _solved(tree, poses, sighted, pair)
     placed, ambiguous = grow(replace(growth, relations=relations))
+    if not placed.keys() & {*tree.unknown}:
+        # What the motion leaves open is for those to say who know how far it does.
+        relations += _loose(growth)
+        placed, ambiguous = grow(replace(growth, relations=relations))
     edges = {
         name: invert(placed[tree.branches[name].parent]) @ placed[name]
         for name in tree.unknown
         if name in placed and tree.branches[name].parent in placed
     }
     return Tied(edges, tuple(it for it in tree.unknown if it not in edges), ambiguous)
-
-
-def pick(predicted: FloatArray, sighted: Sighted) -> IntArray:
-    """Picks of each observation the candidate (n,) that is nearest to what is predicted.
-
-    Args:
-        predicted: (n, 4, 4) `seer_from_seen`.
-        sighted: What may have been seen.
-    """
-    return np.asarray(sighted.candidates.distances(predicted).argmin(axis=1))
 
 
 def _pairs(tree: Tree, sighted: Sighted) -> tuple[Pair, ...]:
@@ -96,33 +90,54 @@ def _solved(
     tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted, pair: Pair
 ) -> Iterator[Relation]:
     """What one pair says by itself."""
-    rows, turns = sighted.early(pair.rows), sighted.turns_of(pair.seen)
+    rows = sighted.early(pair.rows)
     if not pair.robots:
         matrix, _, sigma_m = consensus(sighted.candidates.take(rows))
-        yield Relation(pair.seer, pair.seen, matrix, sigma_m, turns)
+        yield Relation(pair.seer, pair.seen, matrix, sigma_m, sighted.turns_of(pair.seen))
+    if len(pair.robots) != 1:
         return
-    if len(pair.robots) > 1:
-        return
-    (step,) = pair.robots
-    flange, base = step.frame, tree.branches[step.frame].parent
-    near, far = (flange, base) if step.is_up else (base, flange)
     # Where the earliest views do not agree by half, perhaps all do.
     for mine in (rows, pair.rows) if len(rows) < len(pair.rows) else (rows,):
-        found = _parted(poses, sighted, step, mine)
+        if len(mine) < FEWEST:
+            continue
+        found = hand_eye(*_parted(poses, sighted, pair, mine), _mount(pair))
         if found is not None:
-            (x, z), (sigma_x, sigma_z) = found
-            yield Relation(near, pair.seer, x, sigma_x, np.eye(4)[None])
-            yield Relation(far, pair.seen, z, sigma_z, turns)
+            yield from _both(tree, sighted, pair, *found)
             return
 
 
+def _loose(growth: Growth) -> Iterator[Relation]:
+    """What the pair with the most views says, however little that is."""
+    pairs = [it for it in growth.oriented if len(it.robots) == 1 and len(it.rows) >= FEWEST]
+    if pairs:
+        pair = max(pairs, key=lambda it: len(it.rows))
+        found = trimmed(*_parted(growth.poses, growth.sighted, pair, pair.rows))[1]
+        yield from _both(growth.tree, growth.sighted, pair, (found.x, found.z), (np.inf, np.inf))
+
+
+def _both(
+    tree: Tree,
+    sighted: Sighted,
+    pair: Pair,
+    edges: tuple[FloatArray, FloatArray],
+    sigmas_m: tuple[float, float],
+) -> Iterator[Relation]:
+    """The transforms on both sides of the robot that parts a pair."""
+    (step,) = pair.robots
+    flange, base = step.frame, tree.branches[step.frame].parent
+    near, far = (flange, base) if step.is_up else (base, flange)
+    yield Relation(near, pair.seer, edges[0], sigmas_m[0], np.eye(4)[None])
+    yield Relation(far, pair.seen, edges[1], sigmas_m[1], sighted.turns_of(pair.seen))
+
+
 def _parted(
-    poses: Mapping[str, FloatArray], sighted: Sighted, step: Step, rows: IntArray
-) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]] | None:
-    """Both transforms beside a robot, by some views, and what each is known to [m]."""
-    if len(rows) < FEWEST:
-        return None
+    poses: Mapping[str, FloatArray], sighted: Sighted, pair: Pair, rows: IntArray
+) -> tuple[FloatArray, Candidates]:
+    """The robot's part of the chain (m, 4, 4) in some views of a pair, and what these allow."""
+    (step,) = pair.robots
     robot = poses[step.robot][sighted.stops[rows]]
-    mount: Mount = "eye-in-hand" if step.is_up else "eye-to-hand"
-    robot = robot if step.is_up else invert(robot)
-    return hand_eye(robot, sighted.candidates.take(rows), mount)
+    return robot if step.is_up else invert(robot), sighted.candidates.take(rows)
+
+
+def _mount(pair: Pair) -> Mount:
+    return "eye-in-hand" if pair.robots[0].is_up else "eye-to-hand"
