@@ -15,6 +15,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 from visioncal.estimation.variance import LEAST_SIGMA
 from visioncal.figures import figure
+from visioncal.stages.choose import CLEAR_RATIO
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log, rotation_angle
 from visioncal.types import FloatArray, IntArray, Mask, Mount, Rejection
@@ -154,8 +155,9 @@ def other_stops(
         squares = np.minimum(
             *(_squares_by_stop(problem, fit, at, moves, starts) for starts in (late, early))
         )
-        squares[seen.stops[at]] = np.inf
-        near = np.flatnonzero(squares < _NEAR * chi2_limit(_CHANCE, 6))
+        # Stops in one posture are no others: what fits one of them fits its own as well, or nearly.
+        limit = min(_NEAR * chi2_limit(_CHANCE, 6), squares[seen.stops[at]] / CLEAR_RATIO**2)
+        near = np.flatnonzero(squares < limit)
         if len(near):
             found[at] = near[np.argsort(squares[near])].tolist()
     return found
