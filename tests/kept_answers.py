@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from cells import calibrated
 
-from visioncal.alignment import align, calibrate
 from visioncal.errors import VisioncalError
+from visioncal.pipeline import align, calibrate
 from visioncal.pipeline.result import result_of
 from visioncal.session import Session
 from visioncal.simulation import (

@@ -8,10 +8,10 @@ import pytest
 from cells import calibrated, session_of
 from commands import visioncal
 
-from visioncal.alignment import align, calibrate
 from visioncal.calibration import Alignment, Calibration, to_document
 from visioncal.errors import DataError, DegenerateError
 from visioncal.exports import Selection, document
+from visioncal.pipeline import align, calibrate
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE

@@ -47,7 +47,7 @@ LAYERS = (
     ("planning", "report", "viewer", "drivers"),
     ("capture",),
     ("rehearsal",),
-    ("verification", "alignment"),
+    ("verification",),
     ("outputs",),
     ("stored", "formats", "exports"),
     ("joining",),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from swept_cells import AHEAD_S, cell_of, swept_session
 
-from visioncal.alignment import align
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
+from visioncal.pipeline import align
 from visioncal.simulation.layout import NetworkOptions
 from visioncal.transforms import invert, log
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.alignment import align
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
+from visioncal.pipeline import align
 from visioncal.simulation.layout import CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.network import Network, simulate_network
 from visioncal.simulation.network_records import network_session

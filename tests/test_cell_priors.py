@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from visioncal.alignment import align
 from visioncal.errors import DataError
+from visioncal.pipeline import align
 from visioncal.simulation.layout import CameraAt, NetworkOptions
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session

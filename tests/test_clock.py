@@ -8,9 +8,8 @@ import pytest
 from cells import calibrated_sweep
 from scipy.spatial.transform import Rotation
 
-from visioncal.alignment import calibrate
 from visioncal.errors import DataError, DegenerateError
-from visioncal.pipeline import STAGES
+from visioncal.pipeline import STAGES, calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.result import result_of
 from visioncal.recording import write_recording

@@ -10,10 +10,10 @@ import pytest
 from samples import made_up
 from typer.testing import CliRunner
 
-from visioncal.alignment import calibrate
 from visioncal.cli.app import app
 from visioncal.errors import DataError
 from visioncal.formats import convert
+from visioncal.pipeline import calibrate
 from visioncal.recording import RecordingWriter
 from visioncal.session import Session
 

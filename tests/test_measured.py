@@ -7,9 +7,9 @@ import pytest
 from cells import calibrated, error_of, known_of
 from scipy.spatial.transform import Rotation
 
-from visioncal.alignment import calibrate
 from visioncal.calibration import Calibration
 from visioncal.errors import DegenerateError
+from visioncal.pipeline import calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.information import worlds_of

@@ -7,7 +7,6 @@ import pytest
 from cells import calibrated_sweep
 from swept_cells import HOW, cell_of, swept_session
 
-from visioncal.alignment import align, calibrate
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.effects import EFFECTS
 from visioncal.estimation.effects.delays import (
@@ -15,6 +14,7 @@ from visioncal.estimation.effects.delays import (
     shares_of,
     target_twists,
 )
+from visioncal.pipeline import align, calibrate
 from visioncal.pipeline.known import Known
 from visioncal.recording import write_recording
 from visioncal.report.content import method_facts

@@ -13,10 +13,10 @@ from scipy.integrate import solve_ivp
 from warmed import CELL, drift_of, warmed
 
 from visioncal import Session
-from visioncal.alignment import calibrate
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError, DegenerateError
 from visioncal.exports import document
+from visioncal.pipeline import calibrate
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.recording import paths, write_recording

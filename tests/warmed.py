@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.alignment import calibrate
 from visioncal.calibration import Calibration
 from visioncal.estimation.workspace import postures
+from visioncal.pipeline import calibrate
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, WarmUp, WarmUpOptions, simulate_warm_up

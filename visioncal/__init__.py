@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from visioncal.version import __version__
 
 if TYPE_CHECKING:
-    from visioncal.alignment import align, calibrate
     from visioncal.calibration import Alignment, Calibration
     from visioncal.compensation import CalibratedArm, Corrected, correct
     from visioncal.errors import (
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from visioncal.frames.seen import place_seen
     from visioncal.frames.seen_frame import seen_frame
     from visioncal.frames.sight import Sight
+    from visioncal.pipeline import align, calibrate
     from visioncal.robot import Loads
     from visioncal.session import Session
     from visioncal.thermal import OnlineCompensator
@@ -55,8 +55,8 @@ _HOMES = {
     "Session": "visioncal.session",
     "Sight": "visioncal.frames.sight",
     "VisioncalError": "visioncal.errors",
-    "align": "visioncal.alignment",
-    "calibrate": "visioncal.alignment",
+    "align": "visioncal.pipeline",
+    "calibrate": "visioncal.pipeline",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.picks",

@@ -14,8 +14,8 @@ from multiprocessing import Pool
 import numpy as np
 from results import first, wished, write_section
 
-from visioncal.alignment import calibrate
 from visioncal.errors import VisioncalError
+from visioncal.pipeline import calibrate
 from visioncal.simulation import CellOptions, SweepOptions, sweep, sweep_session
 from visioncal.transforms import invert, log
 

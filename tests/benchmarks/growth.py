@@ -18,7 +18,7 @@ import numpy as np
 from cells import known_of
 from results import write_section
 
-from visioncal.alignment import align
+from visioncal.pipeline import align
 from visioncal.pipeline.steps import STAGES
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions

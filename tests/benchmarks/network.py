@@ -15,8 +15,8 @@ import numpy as np
 from networkbound import network_bound
 from results import few, wished, write_section
 
-from visioncal.alignment import align
 from visioncal.calibration import Alignment
+from visioncal.pipeline import align
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.network import Network, simulate_network
 from visioncal.simulation.network_records import network_session

@@ -17,8 +17,8 @@ from multiprocessing import Pool
 import numpy as np
 from results import wished, write_section
 
-from visioncal.alignment import align
 from visioncal.calibration import Alignment
+from visioncal.pipeline import align
 from visioncal.session import Session
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network

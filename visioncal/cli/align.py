@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.alignment import align
 from visioncal.calibration import Alignment
 from visioncal.cli.console import (
     messages,
@@ -19,6 +18,7 @@ from visioncal.cli.console import (
 from visioncal.figures import figure
 from visioncal.joining import leftover
 from visioncal.outputs import write_alignment
+from visioncal.pipeline import align
 from visioncal.robot import Convention
 from visioncal.session import Session
 

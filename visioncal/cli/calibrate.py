@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.alignment import check_whole
 from visioncal.calibration import to_document
 from visioncal.calibration.whole import whole_document
 from visioncal.cli.align import align_into
@@ -15,7 +14,7 @@ from visioncal.cli.console import messages, print_summary, shown_progress, tell_
 from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
-from visioncal.pipeline import run
+from visioncal.pipeline import check_whole, run
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell

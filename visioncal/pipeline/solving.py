@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.alignment.arms import arms_of, with_drifts, with_errors
-from visioncal.alignment.ties import ambiguous_error, untied_robots
 from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.outliers import Agreed, agree, settle
 from visioncal.estimation.problem import Effect, Observations, Problem, State
 from visioncal.estimation.solve import covariance_of, fit_problem
+from visioncal.pipeline.robots import arms_of, with_drifts, with_errors
+from visioncal.pipeline.ties import ambiguous_error, untied_robots
 from visioncal.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.stages.cell import Cell
 from visioncal.stages.clocks import clock_effects

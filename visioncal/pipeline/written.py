@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.alignment.solving import Solved
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
+from visioncal.pipeline.solving import Solved
 from visioncal.session import Session
 from visioncal.session.frames import thing_name
 from visioncal.types import FloatArray

@@ -4,9 +4,6 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from visioncal.alignment.faults import PoseFault, by_way_of
-from visioncal.alignment.solving import Solved
-from visioncal.alignment.ties import robot_motion
 from visioncal.calibration import HELD_BACK, Edge, Sight
 from visioncal.calibration.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.estimation.arm import stops_of
@@ -21,6 +18,9 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
+from visioncal.pipeline.faults import PoseFault, by_way_of
+from visioncal.pipeline.solving import Solved
+from visioncal.pipeline.ties import robot_motion
 from visioncal.stages.cell import Cell
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
 from visioncal.types import Mask, Rejection

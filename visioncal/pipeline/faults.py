@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.alignment.solving import Solved
 from visioncal.calibration import Moved
 from visioncal.estimation.problem import Problem
 from visioncal.figures import figure
 from visioncal.files import some_of
+from visioncal.pipeline.solving import Solved
 from visioncal.stages.agree import exchanged, other_stops
 from visioncal.stages.validate import apart
 from visioncal.transforms import distances, mean_transform, pose_difference

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from visioncal.alignment.run import align
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.pipeline import run
+from visioncal.pipeline.result import run
+from visioncal.pipeline.whole import align
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell

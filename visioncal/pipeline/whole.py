@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.alignment.arms import (
-    covariance_beside_noise,
-    doubts_of_arms,
-    notes_on_arms,
-)
-from visioncal.alignment.faults import (
+from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
+from visioncal.errors import DataError
+from visioncal.estimation.arm import stops_of
+from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.solve import covariance_of
+from visioncal.pipeline.budget import budget_mm, left_out
+from visioncal.pipeline.faults import (
     PoseFault,
     Version,
     moved_words,
@@ -23,21 +24,20 @@ from visioncal.alignment.faults import (
     residuals,
     versions,
 )
-from visioncal.alignment.held import held_sights
-from visioncal.alignment.judging import (
+from visioncal.pipeline.held import held_sights
+from visioncal.pipeline.judging import (
     check_cell,
     findings_of,
     weakest_link,
 )
-from visioncal.alignment.solving import Solved, sensors_of, solve
-from visioncal.alignment.ties import untied_words
-from visioncal.alignment.unseen import budget_mm, left_out
-from visioncal.alignment.written import fit_sections
-from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
-from visioncal.errors import DataError
-from visioncal.estimation.arm import stops_of
-from visioncal.estimation.intervals import noise_intervals
-from visioncal.estimation.solve import covariance_of
+from visioncal.pipeline.robots import (
+    covariance_beside_noise,
+    doubts_of_arms,
+    notes_on_arms,
+)
+from visioncal.pipeline.solving import Solved, sensors_of, solve
+from visioncal.pipeline.ties import untied_words
+from visioncal.pipeline.written import fit_sections
 from visioncal.robot import CONVENTIONS, Convention, Robot
 from visioncal.session import Session, frame_name
 from visioncal.stages.arms import ArmFound

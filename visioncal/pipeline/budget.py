@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from visioncal.alignment.solving import Solved
 from visioncal.estimation.appearance import shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.problem import Problem, State
 from visioncal.estimation.solve import solve_problem
+from visioncal.pipeline.solving import Solved
 from visioncal.stages.validate import HeldOut, validate
 from visioncal.types import FloatArray, IntArray
 

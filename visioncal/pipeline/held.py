@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.alignment.solving import Solved, problem_of, targets_of
 from visioncal.calibration import HELD_BACK, Sight
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
+from visioncal.pipeline.solving import Solved, problem_of, targets_of
 from visioncal.stages.choose import choose_by, chosen
 from visioncal.stages.clocks import clock_effects
 from visioncal.stages.observed import Observed
