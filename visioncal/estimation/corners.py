@@ -98,6 +98,9 @@ class CornerStack:
         Args:
             residuals: (n, 2) by the weights that the corners have [px].
         """
+        # What exact corners leave is rounding, which says nothing of a view.
+        if float(np.sqrt(np.mean(residuals**2))) <= _LEAST_SIGMA_PX:
+            return self
         squares = self.sum_by_view(np.sum(residuals**2, axis=1))
         by_view = weights_by_view(squares, np.asarray(2 * self.counts - 6, float))
         if by_view is None or self.stated_px is not None:
