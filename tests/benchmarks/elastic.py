@@ -73,9 +73,9 @@ def world(options: CellOptions) -> tuple[tuple[float, ...], list[tuple[float, fl
     springs = []
     if options.board_bow_m:
         errors.append(workspace_bound_m(cell, postures(robot)[::EVERY]))
-    elif ours.elastic is not None:
+    elif ours.arm_found.springs is not None:
         bound = compliance_bound(cell)
-        for at, it in enumerate(ours.elastic.springs):
+        for at, it in enumerate(ours.arm_found.springs.springs):
             if it.is_told:
                 off = it.compliance - options.compliance_rad_per_nm[at]
                 springs.append((it.sigma / bound[at], off / it.sigma))
