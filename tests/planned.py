@@ -6,7 +6,7 @@ import numpy as np
 from cells import known_of
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.recorded import SoFar

@@ -7,7 +7,7 @@ import pytest
 from problems import ROBOT_SIGMAS, moved, observed, true_state, world
 
 from visioncal.estimation.budget import Sources, covariance_by_source
-from visioncal.estimation.problem import Effect, FramePrior, Noise, State
+from visioncal.estimation.parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import Solution, covariance_of, normal_equations
 from visioncal.estimation.variance import Knowledge
 

@@ -8,7 +8,7 @@ import pytest
 from apart import UR5E_RADIUS_M, clearances, corners, lines, lines_apart, tubes
 
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.planning.candidates import candidates
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.design import chosen

@@ -7,7 +7,7 @@ import pytest
 
 from visioncal.estimation.causes import Belief, Cause, _at, explain, undone
 from visioncal.estimation.chain import chain
-from visioncal.estimation.problem import ROBOT, Noise, State
+from visioncal.estimation.parts import ROBOT, Noise, State
 from visioncal.transforms import adjoint, exp, invert, log
 
 NOISE = Noise.of_robot(1e-4, 1e-4)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration import Edge, FrameFile, Verdict
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.frames.drawn import drawn_fixture
 from visioncal.frames.fitted import Setting
 from visioncal.frames.fixture import touched_fixture

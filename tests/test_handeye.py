@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DegenerateError
 from visioncal.estimation.chain import FLANGE, chain, robot_part
 from visioncal.estimation.linalg import covariance, damped_step, spectrum
-from visioncal.estimation.problem import ROBOT, Effect, Noise, State
+from visioncal.estimation.parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
 from visioncal.estimation.variance import Knowledge
 from visioncal.pipeline.result import result_of

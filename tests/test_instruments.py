@@ -18,8 +18,8 @@ from tracked import (
 import visioncal
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.chain import chain
+from visioncal.estimation.parts import State
 from visioncal.estimation.positions import Mounting, Places, fit_mounting, supplied_poses
-from visioncal.estimation.problem import State
 from visioncal.estimation.workspace import postures
 from visioncal.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.session import MemoryImages, Session

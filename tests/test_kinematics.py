@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import visioncal
 from visioncal.errors import DataError
 from visioncal.estimation.armpair import ArmPair
-from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.workspace import postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows

@@ -9,7 +9,7 @@ from cells import calibrated, error_of
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import drift, neighbours
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.solve import covariance_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.transforms import exp

@@ -9,7 +9,7 @@ from cells import calibrated, error_of
 from visioncal.errors import DegenerateError
 from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances, inliers
-from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 from visioncal.stages.agree import agree, whole_units

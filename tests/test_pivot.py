@@ -21,8 +21,8 @@ from touched import (
 )
 
 from visioncal.errors import DataError, DegenerateError
+from visioncal.estimation.parts import Noise
 from visioncal.estimation.pivot import fit_pivot
-from visioncal.estimation.problem import Noise
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Placed, Touches, TouchProblem
 from visioncal.transforms import compose, exp, invert

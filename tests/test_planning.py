@@ -10,7 +10,7 @@ from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.errors import DataError
 from visioncal.estimation.linalg import covariance, covariance_root
-from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.planning.accuracy import Wish
 from visioncal.planning.cell import Box

@@ -7,7 +7,7 @@ import pytest
 from problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
 from visioncal.estimation.outliers import agree, settle
-from visioncal.estimation.problem import Effect, FramePrior, Noise, State
+from visioncal.estimation.parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,

@@ -8,7 +8,7 @@ from cells import calibrated
 
 from visioncal.errors import ConvergenceError
 from visioncal.estimation import joint
-from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.parts import ROBOT, Effect
 from visioncal.estimation.solve import (
     RATIO_PRIOR,
     fit_problem,

@@ -14,7 +14,8 @@ from visioncal.errors import DataError
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parameters import free_parameters, parameter_moves
-from visioncal.estimation.problem import Effect, Problem
+from visioncal.estimation.parts import Effect
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from visioncal.estimation.clock import clock_problem
-from visioncal.estimation.problem import State
+from visioncal.estimation.parts import State
 from visioncal.estimation.trajectory import Samples, Trajectory
 from visioncal.estimation.turned import Frames
 from visioncal.transforms import exp, invert, log

@@ -24,7 +24,8 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, fit_level
-from visioncal.estimation.problem import ROBOT, Noise, Problem, State
+from visioncal.estimation.parts import ROBOT, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot

@@ -21,8 +21,8 @@ from tracked import (
     solved_of,
 )
 
+from visioncal.estimation.parts import State
 from visioncal.estimation.positions import fit_mounting
-from visioncal.estimation.problem import State
 from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.workspace import postures
 from visioncal.pipeline.known import Known

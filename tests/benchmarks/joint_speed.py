@@ -16,8 +16,8 @@ from results import few, need, write_section
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance
+from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
-from visioncal.estimation.problem import Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
 from visioncal.targets import corner_positions

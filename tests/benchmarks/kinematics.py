@@ -19,7 +19,7 @@ from cells import calibrated, known_of
 from results import first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.pipeline.known import Known

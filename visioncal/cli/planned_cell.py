@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.calibration import Calibration
 from visioncal.cli.numbers import numbers_in
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.files import absence, read_bytes, some_of
 from visioncal.formats.boards import described_target
 from visioncal.formats.intrinsics import read_intrinsics

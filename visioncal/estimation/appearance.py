@@ -18,8 +18,8 @@ from scipy.linalg import block_diag
 from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance
+from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
-from visioncal.estimation.problem import Effect
 from visioncal.estimation.variance import Knowledge
 from visioncal.targets import corner_positions
 from visioncal.types import Camera, FloatArray, IntArray, Mask, Target

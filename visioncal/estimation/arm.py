@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     RobotLikelihood,
     normal_equations,

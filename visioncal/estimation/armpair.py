@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.problem import Linear, Noise, Observations, Problem, State
+from visioncal.estimation.parts import Noise, Observations, State
+from visioncal.estimation.problem import Linear, Problem
 from visioncal.robot import Loads
 from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask

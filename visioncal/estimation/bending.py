@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import Effect, State
+from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.solve import normal_equations, whitened
 from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Loads

@@ -8,7 +8,8 @@ import numpy as np
 
 from visioncal.chance import chi2_limit
 from visioncal.estimation.linalg import covariance_among, gram
-from visioncal.estimation.problem import Linear, Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.transforms import skew
 from visioncal.types import FloatArray, IntArray

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from visioncal.estimation.problem import Effect, Linear, Noise, Problem, State
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.types import FloatArray

@@ -16,7 +16,8 @@ from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
 from visioncal.estimation.linalg import covariance, gram
 from visioncal.estimation.outliers import closed_form
-from visioncal.estimation.problem import Effect, Problem, State
+from visioncal.estimation.parts import Effect, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, fisher_information, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames

@@ -5,7 +5,8 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import robot_levels, robot_likelihood, starting_noise
 from visioncal.estimation.variance import profile_interval
 from visioncal.types import FloatArray

@@ -17,7 +17,8 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,

@@ -7,7 +7,8 @@ import numpy as np
 from visioncal.chance import chi2_limit
 from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, normal_equations
 from visioncal.estimation.variance import Knowledge
 from visioncal.transforms import adjoint, invert

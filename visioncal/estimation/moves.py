@@ -12,7 +12,8 @@ import numpy as np
 
 from visioncal.chance import chi2_limit, f_limit
 from visioncal.estimation.linalg import covariance, spectrum
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     Solution,
     by_noise_alone,

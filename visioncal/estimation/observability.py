@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DegenerateError
 from visioncal.estimation.chain import edge_names, robot_part
 from visioncal.estimation.linalg import covariance_among, spectrum
-from visioncal.estimation.problem import ROBOT, Noise, Problem, State
+from visioncal.estimation.parts import ROBOT, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.figures import figure
 from visioncal.transforms import invert, rotation_angle

@@ -27,7 +27,8 @@ from visioncal.estimation.moves import (
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.robust import (
     Distances,
     half_of,

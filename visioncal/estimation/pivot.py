@@ -14,7 +14,7 @@ from visioncal.errors import DataError
 from visioncal.estimation.agreement import Agreement, agreeing_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.observability import Direction
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
 from visioncal.estimation.turning import CARELESS_M, check_counts, check_turning
 from visioncal.threads import one_blas_thread

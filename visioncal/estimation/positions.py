@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
-from visioncal.estimation.problem import State
+from visioncal.estimation.parts import State
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 from visioncal.transforms import adjoint, compose, exp, invert, skew

@@ -14,7 +14,8 @@ from visioncal.estimation.linalg import (
     gram,
     squared_lengths,
 )
-from visioncal.estimation.problem import ANYTHING, Linear, Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import ANYTHING, Linear, Problem
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     Components,

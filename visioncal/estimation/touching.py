@@ -18,8 +18,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.estimation.groups import Groups
+from visioncal.estimation.parts import Noise
 from visioncal.estimation.placing import LEAST_NOISE_M
-from visioncal.estimation.problem import Noise
 from visioncal.transforms import compose, exp, invert, nearest_rotation, skew
 from visioncal.types import FloatArray, IntArray, Mask
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from visioncal.estimation.linalg import covariance, covariance_among, gram
-from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, whitened
 from visioncal.types import FloatArray, IntArray
 

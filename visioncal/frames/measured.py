@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 
 from visioncal.calibration import Calibration, Edge, Frame, Verdict
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.files import did_you_mean, some_of
 from visioncal.frames.touches import TouchRows, check_lengths, flange_poses, refuse_copies
 from visioncal.robot import Robot

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.files import did_you_mean, some_of
 from visioncal.frames.verdicts import Doubt
 from visioncal.robot import Robot

@@ -7,7 +7,8 @@ import numpy as np
 from visioncal.estimation.appearance import shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.effects.lenses import LENSES
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import solve_problem
 from visioncal.pipeline.solving import Solved
 from visioncal.stages.validate import HeldOut, validate

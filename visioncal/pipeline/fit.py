@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.estimation.appearance import LENS_AND_BOARD
 from visioncal.estimation.arm import misfit_slopes
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.parts import ROBOT
 from visioncal.pipeline.known import Known
 from visioncal.targets import target_document
 from visioncal.transforms import adjoint, invert

@@ -10,7 +10,8 @@ import numpy as np
 from visioncal.calibration import CameraResult, Rms, Verdict
 from visioncal.estimation.appearance import Free
 from visioncal.estimation.chain import chain, edge_names
-from visioncal.estimation.problem import ROBOT, FramePrior, Problem
+from visioncal.estimation.parts import ROBOT, FramePrior
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import Scene
 from visioncal.pipeline.visits import visits
 from visioncal.robot import Convention, Loads, Robot

@@ -7,7 +7,8 @@ import numpy as np
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.arm import misfit_covariance
 from visioncal.estimation.misfit import inflation
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, held_shift
 from visioncal.stages import thermal
 from visioncal.stages.arms import ArmFound, RobotArm

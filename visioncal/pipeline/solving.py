@@ -9,7 +9,8 @@ from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
 from visioncal.estimation.joint import Fitted
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.outliers import Agreed, agree, settle
-from visioncal.estimation.problem import Effect, Observations, Problem, State
+from visioncal.estimation.parts import Effect, Observations, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.pipeline.robots import arms_of, with_drifts, with_errors
 from visioncal.pipeline.ties import ambiguous_error, untied_robots

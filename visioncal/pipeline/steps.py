@@ -12,7 +12,8 @@ import numpy as np
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.observability import FEWEST_VIEWS, directions, refuse_too_few
-from visioncal.estimation.problem import ROBOT, Problem, State
+from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fit_problem
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import middles, middles_of, without_lost_boards

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.views import chain_px
 from visioncal.stages.handeye import refit

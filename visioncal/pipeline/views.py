@@ -6,7 +6,8 @@ import numpy as np
 
 from visioncal.calibration import HELD_BACK, Rms, ViewResult
 from visioncal.estimation.chain import scatter
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.evidence import ViewEvidence
 from visioncal.pipeline.known import Known, rms_of
 from visioncal.pipeline.layout import own_numbers

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.robot import Robot
 from visioncal.targets import corner_positions
 from visioncal.transforms import exp, invert

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.estimation.armmodel import block_size
-from visioncal.estimation.problem import ROBOT
+from visioncal.estimation.parts import ROBOT
 from visioncal.figures import figure
 from visioncal.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.planning.cell import Box, PlanCell

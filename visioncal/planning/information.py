@@ -26,7 +26,8 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance, gram
-from visioncal.estimation.problem import ROBOT, Effect, Noise, Problem, State
+from visioncal.estimation.parts import ROBOT, Effect, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures

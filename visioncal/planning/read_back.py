@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.documents.jsons import parse_json
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.files import Table, read_text
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.purposes import Purpose, purpose_of

@@ -7,7 +7,8 @@ import numpy as np
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, fit_problem, normal_equations
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES

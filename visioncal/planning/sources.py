@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
-from visioncal.estimation.problem import Noise
+from visioncal.estimation.parts import Noise
 from visioncal.frames.touches import robot_noise
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.robot import Robot

@@ -16,7 +16,8 @@ from visioncal.estimation.arm import (
 )
 from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
-from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution
 from visioncal.robot import Convention, Loads
 from visioncal.session import Session, View

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from visioncal.calibration import HELD_BACK
 from visioncal.errors import DataError
-from visioncal.estimation.problem import FramePrior
+from visioncal.estimation.parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen

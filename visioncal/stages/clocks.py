@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.errors import VisioncalError
 from visioncal.estimation.effects.clock import clock_effect
-from visioncal.estimation.problem import Effect
+from visioncal.estimation.parts import Effect
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import is_seen

@@ -20,7 +20,7 @@ from visioncal.estimation.effects.delays import (
     target_twists,
 )
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import Effect
+from visioncal.estimation.parts import Effect
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.turned import Frames
 from visioncal.estimation.variance import Knowledge

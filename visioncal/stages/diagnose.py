@@ -11,7 +11,8 @@ from visioncal.estimation.budget import Sources, covariance_by_source, point_cov
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem import ROBOT, Problem
+from visioncal.estimation.parts import ROBOT
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.stages.handeye import HandEyeResult
 from visioncal.threads import one_blas_thread

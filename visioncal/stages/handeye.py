@@ -15,7 +15,8 @@ from visioncal.estimation.observability import (
     refuse_too_few,
     title,
 )
-from visioncal.estimation.problem import ROBOT, Noise, Problem, State
+from visioncal.estimation.parts import ROBOT, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,

@@ -10,7 +10,8 @@ from visioncal.calibration import Rms
 from visioncal.errors import DataError
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, LevelFit, fit_level, resized
-from visioncal.estimation.problem import Noise, Problem, State
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.figures import figure
 from visioncal.threads import one_blas_thread

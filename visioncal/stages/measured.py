@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.estimation.observability import SIGMA_LIMIT_M
-from visioncal.estimation.problem import FramePrior, Problem, State
+from visioncal.estimation.parts import FramePrior, State
+from visioncal.estimation.problem import Problem
 from visioncal.figures import figure
 from visioncal.session.tables import PriorTable
 from visioncal.types import FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.clock import ClockFit
 from visioncal.estimation.effects.clock import clock_effect
-from visioncal.estimation.problem import Effect
+from visioncal.estimation.parts import Effect
 from visioncal.estimation.turned import Match
 from visioncal.figures import figure
 from visioncal.session import View

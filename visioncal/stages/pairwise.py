@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.linalg import covariance, spectrum
-from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
 from visioncal.estimation.solve import fisher_information
 from visioncal.solvers import SOLVERS

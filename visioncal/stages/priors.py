@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping
 
 from visioncal.errors import DataError
-from visioncal.estimation.problem import FramePrior, Problem, State
+from visioncal.estimation.parts import FramePrior, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.files import did_you_mean
 from visioncal.session.tables import PriorTable

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
+from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.positions import (
     Mounting,
     Places,
@@ -16,7 +17,6 @@ from visioncal.estimation.positions import (
     residuals,
     supplied_poses,
 )
-from visioncal.estimation.problem import Effect, State
 from visioncal.estimation.variance import Knowledge
 from visioncal.figures import figure
 from visioncal.files import did_you_mean, some_of

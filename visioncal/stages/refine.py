@@ -29,7 +29,7 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem import ROBOT, State
+from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.scene import ONLY_CAMERA, Scene
 from visioncal.estimation.solve import covariance_of, left_out_residuals
 from visioncal.stages.found import found_of_looks

@@ -9,7 +9,8 @@ import numpy as np
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import Fitted
-from visioncal.estimation.problem import Effect, Noise, Problem
+from visioncal.estimation.parts import Effect, Noise
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
 from visioncal.stages.arms import RobotArm, effects_of
 from visioncal.stages.pnp import ViewPoses

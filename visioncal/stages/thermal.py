@@ -11,7 +11,8 @@ from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, starting_noise
 from visioncal.figures import figure
 from visioncal.files import some_of

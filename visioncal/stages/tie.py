@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimation.problem import FramePrior
+from visioncal.estimation.parts import FramePrior
 from visioncal.estimation.tree import Tree
 from visioncal.stages.grow import grow
 from visioncal.stages.pairwise import FEWEST, Candidates, consensus, hand_eye, trimmed

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.camera import project
-from visioncal.estimation.problem import Problem, State
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import distances
 from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask

@@ -14,7 +14,8 @@ import numpy as np
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import covariance_among, damped_step
-from visioncal.estimation.problem import Effect, Noise, Problem, State
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
     equations_and_cost,
     estimate_noise,

@@ -18,7 +18,7 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.problem import Noise, State
+from visioncal.estimation.parts import Noise, State
 from visioncal.frames.chain import noise_freedom
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.targets import numbered_positions, target_from_document

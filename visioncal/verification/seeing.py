@@ -11,7 +11,8 @@ from visioncal.errors import DataError
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.problem import ROBOT, Problem, State
+from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.problem import Problem
 from visioncal.frames.sighting import check_mount, check_resolution
 from visioncal.pipeline import STAGES
 from visioncal.pipeline.known import Known

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.estimation.problem import ROBOT, Effect
+from visioncal.estimation.parts import ROBOT, Effect
 from visioncal.estimation.variance import Knowledge
 from visioncal.types import FloatArray
 

@@ -14,7 +14,7 @@ from visioncal.camera import intrinsics, with_intrinsics
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.linalg import covariance
-from visioncal.estimation.problem import Effect
+from visioncal.estimation.parts import Effect
 from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.variance import Knowledge
 from visioncal.types import Camera, FloatArray, IntArray, Mask
