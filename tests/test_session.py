@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DataError
 from visioncal.session import FolderImages, MemoryImages, Session
 from visioncal.session.table import parse_csv
+from visioncal.types import Need
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "sessions"
 
@@ -264,6 +265,30 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(
     assert Session.load(tmp_path / "empty").digest() == session.digest()
 
 
+def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(
+    folder: Path, tmp_path: Path
+) -> None:
+    plain = Session.load(folder)
+    assert plain.need is None
+    edit(folder, "session.toml", "[robot]", "[need]\nmm = 0.5\nat = [0.4, 0, 0.1]\n[robot]")
+    session = Session.load(folder)
+    assert session.need == Need(0.5, None, (0.4, 0.0, 0.1))
+    asked = session.needing(deg=0.2)
+    assert asked.need == Need(0.5, 0.2, (0.4, 0.0, 0.1))
+    assert session.needing() is session
+    asked.save(tmp_path / "saved")
+    assert Session.load(tmp_path / "saved").need == asked.need
+    assert plain.needing(2).need == Need(2.0)
+    # The same was recorded, whatever it is to be good for.
+    assert plain.digest() == asked.digest()
+
+
+@pytest.mark.parametrize("mm", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_need_of_nothing_is_refused(folder: Path, mm: float) -> None:
+    with pytest.raises(DataError, match="a number above 0 is needed"):
+        Session.load(folder).needing(mm)
+
+
 def test_the_digest_sees_facts_and_not_their_spelling(folder: Path, tmp_path: Path) -> None:
     digest = Session.load(folder).digest()
     other = tmp_path / "other"
@@ -353,6 +378,11 @@ TOML_REFUSALS = [
     ("[robot]", "[prior.flange_from_cam]\nsigma_m = 1.0\n[robot]", "cam names no component"),
     ("[robot]", "[instrument]\nsigma_m = -1\n[robot]", "instrument.sigma_m is -1, .*at least 0"),
     ("[robot]\nmodel = ", "robot = ", "robot is 'ur10e', but must be a table"),
+    ("[robot]", "[need]\nmm = 0\n[robot]", "need.mm is 0, but must be a number above 0"),
+    ("[robot]", '[need]\nat = "views"\n[robot]', "need says neither mm nor deg: give how near"),
+    ("[robot]", '[need]\nmm = 1\nat = "table"\n[robot]', "need.at is 'table', but must be \"v"),
+    ("[robot]", "[need]\nmm = 1\nat = [1, 2]\n[robot]", r"need.at is \[1, 2\], but must be"),
+    ("[robot]", "[need]\nmm = 1\nat = [500, 0, 0]\n[robot]", "farther than any arm reaches: .* me"),
 ]
 
 

@@ -30,6 +30,21 @@ Progress: TypeAlias = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
+class Need:
+    """How near picks have to come; a pick is to meet both, where both are given.
+
+    Attributes:
+        mm: Distance from where it is meant [mm]; None where any will do.
+        deg: Angle from how it is meant [deg]; likewise.
+        at: Where that counts: where the views looked, or a place (x, y, z) in the base [m].
+    """
+
+    mm: float | None = None
+    deg: float | None = None
+    at: Literal["views"] | tuple[float, float, float] = "views"
+
+
+@dataclass(frozen=True)
 class Target:
     """A printed target or a rig of known points, as its `.toml` declares it.
 

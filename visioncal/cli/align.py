@@ -15,6 +15,7 @@ from visioncal.cli.console import (
     tell_written,
     unused_words,
 )
+from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.figures import figure
 from visioncal.joining import leftover
 from visioncal.outputs import write_alignment
@@ -36,6 +37,8 @@ def align_command(
             "kinematics, elastic (joints that bend, too)."
         ),
     ] = "auto",
+    need_mm: NeedMm = None,
+    need_deg: NeedDeg = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print alignment.json to stdout.")
     ] = False,
@@ -48,7 +51,8 @@ def align_command(
     there is a result, with a verdict; 2: nothing ties a robot to the rest, or the observations
     leave a frame open.
     """
-    found = align_into(Session.load(session), out, level=level, quiet=as_json)
+    loaded = Session.load(session).needing(need_mm, need_deg)
+    found = align_into(loaded, out, level=level, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))
 

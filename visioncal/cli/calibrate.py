@@ -11,6 +11,7 @@ from visioncal.calibration import to_document
 from visioncal.calibration.whole import whole_document
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
+from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
@@ -43,6 +44,8 @@ def calibrate_command(
             help="Of the arm's joint table in the result; the stated one where it is left out."
         ),
     ] = None,
+    need_mm: NeedMm = None,
+    need_deg: NeedDeg = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print calibration.json to stdout.")
     ] = False,
@@ -59,7 +62,7 @@ def calibrate_command(
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
-    loaded = Session.load(session)
+    loaded = Session.load(session).needing(need_mm, need_deg)
     if is_whole_cell(loaded):
         check_whole(solver)
         found = align_into(loaded, out, level=level, convention=convention, quiet=as_json)

@@ -18,6 +18,8 @@ def calibrate(
     solver: SolverName = "joint",
     level: str = "auto",
     convention: Convention | None = None,
+    need_mm: float | None = None,
+    need_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrates a session.
@@ -34,6 +36,8 @@ def calibrate(
             `thermal` for its drift with temperature, too.
         convention: Of the joint table in which a calibrated arm's numbers are told: `standard`,
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
+        need_mm: How near picks have to come [mm], in the place of what `[need]` declares.
+        need_deg: The same in rotation [deg].
         progress: Told of long work.
 
     Returns:
@@ -45,6 +49,7 @@ def calibrate(
         ConvergenceError: The intrinsics do not come to rest.
     """
     loaded = session if isinstance(session, Session) else Session.load(session)
+    loaded = loaded.needing(need_mm, need_deg)
     if is_whole_cell(loaded):
         check_whole(solver)
         found = align(loaded, level=level, convention=convention, progress=progress)

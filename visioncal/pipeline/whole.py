@@ -65,6 +65,8 @@ def align(
     *,
     level: str = "auto",
     convention: Convention | None = None,
+    need_mm: float | None = None,
+    need_deg: float | None = None,
     corners: Mapping[int, Corners] | None = None,
     progress: Progress | None = None,
 ) -> Alignment:
@@ -77,6 +79,8 @@ def align(
         level: How far each arm is calibrated, as `calibrate` has it; beyond `hand-eye` it takes
             joint angles and a model.
         convention: Of the joint table in which calibrated arms' numbers are told.
+        need_mm: How near picks have to come [mm], in the place of what `[need]` declares.
+        need_deg: The same in rotation [deg].
         corners: What was found in its images before, by view; None to look.
         progress: Told of long work.
 
@@ -91,6 +95,7 @@ def align(
     if convention is not None and convention not in CONVENTIONS:
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
+    loaded = loaded.needing(need_mm, need_deg)
     looked = Observed(loaded, progress, poses=read_instruments(loaded))
     looked = locate_targets(estimate_lenses(detect_targets(looked, corners)))
     if progress is not None:

@@ -26,7 +26,8 @@ def digest_facts(
 
     It is equal for every storage of the same facts: folders, their formatting, the spelling of
     numbers and the names of a target's or a robot's file do not enter, their contents do. How thick
-    and heavy the robot's links are, and how strong its drives, is no fact of what was recorded.
+    and heavy the robot's links are, how strong its drives, and what the task needs, is no fact of
+    what was recorded.
     """
     paths = sorted({view.image for view in views if view.image and images.exists(view.image)})
     facts: dict[str, object] = {
@@ -50,8 +51,11 @@ def is_file(name: object) -> bool:
 
 
 def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
-    """Leaves out where the target's and the robot's files lie; what they hold counts instead."""
-    kept = dict(document)
+    """Leaves out where the target's and the robot's files lie; what they hold counts instead.
+
+    So it does with the need, which is of the task.
+    """
+    kept = {name: it for name, it in document.items() if name != "need"}
     if is_file(kept.get("target")):
         del kept["target"]
     targets = kept.get("targets")

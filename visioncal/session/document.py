@@ -12,6 +12,7 @@ from visioncal.session.tables import (
     CameraTable,
     ClockTable,
     InstrumentTable,
+    NeedTable,
     PriorTable,
     RobotTable,
     TableModel,
@@ -55,6 +56,7 @@ class Declaration(TableModel):
     clock: ClockTable = ClockTable()
     clocks: dict[str, ClockTable] = Field(default_factory=dict)
     prior: dict[str, PriorTable] = Field(default_factory=dict)
+    need: NeedTable | None = None
 
     def named(self, kind: Kind) -> dict[str, TableModel]:
         """The tables of a kind by the names that rows give them; that of a singular is empty."""
@@ -180,6 +182,11 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
     for kind in KINDS:
         yield from _several_contradictions(declaration, kind)
     yield from _prior_contradictions(declaration)
+    need = declaration.need
+    if need is not None and need.mm is None and need.deg is None:
+        yield "need", "says neither mm nor deg: give how near picks have to come"
+    if need is not None and (wrong := need.wrong_place()):
+        yield "need.at", wrong
 
 
 def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:

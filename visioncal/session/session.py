@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
 from visioncal.errors import DataError
@@ -43,7 +44,7 @@ from visioncal.session.streams import (
 )
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
-from visioncal.types import Camera, Corners, Mount, Target
+from visioncal.types import Camera, Corners, Mount, Need, Target
 
 # The columns of a session without views.
 ALONE = ("view",)
@@ -204,6 +205,36 @@ class Session:
             check_stream(name, stream)
         ordered = dict(sorted(streams.items()))
         return replace(self, streams=ordered, warnings=(*self.warnings, *gap_warnings(ordered)))
+
+    def needing(self, mm: float | None = None, deg: float | None = None) -> "Session":
+        """Returns the session of a task that needs something else; what is None stays as declared.
+
+        Args:
+            mm: How near picks have to come [mm].
+            deg: The same in rotation [deg].
+
+        Raises:
+            DataError: One is no number above 0.
+        """
+        both = (("mm", mm), ("deg", deg))
+        asked = {name: float(it) for name, it in both if it is not None}
+        for name, value in asked.items():
+            if not 0.0 < value < np.inf:
+                raise DataError(
+                    f"the need in {name} is {value!r}; a number above 0 is needed.",
+                    culprits=[f"--need-{name}"],
+                    next_step="Give how near picks have to come, as --need-mm 0.5.",
+                )
+        if not asked:
+            return self
+        table = {**self.document.get("need", {}), **asked}
+        return replace(self, document={**self.document, "need": table})
+
+    @property
+    def need(self) -> Need | None:
+        """What the task needs; None where nothing is said of it."""
+        table = self.declaration.need
+        return None if table is None else table.need
 
     def save(self, folder: Path | str) -> None:
         """Writes the session as a folder that needs no other file; whole or not at all.

@@ -1,11 +1,11 @@
 """The tables of session.toml: their fields, types and ranges."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from visioncal.types import Camera, CameraKind
+from visioncal.types import Camera, CameraKind, Need
 
 # Squares and products of larger numbers leave what floats hold; no field of a cell has such.
 _LARGEST = 1e15
@@ -16,6 +16,11 @@ PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
 # Four times the side of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
+
+# Where a need counts that names no place.
+VIEWS: Literal["views"] = "views"
+# No arm reaches this far [m]: such numbers are in millimetres.
+_FAR_M = 20.0
 
 
 class TableModel(BaseModel):
@@ -75,6 +80,37 @@ class ClockTable(TableModel):
     """`[clock]`. What the camera's stamps are ahead of the robot's [s]."""
 
     camera_minus_robot_s: Number = 0.0
+
+
+class NeedTable(TableModel):
+    """`[need]`. How near picks have to come [mm], [deg], and where; see `types.Need`."""
+
+    mm: Positive | None = None
+    deg: Positive | None = None
+    # "views" or three numbers: checked with the other contradictions, in one sentence.
+    at: Any = VIEWS
+
+    @property
+    def need(self) -> Need:
+        """The need, typed."""
+        if self.at == VIEWS:
+            return Need(self.mm, self.deg)
+        x, y, z = map(float, self.at)
+        return Need(self.mm, self.deg, (x, y, z))
+
+    def wrong_place(self) -> str:
+        """What is wrong with `at`, in words; empty where nothing is."""
+        if self.at == VIEWS:
+            return ""
+        numbers = self.at if isinstance(self.at, list) else []
+        if len(numbers) != 3 or not all(type(it) in (int, float) for it in numbers):
+            return f'is {self.at!r}, but must be "{VIEWS}" or [x, y, z] in the base [m]'
+        if not all(abs(it) <= _FAR_M for it in numbers):
+            return (
+                f"is {self.at!r}, farther than any arm reaches: it is in the base, in metres "
+                f"(under {_FAR_M:g})"
+            )
+        return ""
 
 
 class PriorTable(TableModel):
