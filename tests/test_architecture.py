@@ -29,6 +29,7 @@ LAYERS = (
     ("targets",),
     ("printing",),
     ("finders",),
+    ("dense",),
     ("solvers",),
     ("estimation",),
     ("session",),
@@ -69,8 +70,8 @@ HOMES = {
     "depthai": {"drivers"},
     "rtde_control": {"drivers"},
     "rtde_receive": {"drivers"},
-    "torch": set(),
-    "kornia": set(),
+    "torch": {"dense"},
+    "kornia": {"dense"},
 }
 
 

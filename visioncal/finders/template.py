@@ -19,7 +19,6 @@ and sharpening leave a pattern with a period of two pixels. On ChArUco boards th
 markers and of their blurred edges are left out. All corners of an image are worked on at once.
 """
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Self, TypeAlias
@@ -27,8 +26,8 @@ from typing import Self, TypeAlias
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
+from visioncal.finders.maps import maps_about
 from visioncal.targets import corner_positions, marked_squares
 from visioncal.types import FloatArray, Image, IntArray, Mask, Target
 
@@ -46,10 +45,6 @@ _FEWEST = 4
 _RIM_PX = 32
 # Bounds memory and time where corners are many.
 _MOST_PIXELS = 600_000
-# Corners around a corner that shape its map, and how far away they count half [squares].
-_AROUND, _NEAR = 25, 1.5
-# Held by so much to a plain homography, a map stays determined where corners are few.
-_RIDGE = np.diag([1e-6, 1e-4, 1e-4, *[1e-2] * 7])
 # Corners that measure the blur, and what it starts from and stays above [px].
 _BLUR_SAMPLE, _BLUR_START_PX, _BLUR_LEAST_PX = 30, 1.5, 0.5
 # Most turns, for the blur and for the corners, and the step that ends them [px].
@@ -147,7 +142,7 @@ class _Windows:
         cls, smooth: _Float32Array, board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray
     ) -> Self:
         """Cuts the windows of the chosen ones among corners, whose good ones make the maps."""
-        on_board, around, smoother = _maps(board, px, good, chosen)
+        on_board, around, smoother = maps_about(board, px, good, chosen)
         start = px[chosen]
         ends = on_board(start[:, None] + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
         by_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
@@ -439,52 +434,3 @@ def _median(values: FloatArray) -> float:
     """The median of what is finite; NaN where nothing is."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else np.nan
-
-
-def _maps(
-    board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray
-) -> tuple[Callable[[FloatArray], FloatArray], IntArray, FloatArray]:
-    """The maps about the chosen m corners.
-
-    Returns:
-        What maps pixels (m, k, 2) to the board, from each corner; the (m, k) corners around each;
-        and what makes polynomials of values there, (m, 10, k).
-    """
-    middle, scale = px.mean(axis=0), float(np.abs(px - px.mean(axis=0)).max())
-    found = cv2.findHomography((px - middle) / scale, board)[0]
-    if found is None:
-        raise np.linalg.LinAlgError
-    flat_from_px = np.asarray(found, float)
-
-    def flat(places: FloatArray) -> FloatArray:
-        return _mapped(flat_from_px, (places - middle) / scale)
-
-    own = flat(px[chosen])[:, None]
-    distances, around = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
-    off = flat(px)[around] - own
-    terms = _terms(off)
-    weighed = terms * (good[around] / (1.0 + (distances / _NEAR) ** 2))[..., None]
-    weighed = weighed.transpose(0, 2, 1)
-    smoother = np.linalg.solve(weighed @ terms + _RIDGE, weighed)
-    bends = smoother @ (board[around] - board[chosen, None] - off)
-    # The corner itself is where its map is zero.
-    bends[:, 0] = 0.0
-
-    def on_board(places: FloatArray) -> FloatArray:
-        off = flat(places) - own
-        return np.asarray(off + _terms(off) @ bends)
-
-    return on_board, around, smoother
-
-
-def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
-    """Maps (..., 2) places by a (3, 3) homography."""
-    ahead = places @ homography[2, :2] + homography[2, 2]
-    return np.asarray((places @ homography[:2, :2].T + homography[:2, 2]) / ahead[..., None])
-
-
-def _terms(at: FloatArray) -> FloatArray:
-    """(..., 10) powers and products of (..., 2) places, up to the third order."""
-    x, y = at[..., 0], at[..., 1]
-    ones, xx, xy, yy = np.ones_like(x), x * x, x * y, y * y
-    return np.stack([ones, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
