@@ -22,6 +22,7 @@ from visioncal.session import Session
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES, compare_solvers
 from visioncal.stages.kinematics import check_level
+from visioncal.stages.need import need_met
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
@@ -145,6 +146,7 @@ def result_of(known: Known) -> Calibration:
         camera=_camera(known),
         robot=known.robot,
         stages=_further(known),
+        need=need_met(findings.need, findings.picks),
     )
 
 
