@@ -61,8 +61,6 @@ def _print(target: Target):
         columns, rows = target.columns + 1, target.rows + 1
         light = np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 1
         lines = np.arange(columns + 1.0) - 1, np.arange(rows + 1.0) - 1
-    elif target.kind == "aprilgrid":
-        lines, light = _aprilgrid(target)
     else:
         columns, rows = target.columns, target.rows
         share = target.marker_m / target.square_m
@@ -80,26 +78,6 @@ def _print(target: Target):
         )
     light = np.pad(light, 1, constant_values=True)
     return lines, light.astype(float)
-
-
-def _aprilgrid(target: Target):
-    """Rows of tags, turned as on Kalibr's pages, between rows of small squares."""
-    side, gap = 6 + 2 * target.border, target.spacing
-    cuts = np.append(-gap, np.arange(side) / side)
-    n, pitch = len(cuts), 1.0 + gap
-    lines = tuple(
-        np.append(
-            (pitch * np.arange(count)[:, None] + cuts).ravel(), [pitch * count - gap, pitch * count]
-        )
-        for count in (target.columns, target.rows)
-    )
-    light = np.ones((target.rows * n + 1, target.columns * n + 1), bool)
-    light[::n, ::n] = False
-    for number in range(target.columns * target.rows):
-        row, column = target.rows - 1 - number // target.columns, number % target.columns
-        cells = marker_cells(target.dictionary, target.marker_id + number, target.border)
-        light[row * n + 1 : (row + 1) * n, column * n + 1 : (column + 1) * n] = ~cells[::-1, ::-1]
-    return lines, light
 
 
 def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -191,7 +169,7 @@ def _through(picture, shot, direction):
     """The optics: a little blur that every lens has, defocus, and a line of motion."""
     picture = cv2.GaussianBlur(picture, (0, 0), 0.35 * SAMPLES, borderType=cv2.BORDER_REPLICATE)
     half = np.array([np.cos(direction), np.sin(direction)]) * shot.motion_px * SAMPLES / 2
-    for kernel in (_disc(shot.disc_px * SAMPLES), _line(half)):
+    for kernel in (disc_kernel(shot.disc_px * SAMPLES), line_kernel(half)):
         if kernel.size > 1:
             picture = cv2.filter2D(picture, -1, kernel, borderType=cv2.BORDER_REPLICATE)
     return picture
@@ -205,13 +183,13 @@ def _kernel(reach, inside):
     return kernel / kernel.sum()
 
 
-def _disc(radius):
+def disc_kernel(radius):
     if radius <= 0:
         return np.ones((1, 1))
     return _kernel(radius, lambda x, y: (x**2 + y**2 <= radius**2).astype(float))
 
 
-def _line(half):
+def line_kernel(half):
     length = np.linalg.norm(half)
     if length <= 0:
         return np.ones((1, 1))

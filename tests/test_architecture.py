@@ -27,7 +27,6 @@ LAYERS = (
     ("robot",),
     ("instruments",),
     ("targets",),
-    ("prints",),
     ("printing",),
     ("finders",),
     ("dense",),

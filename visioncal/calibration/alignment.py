@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -13,13 +13,7 @@ from visioncal.calibration.edge import Edge, edge_document, read_covariance, rea
 from visioncal.calibration.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
 from visioncal.calibration.frame import Frame, present
 from visioncal.calibration.lens import camera_document, read_camera
-from visioncal.calibration.parts import CameraResult, NeedMet, RobotResult, Verdict
-from visioncal.calibration.verdicts import (
-    need_document,
-    read_need,
-    read_verdict,
-    verdict_document,
-)
+from visioncal.calibration.parts import CameraResult, RobotResult, Verdict, VerdictStatus
 from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.estimation.tree import Branch, Step, Tree
@@ -141,7 +135,6 @@ class Alignment:
         stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`,
             `uncertainty`.
         left_out: How observations were left out of fits in turn, in words; empty where none was.
-        need: What the task needs, and how likely picks meet it; None where that is not said.
     """
 
     session_name: str
@@ -165,7 +158,6 @@ class Alignment:
     placed: Mapping[str, Frame] = field(default_factory=dict)
     stages: Mapping[str, Any] = field(default_factory=dict)
     left_out: str = ""
-    need: NeedMet | None = None
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:
@@ -262,8 +254,7 @@ class Alignment:
             "moved": moved_document(self.moved),
             "untied": [vars(it) for it in self.untied],
             "weakest": self.weakest,
-            "verdict": verdict_document(self.verdict),
-            **need_document(self.need),
+            "verdict": {"status": self.verdict.status, "reasons": list(self.verdict.reasons)},
             "details": dict(self.details),
         }
 
@@ -334,6 +325,9 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
     if document.get("schema") != SCHEMA:
         raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
     check(document, _FORM)
+    verdict = document["verdict"]
+    if verdict["status"] not in get_args(VerdictStatus):
+        raise ValueError(f"verdict.status is {verdict['status']!r}")
     return {
         "session_name": document["session"]["name"],
         "session_sha256": document["session"]["sha256"],
@@ -349,7 +343,6 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
         "moved": read_moved(document["moved"]),
         "untied": tuple(Untied(**it) for it in document["untied"]),
         "weakest": document["weakest"],
-        "verdict": read_verdict(document["verdict"]),
-        "need": read_need(document),
+        "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
         "details": dict(document["details"]),
     }

@@ -19,13 +19,9 @@ from visioncal.calibration.parts import (
     Rms,
     SolverResult,
     Validation,
+    Verdict,
+    VerdictStatus,
     ViewResult,
-)
-from visioncal.calibration.verdicts import (
-    need_document,
-    read_need,
-    read_verdict,
-    verdict_document,
 )
 from visioncal.calibration.whole import whole_document
 from visioncal.documents import Kinds, shown
@@ -38,14 +34,12 @@ if TYPE_CHECKING:
 
 # What the fields hold beside numbers, by their names.
 KINDS = Kinds(
-    re.compile(
-        "reasons?|method|status|level|name|source|created|mount|words|weight|cause|sentence"
-    ),
+    re.compile("reasons?|method|status|level|name|source|created|mount|words|weight"),
     re.compile(
         "session|transforms|joint_covariance|solvers|noise|rms|validation|held_out|verdict|need"
         "|kinematics|elastic|thermal|uncertainty|noise_95|joint_fit|observability|camera|conditions"
     ),
-    re.compile("views|levels|parameters|left_out|stops|joints|course|observations|causes"),
+    re.compile("views|levels|parameters|left_out|stops|joints|course|observations"),
 )
 
 
@@ -76,8 +70,10 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
         "views": [present(vars(view)) for view in calibration.views],
         "rms": present(vars(calibration.rms)),
         "validation": _validation_document(calibration.validation),
-        "verdict": verdict_document(calibration.verdict),
-        **need_document(calibration.need),
+        "verdict": {
+            "status": calibration.verdict.status,
+            "reasons": list(calibration.verdict.reasons),
+        },
     }
     if calibration.frames:
         document["frames"] = frames_document(calibration.frames)
@@ -101,8 +97,7 @@ def _validation_document(validation: Validation) -> dict[str, Any]:
 
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "created", "session", "mount", "transforms", "joint_covariance"}
-    | {"solvers", "camera", "robot", "noise", "views", "rms", "validation", "verdict", "need"}
-    | {"frames"}
+    | {"solvers", "camera", "robot", "noise", "views", "rms", "validation", "verdict", "frames"}
 )
 
 
@@ -117,10 +112,13 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     check(document, CALIBRATION)
     if document["mount"] not in get_args(Mount):
         raise ValueError(f"mount is {document['mount']!r}")
+    if document["verdict"]["status"] not in get_args(VerdictStatus):
+        raise ValueError(f"verdict.status is {document['verdict']['status']!r}")
     if not document["transforms"]:
         raise ValueError("transforms is empty")
     camera = document.get("camera")
     robot = document.get("robot")
+    verdict = document["verdict"]
     return {
         "session_name": document["session"]["name"],
         "session_sha256": document["session"]["sha256"],
@@ -133,8 +131,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "views": tuple(_view(it) for it in document["views"]),
         "rms": Rms(**_figures(document["rms"])),
         "validation": _validation(document["validation"]),
-        "verdict": read_verdict(document["verdict"]),
-        "need": read_need(document),
+        "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
         "camera": None if camera is None else read_camera(camera),
         "robot": None if robot is None else Robot.from_document(robot),
         "frames": read_frames(document.get("frames", {})),

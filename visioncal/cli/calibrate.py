@@ -1,6 +1,7 @@
 """`visioncal calibrate`."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,7 @@ from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
-from visioncal.pipeline import check_whole, run
+from visioncal.pipeline import check_whole, run, run_dense
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell
@@ -46,6 +47,15 @@ def calibrate_command(
     ] = None,
     need_mm: NeedMm = None,
     need_deg: NeedDeg = None,
+    dense: Annotated[
+        bool,
+        typer.Option(
+            "--dense",
+            help="Corners by all pixels around them, for images that are blurred, smeared by "
+            "motion or badly lit; needs torch and kornia (the extra dense).",
+        ),
+    ] = False,
+    device: Annotated[str, typer.Option(help="What --dense works on: auto, cpu or cuda.")] = "auto",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print calibration.json to stdout.")
     ] = False,
@@ -64,7 +74,7 @@ def calibrate_command(
     """
     loaded = Session.load(session).needing(need_mm, need_deg)
     if is_whole_cell(loaded):
-        check_whole(solver)
+        check_whole(solver, dense=dense)
         found = align_into(loaded, out, level=level, convention=convention, quiet=as_json)
         document = whole_document(found)
         if as_json:
@@ -72,7 +82,10 @@ def calibrate_command(
         return
     left = leftover(out)
     with naming(session), shown_progress(quiet=as_json) as told:
-        result = run(loaded, solver=solver, level=level, convention=convention, progress=told)
+        calibrated = partial(run_dense, device=device) if dense else run
+        result = calibrated(
+            loaded, solver=solver, level=level, convention=convention, progress=told
+        )
         told("write", 0, 1)
         if left is not None:
             left.keep()

@@ -41,8 +41,8 @@ _TAPS = 5
 _TAPER_PX = 4
 # Corners without which there is no fit.
 _FEWEST = 6
-# Maps are made anew so often.
-_PASSES = 2
+# Maps are made anew so often, unless the corners stay where they were, as an rms [px].
+_PASSES, _AT_REST_PX = 2, 0.02
 # The width of a sharp edge, and of the widest that a search starts from [px].
 _SHARP_PX, _MOST_START_PX = 0.45, 5.0
 # Tones beyond have no longer a light for each grey.
@@ -52,9 +52,9 @@ _MOST_MARGIN_PX = 16.0
 # Corners that measure the blur, and that choose where its search starts.
 _BLUR_SAMPLE, _START_SAMPLE = 30, 12
 # Turns of the search from each start, of the best one, and of the corners alone.
-_START_TURNS, _BLUR_TURNS, _CORNER_TURNS = 6, 15, 6
+_START_TURNS, _BLUR_TURNS, _CORNER_TURNS = 4, 12, 6
 # Steps that end the turns: of corners [px], and of the cost as a share of it.
-_STILL_PX, _STILL = 0.001, 1e-5
+_STILL_PX, _STILL = 0.001, 3e-5
 # Damping to begin with.
 _DAMPING = 1e-3
 # No step of a corner is longer [px].
@@ -66,8 +66,8 @@ _MOST_SAMPLES = 8_000_000
 # What a fit has to show; see `finders.template`.
 _LAST_STEP_PX, _MOST_SHIFT, _LEAST_INSIDE, _LEAST_CONTRAST = 0.02, 0.3, 0.6, 0.1
 _MISFIT_TIMES, _MISFIT_MORE, _MOST_MISFIT = 3.0, 0.05, 0.6
-# A surface of the light takes so many corners.
-_FEWEST_LIT = 12
+# A surface of the light takes so many corners, and has to leave less than this share of the cost.
+_FEWEST_LIT, _LIT = 12, 0.995
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +150,15 @@ def fit_corners(
             shift, sums = _settled(patches, best)
             lit = replace(patches, slopes=_light(patches, sums, good))
             tried, tried_sums = _settled(lit, best, shift)
-            if tried_sums.cost(good) < sums.cost(good):
+            is_lit = tried_sums.cost(good) < _LIT * sums.cost(good)
+            if is_lit:
                 patches, shift, sums, slopes = lit, tried, tried_sums, lit.slopes
             moved = found + shift
             good = _good(patches, sums, moved - px)
             found = np.where(good[:, None], moved, px)
+            # What hardly moves leaves maps and blur as they are.
+            if not is_lit and np.sqrt(np.mean(shift[good] ** 2)) < _AT_REST_PX:
+                break
         return _fitted(patches, sums, shift, best, good, found)
     return None
 
@@ -474,10 +478,8 @@ def _started(scene: _Scene, px: FloatArray, widths_px: FloatArray) -> FloatArray
     wide = np.clip(np.nan_to_num(widths_px, nan=1.0), _SHARP_PX, _MOST_START_PX)
     reach = 3.0 * float(wide.max()) + 2.0
     patches = _Patches.cut(scene, px, good, sample, reach, np.zeros((len(px), 2, 2)))
-    found = [
-        _searched(patches, np.append(it, 0.0), _START_TURNS)
-        for it in _starts(np.median(patches.normals, axis=0), wide)
-    ]
+    starts = [np.append(it, 0.0) for it in _starts(np.median(patches.normals, axis=0), wide)]
+    found = [_searched(patches, it, _START_TURNS) for it in starts]
     return min(found, key=lambda it: it[1])[0]
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from visioncal.calibration import Calibration
 from visioncal.errors import DataError
+from visioncal.pipeline.denser import run_dense
 from visioncal.pipeline.result import run
 from visioncal.pipeline.whole import align
 from visioncal.robot import Convention
@@ -21,6 +22,8 @@ def calibrate(
     need_mm: float | None = None,
     need_deg: float | None = None,
     progress: Progress | None = None,
+    dense: bool = False,
+    device: str = "auto",
 ) -> Calibration:
     """Calibrates a session.
 
@@ -39,6 +42,10 @@ def calibrate(
         need_mm: How near picks have to come [mm], in the place of what `[need]` declares.
         need_deg: The same in rotation [deg].
         progress: Told of long work.
+        dense: Whether to fit corners by all pixels around them, for blurred, moving and badly lit
+            images; needs the extra `dense`. They are kept only where views that were left out
+            are predicted no worse.
+        device: What that works on: `auto` for a GPU where there is one, `cpu` or `cuda`.
 
     Returns:
         The result with its verdict.
@@ -51,15 +58,24 @@ def calibrate(
     loaded = session if isinstance(session, Session) else Session.load(session)
     loaded = loaded.needing(need_mm, need_deg)
     if is_whole_cell(loaded):
-        check_whole(solver)
+        check_whole(solver, dense=dense)
         found = align(loaded, level=level, convention=convention, progress=progress)
         return Calibration.whole(found)
+    if dense:
+        return run_dense(
+            loaded,
+            device=device,
+            solver=solver,
+            level=level,
+            convention=convention,
+            progress=progress,
+        ).calibration
     return run(
         loaded, solver=solver, level=level, convention=convention, progress=progress
     ).calibration
 
 
-def check_whole(solver: SolverName) -> None:
+def check_whole(solver: SolverName, *, dense: bool = False) -> None:
     """Refuses what is not asked of a whole cell.
 
     Raises:
@@ -69,5 +85,11 @@ def check_whole(solver: SolverName) -> None:
         raise DataError(
             f"solver {solver} cannot be asked of a whole cell: it has the joint solver.",
             culprits=["--solver"],
+            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
+        )
+    if dense:
+        raise DataError(
+            "dense corners cannot be asked of a whole cell.",
+            culprits=["--dense"],
             next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
         )

@@ -1,6 +1,7 @@
 """Running the stages, and putting their results together as a Calibration."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,10 @@ from visioncal.pipeline.unseen import held_back
 from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
+from visioncal.stages.dense import Dense
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES, compare_solvers
 from visioncal.stages.kinematics import check_level
-from visioncal.stages.need import need_met
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
@@ -37,10 +38,14 @@ class Run:
     Attributes:
         calibration: The result.
         evidence: One entry for each view of the session.
+        dense: What all pixels have of the images, where they were asked for.
+        left_out: By view, how far it is predicted off by a fit without it [m], [px].
     """
 
     calibration: Calibration
     evidence: tuple[ViewEvidence, ...]
+    dense: Dense | None = None
+    left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
 
 def run(
@@ -50,6 +55,7 @@ def run(
     level: str = "auto",
     convention: Convention | None = None,
     progress: Progress | None = None,
+    dense: Dense | None = None,
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
     if solver not in SOLVER_NAMES:
@@ -59,7 +65,8 @@ def run(
         raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
     loaded = session if isinstance(session, Session) else Session.load(session)
     with one_blas_thread():
-        return _run(Known(loaded, progress, solver=solver, level=level, convention=convention))
+        known = Known(loaded, progress, solver=solver, level=level, convention=convention)
+        return _run(replace(known, dense=dense))
 
 
 def _run(known: Known) -> Run:
@@ -78,7 +85,12 @@ def _run(known: Known) -> Run:
         # Joints that are misread explain themselves, and would mislead what is guessed of poses.
         if stage.name == "joints":
             seen = known
-    return Run(result_of(_with_reading(known, seen)), view_evidence(known))
+    held, left_out = known.held_out, {}
+    if held is not None:
+        pairs = zip(held.away_m.tolist(), held.rms_px.tolist(), strict=True)
+        left_out = dict(zip(known.used, pairs, strict=True))
+    calibration = result_of(_with_reading(known, seen))
+    return Run(calibration, view_evidence(known), known.dense, left_out)
 
 
 def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
@@ -146,7 +158,6 @@ def result_of(known: Known) -> Calibration:
         camera=_camera(known),
         robot=known.robot,
         stages=_further(known),
-        need=need_met(findings.need, findings.picks),
     )
 
 

@@ -11,6 +11,7 @@ from visioncal.errors import VisioncalError
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
 from visioncal.session.tables import CameraTable
+from visioncal.stages.dense import fit_densely
 from visioncal.stages.detect import detect
 from visioncal.stages.intrinsics import estimate_intrinsics
 from visioncal.stages.observed import CameraLook, Observed, nothing_seen
@@ -43,6 +44,9 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                 found = detect(session, progress=seen.progress, among=views)
             corners, resolution = found.corners, found.resolution
             seen = seen.noting(found.rejections)
+            if seen.dense is not None:
+                looked = fit_densely(session, views, corners, seen.dense, seen.progress)
+                corners, seen = looked[0], replace(seen, dense=looked[1])
         mine = _numbered_through(session, views, corners)
         seen = seen.with_camera(frame, CameraLook(table, mine, resolution))
     return seen

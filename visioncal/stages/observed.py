@@ -13,6 +13,7 @@ from visioncal.files import some_of
 from visioncal.session import Session
 from visioncal.session.tables import CameraTable
 from visioncal.stages.clock import Clocked, Pair
+from visioncal.stages.dense import Dense
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.reported import Reported
 from visioncal.types import Corners, Progress, Rejection
@@ -55,6 +56,7 @@ class Observed:
         clocks: How the clocks of cameras and robots go together, where robots' streams are used.
         warnings: What the user should know, in sentences.
         notes: What is good to know and no reason for doubt.
+        dense: How corners are fitted by all pixels around them; None for the template's.
     """
 
     session: Session
@@ -66,6 +68,7 @@ class Observed:
     clocks: Mapping[Pair, Clocked] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    dense: Dense | None = None
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[str] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
