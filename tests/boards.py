@@ -42,3 +42,10 @@ def charuco(columns: int, rows: int, dictionary: str = "DICT_5X5_100", **options
 def checkerboard(columns: int, rows: int, square_m: float = 0.025) -> Target:
     """A checkerboard."""
     return Target("board", "checkerboard", columns, rows, square_m, 1e-5)
+
+
+def aprilgrid(columns: int, rows: int, **options) -> Target:
+    """An AprilGrid of tags of 32 mm, as Kalibr prints them."""
+    measures = {"square_m": 0.032, "square_sigma_m": 1e-5, "marker_id": 0} | options
+    layout = {"spacing": 0.3, "border": 2, "dictionary": "DICT_APRILTAG_36h11"} | measures
+    return Target("board", "aprilgrid", columns, rows, **layout)

@@ -61,6 +61,8 @@ def _print(target: Target):
         columns, rows = target.columns + 1, target.rows + 1
         light = np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 1
         lines = np.arange(columns + 1.0) - 1, np.arange(rows + 1.0) - 1
+    elif target.kind == "aprilgrid":
+        lines, light = _aprilgrid(target)
     else:
         columns, rows = target.columns, target.rows
         share = target.marker_m / target.square_m
@@ -78,6 +80,26 @@ def _print(target: Target):
         )
     light = np.pad(light, 1, constant_values=True)
     return lines, light.astype(float)
+
+
+def _aprilgrid(target: Target):
+    """Rows of tags, turned as on Kalibr's pages, between rows of small squares."""
+    side, gap = 6 + 2 * target.border, target.spacing
+    cuts = np.append(-gap, np.arange(side) / side)
+    n, pitch = len(cuts), 1.0 + gap
+    lines = tuple(
+        np.append(
+            (pitch * np.arange(count)[:, None] + cuts).ravel(), [pitch * count - gap, pitch * count]
+        )
+        for count in (target.columns, target.rows)
+    )
+    light = np.ones((target.rows * n + 1, target.columns * n + 1), bool)
+    light[::n, ::n] = False
+    for number in range(target.columns * target.rows):
+        row, column = target.rows - 1 - number // target.columns, number % target.columns
+        cells = marker_cells(target.dictionary, target.marker_id + number, target.border)
+        light[row * n + 1 : (row + 1) * n, column * n + 1 : (column + 1) * n] = ~cells[::-1, ::-1]
+    return lines, light
 
 
 def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

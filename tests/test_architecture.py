@@ -27,6 +27,7 @@ LAYERS = (
     ("robot",),
     ("instruments",),
     ("targets",),
+    ("prints",),
     ("printing",),
     ("finders",),
     ("dense",),

@@ -145,7 +145,7 @@ def test_a_corner_unlike_the_print_is_left_out_of_a_view():
 def test_where_few_corners_are_like_the_print_the_detector_serves(monkeypatch):
     image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)
     seen = Seen(np.arange(30), truth + 0.1)
-    monkeypatch.setattr(board, "find_checkerboard", lambda *_: seen)
+    monkeypatch.setitem(board.FINDERS, "checkerboard", lambda *_: seen)
     for covered, fits in ((0.3, True), (0.7, False), (1.0, False)):
         blank = image.copy()
         blank[:, : int(covered * image.shape[1])] = 120
@@ -181,9 +181,9 @@ def large():
 
 def searched(monkeypatch):
     """The sizes of the images that the detector is given."""
-    sizes, plain = [], board.find_charuco
-    monkeypatch.setattr(
-        board, "find_charuco", lambda im, it: sizes.append(im.shape) or plain(im, it)
+    sizes, plain = [], board.FINDERS["charuco"]
+    monkeypatch.setitem(
+        board.FINDERS, "charuco", lambda im, it: sizes.append(im.shape) or plain(im, it)
     )
     return sizes
 

@@ -401,10 +401,10 @@ class Table:
             raise self.refuse(key, values, needed)
         return [Table({key: value}, self.label).number(key) for value in values]
 
-    def integer(self, key: str, low: int, high: int) -> int:
+    def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
         """Reads a whole number from `low` to `high`."""
         needed = f"a whole number from {low} to {high}"
-        value = self._value(key, None, needed)
+        value = self._value(key, default, needed)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise self.refuse(key, value, needed)
         return value

@@ -1,15 +1,16 @@
 """Targets, printed ones and rigs of known points: their files, corners and symmetries.
 
 The target's frame: for a ChArUco board the origin is the outer corner of square 0, for a
-checkerboard inner corner 0, for a single marker its centre; x runs along columns, y along rows
-(down the printed page), and z into the board. A rig of points has the frame that its table is in.
+checkerboard inner corner 0, for an AprilGrid the outer corner of the tag at the upper left, for a
+single marker its centre; x runs along columns, y along rows (down the printed page), and z into the
+board. A rig of points has the frame that its table is in.
 """
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from visioncal import transforms
 from visioncal.documents.tables import TextTable, read_table
 from visioncal.errors import DataError
 from visioncal.files import Table, did_you_mean, find_described, is_inside, read_toml
-from visioncal.types import FloatArray, IntArray, Mask, Target
+from visioncal.types import FloatArray, IntArray, Mask, Target, TargetKind
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
 DEFAULT_RELATIVE_SIGMA = 1e-3
@@ -36,6 +37,15 @@ _LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
 
 # Fewer do not determine a pose robustly; more do not fit a printable board.
 _MIN_SQUARES, _MAX_SQUARES = 3, 100
+
+# A tag has four corners, which do; Kalibr's page has tags of this family with borders of two
+# modules, and white of no more than a tag between them.
+_MIN_TAGS, _MOST_SPACING, _MOST_BORDER = 1, 1.0, 2
+APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
+# A marker's corners, clockwise from its upper left, in its sides.
+_CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+# Kinds that are found where the image shows a part of them.
+FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
 
 
 def _shipped() -> dict[str, Path]:
@@ -127,17 +137,20 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
 
     Args:
         document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for
-            a single marker kind, id, size_m, dictionary; for a rig kind and points, the columns
-            of its table as lists.
+            a single marker kind, id, size_m, dictionary; for an AprilGrid kind, columns, rows,
+            size_m, spacing and, where they are not Kalibr's, id, dictionary, border; for a rig kind
+            and points, the columns of its table as lists.
         name: The name that the target gets.
 
     Raises:
         DataError: A field is missing, of another type, or out of range.
     """
     table = Table(document, f"target {name}")
-    kind = table.choice("kind", ("charuco", "checkerboard", "marker", "points"))
+    kind = table.choice("kind", get_args(TargetKind))
     if kind == "marker":
         return _marker(table, name)
+    if kind == "aprilgrid":
+        return _aprilgrid(table, name)
     if kind == "points":
         return _rig(table, name)
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
@@ -183,6 +196,38 @@ def _marker(table: Table, name: str) -> Target:
     dictionary = table.text("dictionary")
     marker_id = table.integer("id", 0, _dictionary_size(table, dictionary) - 1)
     return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=marker_id)
+
+
+def _aprilgrid(table: Table, name: str) -> Target:
+    columns = table.integer("columns", _MIN_TAGS, _MAX_SQUARES)
+    rows = table.integer("rows", _MIN_TAGS, _MAX_SQUARES)
+    size_m = _size(table, "size_m")
+    sigma_m = _sigma(table, size_m)
+    spacing = table.number("spacing", positive=True)
+    if spacing > _MOST_SPACING:
+        raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3,")
+    dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
+    markers = _dictionary_size(table, dictionary)
+    first = table.integer("id", 0, markers - 1, 0)
+    if first + columns * rows > markers:
+        raise DataError(
+            f"{table.label}: dictionary {dictionary} has {markers} tags; {columns} x {rows} tags "
+            f"from id {first} on need {first + columns * rows}.",
+            culprits=[f"{table.label}: columns"],
+        )
+    border = table.integer("border", 1, _MOST_BORDER, _MOST_BORDER)
+    return Target(
+        name,
+        "aprilgrid",
+        columns,
+        rows,
+        size_m,
+        sigma_m,
+        dictionary=dictionary,
+        marker_id=first,
+        spacing=spacing,
+        border=border,
+    )
 
 
 def _rig(table: Table, name: str) -> Target:
@@ -255,6 +300,18 @@ def target_document(target: Target) -> dict[str, Any]:
             "square_sigma_m": target.square_sigma_m,
             "dictionary": target.dictionary,
         }
+    if target.kind == "aprilgrid":
+        return {
+            "kind": "aprilgrid",
+            "columns": target.columns,
+            "rows": target.rows,
+            "size_m": target.square_m,
+            "square_sigma_m": target.square_sigma_m,
+            "spacing": target.spacing,
+            "dictionary": target.dictionary,
+            "id": target.marker_id,
+            "border": target.border,
+        }
     if target.kind == "points":
         places = corner_positions(target).T.tolist()
         columns = (list(target.point_numbers), *places, list(target.point_sigmas_m))
@@ -281,18 +338,31 @@ def corner_positions(target: Target) -> FloatArray:
 
     Returns:
         (n, 3) positions in the target's frame [m], in the order of the corners' numbers. A
-        marker's four corners come in OpenCV's order, clockwise from its top left; the points of
-        a rig in that of its table.
+        marker's four corners come in OpenCV's order, clockwise from its top left; those of an
+        AprilGrid likewise on the page, tag by tag in the order of their ids; the points of a rig in
+        that of its table.
     """
     side = target.square_m
     if target.kind == "points":
         return np.array(target.points_m, dtype=float)
     if target.kind == "marker":
-        return 0.5 * side * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        return np.asarray(side * (_CLOCKWISE - np.array([0.5, 0.5, 0.0])))
+    if target.kind == "aprilgrid":
+        places = np.pad((1.0 + target.spacing) * tag_places(target), ((0, 0), (0, 1)))
+        return np.asarray(side * (places[:, None] + _CLOCKWISE).reshape(-1, 3))
     inset = 1 if target.kind == "charuco" else 0
     rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
     flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
     return np.asarray(side * flat, dtype=float)
+
+
+def tag_places(target: Target) -> IntArray:
+    """The (t, 2) columns and rows of an AprilGrid's tags, in the order of their ids.
+
+    As on Kalibr's pages the first tag is at the lower left, and ids run along the rows.
+    """
+    rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    return np.stack([columns, target.rows - 1 - rows], axis=1)
 
 
 def point_numbers(target: Target) -> tuple[int, ...]:
@@ -319,18 +389,23 @@ def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
         return places.min(axis=0), places.max(axis=0)
     if target.kind == "marker":
         return np.full(2, -0.5 * side), np.full(2, 0.5 * side)
+    if target.kind == "aprilgrid":
+        # Small squares stand around the outermost tags too.
+        count = np.array([target.columns, target.rows])
+        high = side * (count * (1.0 + target.spacing))
+        return np.full(2, -side * target.spacing), high
     # A checkerboard's origin is its first inner corner, one square inside.
     low = np.full(2, 0.0 if target.kind == "charuco" else -side)
     return low, side * np.array([target.columns, target.rows], dtype=float)
 
 
-def marker_cells(dictionary_name: str, marker_id: int) -> Mask:
-    """The (n, n) dark cells of a marker, its border of one cell included."""
+def marker_cells(dictionary_name: str, marker_id: int, border: int = 1) -> Mask:
+    """The (n, n) dark cells of a marker, its border of so many cells included."""
     dictionary = aruco_dictionary(dictionary_name)
     size = dictionary.markerSize
     code = dictionary.bytesList[marker_id : marker_id + 1]
     bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
-    return np.pad(bits == 0, 1, constant_values=True)
+    return np.pad(bits == 0, border, constant_values=True)
 
 
 def marked_squares(target: Target) -> IntArray:

@@ -17,6 +17,7 @@ from visioncal.simulation import (
     Second,
     SweepOptions,
     WarmUpOptions,
+    aprilgrid_target,
     arm_named,
     cell_names,
     charuco_target,
@@ -36,7 +37,11 @@ from visioncal.simulation.records import truth_of, write_truth
 from visioncal.simulation.tracked import THREE, Tracked, tracked, write_tracked
 from visioncal.types import CameraMount
 
-_BOARDS = {"charuco": charuco_target, "checkerboard": checkerboard_target}
+_BOARDS = {
+    "charuco": charuco_target,
+    "checkerboard": checkerboard_target,
+    "aprilgrid": aprilgrid_target,
+}
 
 
 def simulate_command(
@@ -50,7 +55,7 @@ def simulate_command(
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
     ] = "wide",
     board: Annotated[
-        Literal["charuco", "checkerboard"], typer.Option(help="What is printed.")
+        Literal["charuco", "checkerboard", "aprilgrid"], typer.Option(help="What is printed.")
     ] = "charuco",
     second_board: Annotated[
         bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")

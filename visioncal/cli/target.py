@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 from rich.markup import escape
@@ -23,7 +23,7 @@ from visioncal.printing import (
     write_board,
 )
 from visioncal.targets import load_target, target_document, target_from_document, target_names
-from visioncal.types import Target, TargetKind
+from visioncal.types import Target
 
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",
@@ -31,7 +31,8 @@ target_app = typer.Typer(
 )
 
 # The options that describe a board, by its kind.
-_USED: dict[TargetKind, tuple[str, ...]] = {
+_Described: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "marker"]
+_USED: dict[_Described, tuple[str, ...]] = {
     "charuco": (
         "--columns",
         "--rows",
@@ -42,6 +43,16 @@ _USED: dict[TargetKind, tuple[str, ...]] = {
         "--name",
     ),
     "checkerboard": ("--columns", "--rows", "--square-mm", "--name"),
+    "aprilgrid": (
+        "--columns",
+        "--rows",
+        "--size-mm",
+        "--spacing",
+        "--border",
+        "--dictionary",
+        "--id",
+        "--name",
+    ),
     "marker": ("--id", "--size-mm", "--dictionary", "--name"),
 }
 # Where no page is named, the first of these that has room.
@@ -70,9 +81,12 @@ def make_command(
         typer.Option("--landscape/--portrait", help="Left out: as the board fits."),
     ] = None,
     dpi: Annotated[float, typer.Option(help="Pixels an inch of the PNG.")] = 300.0,
-    kind: Annotated[TargetKind | None, typer.Option(help="What to print.")] = None,
+    kind: Annotated[_Described | None, typer.Option(help="What to print.")] = None,
     columns: Annotated[
-        int | None, typer.Option(help="Squares along x; inner corners of a checkerboard.")
+        int | None,
+        typer.Option(
+            help="Squares along x; inner corners of a checkerboard, tags of an AprilGrid."
+        ),
     ] = None,
     rows: Annotated[int | None, typer.Option(help="The same along y.")] = None,
     square_mm: Annotated[
@@ -85,9 +99,18 @@ def make_command(
     legacy: Annotated[
         bool, typer.Option("--legacy", help="The ChArUco layout from before OpenCV 4.6.")
     ] = False,
-    marker_id: Annotated[int | None, typer.Option("--id", help="Id of a single marker.")] = None,
+    marker_id: Annotated[
+        int | None, typer.Option("--id", help="Id of a single marker; an AprilGrid's first.")
+    ] = None,
     size_mm: Annotated[
-        float | None, typer.Option(help="Side of a single marker; left out: the largest.")
+        float | None, typer.Option(help="Side of a single marker or a tag; left out: the largest.")
+    ] = None,
+    spacing: Annotated[
+        float | None,
+        typer.Option(help="White between an AprilGrid's tags, as a share of their side: 0.3."),
+    ] = None,
+    border: Annotated[
+        int | None, typer.Option(help="Dark modules around their bits: 2, as Kalibr has it.")
     ] = None,
     name: Annotated[str, typer.Option(help="Name of a board described by options.")] = "",
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
@@ -111,14 +134,26 @@ def make_command(
         "--legacy": legacy or None,
         "--id": marker_id,
         "--size-mm": size_mm,
+        "--spacing": spacing,
+        "--border": border,
         "--name": name or None,
     }
     _refuse_unused(kind, [option for option, value in described.items() if value is not None])
     request = None
     if kind is not None:
-        side_mm = size_mm if kind == "marker" else square_mm
+        side_mm = square_mm if size_mm is None else size_mm
         request = Request(
-            kind, columns, rows, side_mm, marker_mm, dictionary, legacy, marker_id, name
+            kind,
+            columns,
+            rows,
+            side_mm,
+            marker_mm,
+            dictionary,
+            legacy,
+            marker_id,
+            name,
+            spacing,
+            border,
         )
     sized = request is None or request.square_mm is not None
     pages = _pages(page, landscape, larger=sized)
@@ -133,7 +168,7 @@ def make_command(
     messages().print(escape(f"Print it on {sheet.page} at 100 %, and check both rulers."))
 
 
-def _refuse_unused(kind: TargetKind | None, given: list[str]) -> None:
+def _refuse_unused(kind: _Described | None, given: list[str]) -> None:
     """Refuses options that would change nothing."""
     used = _USED[kind] if kind is not None else ()
     unused = [option for option in given if option not in used]
@@ -158,7 +193,7 @@ def check_command(
     image: Annotated[Path, typer.Argument(help="A photograph of the board: png, jpg or tif.")],
     square_mm: Annotated[
         float | None,
-        typer.Option(help="Measured side of a square; of the marker for a single one."),
+        typer.Option(help="Measured side of a square; of a tag for an AprilGrid or a single one."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Write the description here.")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.finders.board import find_board
+from visioncal.finders.board import FINDERS, find_board
 from visioncal.finders.charuco import fitting_layouts
 from visioncal.finders.imaging import blur_at_corners
 from visioncal.finders.marker import find_marker
@@ -24,7 +24,7 @@ def find_target(image: Image, target: Target) -> Seen | NotFound:
         The corners, or why there are none.
     """
     match target.kind:
-        case "charuco" | "checkerboard":
+        case "charuco" | "checkerboard" | "aprilgrid":
             return find_board(image, target)
         case "marker":
             return find_marker(image, target)
@@ -48,7 +48,7 @@ def blur_of(image: Image, target: Target, ids: IntArray, px: FloatArray) -> floa
         The width as a Gaussian's sigma, on a board in the direction in which edges are wider: what
         moves is smeared in one alone [px].
     """
-    if target.kind in ("charuco", "checkerboard"):
+    if target.kind in FINDERS:
         blur_px = float(refine(image, target, ids, px).blur_px.max())
         if np.isfinite(blur_px):
             return blur_px

@@ -6,12 +6,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from visioncal.finders.aprilgrid import find_aprilgrid
 from visioncal.finders.charuco import find_charuco
 from visioncal.finders.checkerboard import find_checkerboard
 from visioncal.finders.result import NotFound, Seen
 from visioncal.finders.template import refine
 from visioncal.targets import corner_positions
-from visioncal.types import FloatArray, Image, Target
+from visioncal.types import FloatArray, Image, Target, TargetKind
 
 # Images with longer sides are halved first, and at twice as much once more: detectors take as long
 # as there are pixels. Smaller images lose markers and gain nothing.
@@ -21,22 +22,27 @@ _LONG_SIDE_PX = 2000
 # weight: so much less exact they are in the median of what was measured.
 _FEWEST_FITTED, _LEAST_FITTED, _DETECTED_WEIGHT = 6, 0.5, 0.1
 
+FINDERS: dict[TargetKind, Callable[[Image, Target], Seen | NotFound]] = {
+    "charuco": find_charuco,
+    "checkerboard": find_checkerboard,
+    "aprilgrid": find_aprilgrid,
+}
+
 
 def find_board(image: Image, target: Target) -> Seen | NotFound:
-    """Finds the corners of a checkerboard or a ChArUco board.
+    """Finds the corners of a board whose corners the template fits.
 
     OpenCV finds them, in a small copy where an image is large and shows the whole board there;
     the template of `refine` says where they are.
 
     Args:
         image: (h, w) grey image.
-        target: A checkerboard or a ChArUco target.
+        target: A target of one of the kinds of `FINDERS`.
 
     Returns:
         The corners, or why there are none.
     """
-    find: Callable[[Image, Target], Seen | NotFound]
-    find = find_charuco if target.kind == "charuco" else find_checkerboard
+    find = FINDERS[target.kind]
     for by in (4, 2):
         if max(image.shape) <= by // 2 * _LONG_SIDE_PX or min(image.shape) < by:
             continue

@@ -8,17 +8,13 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from visioncal.finders.layout import LAYOUT_MISFIT, layout_misfit
 from visioncal.finders.result import NotFound, Seen
 from visioncal.targets import charuco_board
 from visioncal.types import FloatArray, Image, Target
 
-# Rms distance of markers from a plane's homography, in sides of a marker. Lens distortion and
-# noise stay under a tenth; another layout moves every second row by more than a whole side.
-_LAYOUT_MISFIT = 0.35
 # A homography has eight unknowns and a marker gives eight equations: three markers check it.
 _LAYOUT_MARKERS = 3
-# A marker and those around it: of this many, some are of the rows above and below.
-_NEIGHBOURS = 9
 
 # Places on a marker's side to which distances are taken.
 _ALONG = 7
@@ -53,7 +49,7 @@ def find_charuco(image: Image, target: Target) -> Seen | NotFound:
     px, ids, marker_px, marker_ids = detector.detectBoard(image)
     if not marker_px:
         return NotFound(f"no board: no marker of {target.dictionary} is seen")
-    if _misfit(_by_id(marker_px, marker_ids), target) > _LAYOUT_MISFIT:
+    if _misfit(_by_id(marker_px, marker_ids), target) > LAYOUT_MISFIT:
         return NotFound("the markers do not lie as the target describes them", misfit=True)
     if np.size(ids) == 0 or px is None:
         return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
@@ -104,7 +100,7 @@ def fitting_layouts(image: Image, target: Target) -> tuple[Target, ...]:
         return ()
     markers = _by_id(marker_px, marker_ids)
     enough = [it for it in variants if len(_matches(markers, it)[0]) >= 4 * _LAYOUT_MARKERS]
-    return tuple(it for it in enough if _misfit(markers, it) <= _LAYOUT_MISFIT)
+    return tuple(it for it in enough if _misfit(markers, it) <= LAYOUT_MISFIT)
 
 
 def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's
@@ -127,31 +123,6 @@ def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]
 
 
 def _misfit(markers: _Markers, target: Target) -> float:
-    """Rms distance of the markers from their places on a plane, in sides of a marker.
-
-    A wide lens bends a board of many squares by more than a side, but nowhere a few neighbours:
-    where the whole board does not fit a plane, each marker is judged together with those around it.
-    """
+    """How far the markers are from their places; see `layout_misfit`."""
     on_board, in_image = (it.reshape(-1, 4, 2) for it in _matches(markers, target))
-    if len(on_board) < _LAYOUT_MARKERS:
-        return 0.0
-    whole = _off_plane(on_board, in_image)
-    if whole <= _LAYOUT_MISFIT:
-        return whole
-    centres = in_image.mean(axis=1)
-    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
-    near = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
-    parts = [_off_plane(on_board[it], in_image[it]) for it in near]
-    return float(np.sqrt(np.mean(np.square(parts))))
-
-
-def _off_plane(on_board: FloatArray, in_image: FloatArray) -> float:
-    """Rms distance of (n, 4, 2) corners of markers from a homography, in sides of a marker."""
-    flat, px = on_board.reshape(-1, 2), in_image.reshape(-1, 2)
-    homography = np.asarray(cv2.findHomography(flat, px)[0])
-    if homography.shape != (3, 3):
-        return 0.0
-    predicted = cv2.perspectiveTransform(flat[None], homography)[0]
-    sides = np.linalg.norm(np.diff(in_image, axis=1), axis=2)
-    errors = np.linalg.norm(predicted - px, axis=1)
-    return float(np.sqrt(np.mean(errors**2)) / np.median(sides))
+    return layout_misfit(on_board, in_image) if len(on_board) >= _LAYOUT_MARKERS else 0.0

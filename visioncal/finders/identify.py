@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.finders.charuco import find_charuco
+from visioncal.finders.identify_aprilgrid import find_grid
 from visioncal.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
 from visioncal.finders.identify_checkerboard import find_squares
 from visioncal.finders.identify_markers import Marker, decode_markers, genuine, holding
@@ -36,7 +37,7 @@ class Identity:
     Attributes:
         kind: What is printed.
         columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
-        rows: The same along y.
+        rows: The same along y; of tags for an AprilGrid.
         whole: Whether the board is seen to end there; where not, it may have more.
         dictionary: The smallest dictionary that holds the markers; empty without markers.
         larger: Other dictionaries that hold the same markers.
@@ -45,6 +46,9 @@ class Identity:
         marker_share: A marker's side over a square's; 0 except for ChArUco.
         marker_share_sigma: Standard deviation of that.
         marker_ids: The ids that were decoded, ascending; of single markers, the target's first.
+        first_id: The least id of an AprilGrid.
+        spacing: White between its tags, as a share of their side.
+        border: Dark modules around their bits.
         corners_seen: Corners that the finder of that kind finds.
         corners: Corners that the target has.
         notes: What else there is to know, in sentences.
@@ -62,6 +66,9 @@ class Identity:
     marker_share: float = 0.0
     marker_share_sigma: float = 0.0
     marker_ids: tuple[int, ...] = ()
+    first_id: int = -1
+    spacing: float = 0.0
+    border: int = 1
     notes: tuple[str, ...] = ()
 
     def target(self, name: str, square_m: float) -> Target:
@@ -81,12 +88,14 @@ class Identity:
             marker_m=round(self.marker_share * square_m, 5),
             dictionary=self.dictionary,
             legacy=self.legacy,
-            marker_id=self.marker_ids[0] if self.kind == "marker" else -1,
+            marker_id=self.marker_ids[0] if self.kind == "marker" else self.first_id,
+            spacing=self.spacing,
+            border=self.border,
         )
 
 
 def identify(image: Image) -> Identity:
-    """Names the target in an image: ChArUco board, checkerboard or marker.
+    """Names the target in an image: ChArUco board, AprilGrid, checkerboard or marker.
 
     Args:
         image: (h, w) grey image.
@@ -114,7 +123,7 @@ def identify(image: Image) -> Identity:
         f"No target is seen in this image of {width} x {height} pixels"
         + (f": {why}." if why else ".")
         + " Looked for were ChArUco boards and single markers of OpenCV's ArUco and AprilTag "
-        "dictionaries, and checkerboards of 3 x 3 inner corners or more; "
+        "dictionaries, AprilGrids, and checkerboards of 3 x 3 inner corners or more; "
         f"{len(decode_markers(image))} patterns looked like a marker.",
         culprits=["image"],
         next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
@@ -127,11 +136,14 @@ def _identity(image: Image) -> Identity | None:
     markers = decode_markers(image)
     boards = _charucos(image, markers)
     singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
-    found = list(boards.values()) or [*_checkerboards(image), *singles]
+    grids = _aprilgrids(image)
+    found = [*boards.values(), *grids] or [*_checkerboards(image), *singles]
     if not found:
         return None
     best = max(found, key=lambda it: it.corners_seen)
-    beside = (it for it in (*found, *singles) if it is not best)
+    # A grid's tags are no single ones.
+    around = () if best.kind == "aprilgrid" else singles
+    beside = (it for it in (*found, *around) if it is not best)
     return replace(best, notes=(*best.notes, *dict.fromkeys(_notes_beside(beside))))
 
 
@@ -234,6 +246,35 @@ def _checkerboards(image: Image) -> list[Identity]:
     return [
         Identity(
             "checkerboard", squares.columns, squares.rows, whole, seen, count, notes=tuple(notes)
+        )
+    ]
+
+
+def _aprilgrids(image: Image) -> list[Identity]:
+    grid = find_grid(image)
+    if grid is None:
+        return []
+    target = grid.target
+    notes = [
+        "The white between its tags is estimated by the image, to a hundredth of their side: "
+        "measure it to be sure."
+    ]
+    if not grid.whole:
+        notes.append(f"The board may go on above row {target.rows}, counted from below.")
+    return [
+        Identity(
+            "aprilgrid",
+            target.columns,
+            target.rows,
+            grid.whole,
+            grid.corners,
+            4 * target.columns * target.rows,
+            dictionary=target.dictionary,
+            marker_ids=tuple(grid.ids.tolist()),
+            first_id=target.marker_id,
+            spacing=target.spacing,
+            border=target.border,
+            notes=tuple(notes),
         )
     ]
 

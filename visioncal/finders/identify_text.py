@@ -39,6 +39,8 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
             "marker_over_square": identity.marker_share,
             "marker_over_square_sigma": identity.marker_share_sigma,
         }
+    if identity.kind == "aprilgrid":
+        document |= {"spacing": identity.spacing, "border": identity.border}
     if square_m is not None:
         document["target"] = target_document(identity.target("board", square_m))
     return document
@@ -53,9 +55,11 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
             sizes become comments that say what to measure.
         source: Where it was seen, for the first line.
     """
-    size = "size_m" if identity.kind == "marker" else "square_m"
-    what = "side of the dark square" if identity.kind == "marker" else "side of a square"
-    where = "measured" if identity.kind == "marker" else "measured over many squares"
+    size, what, where = "square_m", "side of a square", "measured over many squares"
+    if identity.kind == "marker":
+        size, what, where = "size_m", "side of the dark square", "measured"
+    if identity.kind == "aprilgrid":
+        size, what, where = "size_m", "side of a tag", "measured over many tags"
     lines = [f"# Seen in {one_line(source)}: {describe(identity)}."]
     lines += [f"# {note}" for note in identity.notes]
     if square_m is None:
@@ -84,6 +88,11 @@ def describe(identity: Identity) -> str:
     size = f"{least}{identity.columns} x {identity.rows}"
     if identity.kind == "checkerboard":
         return f"checkerboard of {size} inner corners, {seen}"
+    if identity.kind == "aprilgrid":
+        return (
+            f"AprilGrid of {size} tags, {identity.dictionary} from id {identity.first_id}, "
+            f"{identity.spacing:g} of a tag apart, {seen}"
+        )
     layout = ", legacy layout" if identity.legacy else ""
     return (
         f"ChArUco board of {size} squares, {identity.dictionary}{layout}, "

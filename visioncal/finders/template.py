@@ -17,6 +17,10 @@ Ink that spreads, a tone curve, and a symmetric blur of another shape are even a
 they leave residuals but do not move it. The image is smoothed a little first, because demosaicing
 and sharpening leave a pattern with a period of two pixels. On ChArUco boards the pixels of the
 markers and of their blurred edges are left out. All corners of an image are worked on at once.
+
+The corners of an AprilGrid's tags are such corners too, for each touches a small dark square. The
+white between tags takes the place of the squares' side: within it lie a corner's lines alone, and
+the next ones.
 """
 
 from contextlib import suppress
@@ -28,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.finders.maps import maps_about
-from visioncal.targets import corner_positions, marked_squares
+from visioncal.targets import corner_positions, marked_squares, marker_cells
 from visioncal.types import FloatArray, Image, IntArray, Mask, Target
 
 _Float32Array: TypeAlias = npt.NDArray[np.float32]
@@ -88,15 +92,21 @@ class _Pattern:
 
     Attributes:
         signs: (n,) the colour of the squares where x y > 0: one sign for the light ones. On a
-            checkerboard, which may be described turned, the other sign may be the light one.
-        inset: How far a light square's marker is from its edges [squares]; infinite without one.
+            checkerboard, which may be described turned, the other sign may be the light one; on an
+            AprilGrid one sign stands for the dark ones.
+        inset: How far a light square's marker is from its edges, or the bits of a tag from its own
+            [squares]; infinite without them.
     """
 
     signs: FloatArray
     inset: float
 
     @classmethod
-    def of(cls, target: Target, board: FloatArray) -> Self:
+    def of(cls, target: Target, ids: IntArray, board: FloatArray) -> Self:
+        if target.kind == "aprilgrid":
+            modules = len(marker_cells(target.dictionary, target.marker_id, target.border))
+            # The tag is off its own corners in turn: below right, below left, and so on.
+            return cls(np.where(ids % 2, -1.0, 1.0), target.border / (modules * target.spacing))
         odd = np.rint(board).astype(int).sum(axis=1) % 2
         if target.kind == "checkerboard":
             return cls(1.0 - 2.0 * odd, np.inf)
@@ -219,7 +229,7 @@ class _Step:
 
 
 def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
-    """Refines corners of a checkerboard or a ChArUco board; see the module.
+    """Refines corners of a checkerboard, a ChArUco board or an AprilGrid; see the module.
 
     Args:
         image: (h, w) grey image.
@@ -230,7 +240,8 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     Returns:
         The corners, in the same order.
     """
-    board = corner_positions(target)[ids, :2] / target.square_m
+    share = target.spacing if target.kind == "aprilgrid" else 1.0
+    board = corner_positions(target)[ids, :2] / (share * target.square_m)
     low = np.maximum(np.floor(px.min(axis=0)).astype(int) - _RIM_PX, 0)
     high = np.ceil(px.max(axis=0)).astype(int) + _RIM_PX + 1
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
@@ -238,7 +249,7 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     # Corners that cannot be fitted may lead to anything; they are sorted out afterwards.
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         if len(ids) >= _FEWEST and flat and part.size:
-            refined = _refined(part, _Pattern.of(target, board), board, px - low)
+            refined = _refined(part, _Pattern.of(target, ids, board), board, px - low)
             return replace(refined, px=refined.px + low)
     nothing = np.full(len(ids), np.nan)
     reason = "the corners found are too few, or lie as no board's do"

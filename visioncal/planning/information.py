@@ -34,7 +34,7 @@ from visioncal.estimation.workspace import postures
 from visioncal.planning.cell import Box, PlanCell
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
-from visioncal.targets import corner_positions
+from visioncal.targets import FOUND_IN_PART, corner_positions
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
@@ -390,7 +390,7 @@ def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[Co
     px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
-    fewest = _FEWEST_CORNERS if cell.target.kind == "charuco" else len(positions)
+    fewest = _FEWEST_CORNERS if cell.target.kind in FOUND_IN_PART else len(positions)
     seen = visible.sum(axis=1) >= fewest
     view, corner = np.nonzero(visible[seen])
     counts = visible[seen].sum(axis=1)

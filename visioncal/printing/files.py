@@ -8,6 +8,7 @@ from visioncal.errors import DataError
 from visioncal.files import check_free, named_errors, read_toml, write_atomically
 from visioncal.generations import write_generation
 from visioncal.printing.page import Sheet
+from visioncal.printing.request import OF_TAGS
 from visioncal.targets import target_document, target_from_document
 from visioncal.types import Target
 
@@ -104,7 +105,7 @@ def _description(sheet: Sheet) -> str:
     left, top, right, bottom = sheet.pattern.box
     page = sheet.page
     lying = "landscape" if page.width_mm > page.height_mm else "portrait"
-    size = "size_m" if sheet.target.kind == "marker" else "square_m"
+    size = "size_m" if sheet.target.kind in OF_TAGS else "square_m"
     return (
         f"# {1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, for {page.name}, {lying}.\n"
         f"# {size} is what was meant to be printed: replace it by what you measure on paper,\n"

@@ -34,6 +34,8 @@ ARROW_MM = 8.0
 
 FONT_PT = 7.0
 LINE_MM = 3.1
+# What is measured over whole squares.
+_OF_SQUARES = ("charuco", "checkerboard")
 # The text's gap to the white around the board.
 _GAP_MM = 0.5
 # Width of a line over its number of letters, with some room to spare.
@@ -144,7 +146,7 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
             return _centred(target, pattern, page, room)
     left, top, right, bottom = pattern.box
     needed = _room(target, pattern, pages[0])
-    what = "side" if target.kind == "marker" else "square"
+    what = "square" if target.kind in _OF_SQUARES else "side"
     largest = largest_side_mm(target, pages)
     smaller = f", or a {what} of {largest} mm, the largest that fits" if largest else ""
     raise DataError(
@@ -257,7 +259,20 @@ def _sentences(target: Target) -> tuple[str, str, str]:
                 f"{1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}"
             )
             origin = "the print's top left corner"
-    if target.kind != "marker":
+        case "aprilgrid":
+            what = (
+                f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm}, "
+                f"{1e3 * target.spacing * target.square_m:g} mm apart, {target.dictionary} from id "
+                f"{target.marker_id} at the lower left"
+            )
+            origin = "the upper left corner of the tag at the top left"
+            sides = target.columns + (target.columns - 1) * target.spacing
+            measure = (
+                f"Measure over all {target.columns} columns of tags, meant to be "
+                f"{1e3 * sides * target.square_m:g} mm; divide by {sides:g} and write the result "
+                "into size_m, in metres."
+            )
+    if target.kind in _OF_SQUARES:
         count = target.columns + (target.kind == "checkerboard")
         measure = (
             f"Measure over all {count} columns, meant to be {1e3 * count * target.square_m:g} mm; "

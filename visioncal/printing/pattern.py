@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.targets import marked_squares, marker_cells
+from visioncal.prints import dark_cells
+from visioncal.targets import extent_m
 from visioncal.types import FloatArray, Mask, Target
 
 # White that finders need around squares; markers need one of their own modules.
@@ -35,24 +35,11 @@ def draw_pattern(target: Target) -> Pattern:
     Raises:
         DataError: It is a rig of points.
     """
-    side = target.square_m
-    match target.kind:
-        case "marker":
-            dark = marker_cells(target.dictionary, target.marker_id)
-            module_m = side / len(dark)
-            loops = _moved(dark, np.full(2, -0.5 * side), module_m)
-            return Pattern(loops, (-side / 2, -side / 2, side / 2, side / 2), module_m)
-        case "checkerboard":
-            # The square diagonally outside corner 0 is dark.
-            row, column = np.indices((target.rows + 1, target.columns + 1))
-            loops = _moved((row + column) % 2 == 0, np.full(2, -side), side)
-            box = (-side, -side, target.columns * side, target.rows * side)
-            return Pattern(loops, box, _QUIET_M)
-        case "charuco":
-            box = (0.0, 0.0, target.columns * side, target.rows * side)
-            return Pattern(_charuco_loops(target), box, _QUIET_M)
-        case "points":
-            raise DataError(f"target {target.name} is a rig of points; a board can be printed.")
+    (left, top), (right, bottom) = (it.tolist() for it in extent_m(target))
+    grids = dark_cells(target)
+    loops = (it.corner_m + it.cell_m * loop for it in grids for loop in outlines(it.dark))
+    quiet_m = grids[0].cell_m if target.kind == "marker" else _QUIET_M
+    return Pattern(tuple(loops), (left, top, right, bottom), quiet_m)
 
 
 def outlines(dark: Mask) -> tuple[FloatArray, ...]:
@@ -99,21 +86,3 @@ def _without_straight(loop: FloatArray) -> FloatArray:
     before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
     turns = before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]
     return np.asarray(loop[turns])
-
-
-def _moved(dark: Mask, corner_m: FloatArray, cell_m: float) -> tuple[FloatArray, ...]:
-    """Outlines of a grid whose first cell's outer corner and cell side are given [m]."""
-    return tuple(corner_m + cell_m * loop for loop in outlines(dark))
-
-
-def _charuco_loops(target: Target) -> tuple[FloatArray, ...]:
-    light = marked_squares(target)
-    dark = np.ones((target.rows, target.columns), dtype=bool)
-    dark[light[:, 1], light[:, 0]] = False
-    loops = list(_moved(dark, np.zeros(2), target.square_m))
-    inset = (target.square_m - target.marker_m) / 2
-    for marker_id, square in enumerate(light):
-        cells = marker_cells(target.dictionary, marker_id)
-        corner_m = target.square_m * square + inset
-        loops += _moved(cells, corner_m, target.marker_m / len(cells))
-    return tuple(loops)

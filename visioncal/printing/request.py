@@ -5,11 +5,21 @@ from typing import Any
 
 from visioncal.errors import DataError
 from visioncal.printing.page import Page, arrange, largest_side_mm
-from visioncal.targets import LARGEST_M, aruco_dictionary, metres, target_from_document
+from visioncal.targets import (
+    APRILGRID_DICTIONARY,
+    LARGEST_M,
+    aruco_dictionary,
+    metres,
+    target_from_document,
+)
 from visioncal.types import Target, TargetKind
 
 # A marker's share of its square: it leaves at least one module of white on every side.
 _MARKER_SHARE = 0.75
+# Kalibr's pages have so much white between their tags, as a share of a tag's side.
+_SPACING = 0.3
+# Kinds whose size is that of a tag.
+OF_TAGS = ("marker", "aprilgrid")
 # Smaller squares are lost to the printer's dots.
 _LEAST_MM = 5
 # Nobody measures a smaller one to its 0.1 %.
@@ -23,14 +33,16 @@ class Request:
 
     Attributes:
         kind: What is printed.
-        columns: Squares (ChArUco) or inner corners (checkerboard) along x.
+        columns: Squares (ChArUco), inner corners (checkerboard) or tags (AprilGrid) along x.
         rows: The same along y.
-        square_mm: Side of a square; of the marker itself for a single marker [mm].
+        square_mm: Side of a square; of the marker itself for a single marker and an AprilGrid [mm].
         marker_mm: Side of the markers in a ChArUco board [mm].
         dictionary: ArUco dictionary by OpenCV's name.
         legacy: Whether a ChArUco board gets the layout that OpenCV printed before 4.6.
-        marker_id: The id of a single marker.
+        marker_id: The id of a single marker; the least one of an AprilGrid.
         name: The target's name.
+        spacing: White between the tags of an AprilGrid, as a share of their side.
+        border: Dark modules around their bits.
     """
 
     kind: TargetKind
@@ -42,6 +54,8 @@ class Request:
     legacy: bool = False
     marker_id: int | None = None
     name: str = ""
+    spacing: float | None = None
+    border: int | None = None
 
 
 def side_metres(option: str, side_mm: float) -> float:
@@ -86,13 +100,17 @@ def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
 
 def _target(request: Request, square_mm: float) -> Target:
     document: dict[str, Any] = {"kind": request.kind}
-    side_m = side_metres("--size-mm" if request.kind == "marker" else "--square-mm", square_mm)
-    if request.kind == "marker":
-        document |= {"size_m": side_m, "dictionary": request.dictionary or "DICT_APRILTAG_36h11"}
-        wishes: dict[str, int | None] = {"id": request.marker_id}
-    else:
-        document |= {"square_m": side_m}
-        wishes = {"columns": request.columns, "rows": request.rows}
+    of_tags = request.kind in OF_TAGS
+    side_m = side_metres("--size-mm" if of_tags else "--square-mm", square_mm)
+    document |= {"size_m" if of_tags else "square_m": side_m}
+    if of_tags:
+        document |= {"dictionary": request.dictionary or APRILGRID_DICTIONARY}
+    wishes: dict[str, float | None] = {"id": request.marker_id} if of_tags else {}
+    if request.kind != "marker":
+        wishes |= {"columns": request.columns, "rows": request.rows}
+    if request.kind == "aprilgrid":
+        spacing = _SPACING if request.spacing is None else request.spacing
+        wishes |= {"spacing": spacing, "border": request.border}
     document |= {key: value for key, value in wishes.items() if value is not None}
     if request.kind == "charuco":
         marker_mm = request.marker_mm

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import rerun as rr
 
+from visioncal.prints import dark_cells
 from visioncal.recording import colours
-from visioncal.targets import corner_positions, extent_m, marked_squares, marker_cells
-from visioncal.types import FloatArray, Image, Mask, Target
+from visioncal.targets import corner_positions, extent_m
+from visioncal.types import FloatArray, Image, Target
 
 # Enough to show the bits of the markers; the pattern of a large board still stays small.
 _SQUARE_PX, _LARGEST_PX = 48, 2000
@@ -67,32 +68,19 @@ def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
 
 def picture(target: Target) -> Image:
     """The printed pattern inside its outline, as a grey image with x to the right and y down."""
-    squares = np.rint(np.subtract(*extent_m(target)[::-1]) / target.square_m).astype(int)
-    square_px = max(min(_SQUARE_PX, _LARGEST_PX // int(squares.max())), 1)
-    if target.kind == "marker":
-        return _marker(target, target.marker_id, 4 * _SQUARE_PX)
-    if target.kind == "checkerboard":
-        row, column = np.mgrid[: squares[1], : squares[0]]
-        # The square that touches corner 0 from outside, on its diagonal, is dark.
-        return _enlarged((row + column) % 2 == 1, square_px)
-    marked = marked_squares(target)
-    light = np.zeros((target.rows, target.columns), dtype=bool)
-    light[marked[:, 1], marked[:, 0]] = True
-    page = _enlarged(light, square_px)
-    side_px = max(round(square_px * target.marker_m / target.square_m), 1)
-    corners = square_px * marked + (square_px - side_px) // 2
-    for marker_id, (x, y) in enumerate(corners):
-        page[y : y + side_px, x : x + side_px] = _marker(target, marker_id, side_px)
+    low, high = extent_m(target)
+    side_px = _LARGEST_PX * target.square_m / float(np.max(high - low))
+    side_px = max(int(min(4 * _SQUARE_PX if target.kind == "marker" else _SQUARE_PX, side_px)), 1)
+    scale = side_px / target.square_m
+    width, height = np.rint(scale * (high - low)).astype(int).tolist()
+    page = np.full((height, width), 255, dtype=np.uint8)
+    for grid in dark_cells(target):
+        left, top = np.rint(scale * (grid.corner_m - low)).astype(int).tolist()
+        rows, columns = (max(round(scale * grid.cell_m * it), 1) for it in grid.dark.shape)
+        # Where there are more cells than pixels, they mix to grey.
+        how = cv2.INTER_NEAREST if rows >= len(grid.dark) else cv2.INTER_AREA
+        light = np.where(grid.dark, 0, 255).astype(np.uint8)
+        there = page[top : top + rows, left : left + columns]
+        drawn = cv2.resize(light, (columns, rows), interpolation=how)
+        np.minimum(there, drawn[: there.shape[0], : there.shape[1]], out=there)
     return page
-
-
-def _enlarged(light: Mask, square_px: int) -> Image:
-    squares = np.where(light, 255, 0).astype(np.uint8)
-    return np.kron(squares, np.ones((square_px, square_px), dtype=np.uint8))
-
-
-def _marker(target: Target, marker_id: int, side_px: int) -> Image:
-    cells = np.where(marker_cells(target.dictionary, marker_id), 0, 255).astype(np.uint8)
-    # Where there are more cells than pixels, they mix to grey.
-    how = cv2.INTER_NEAREST if side_px >= len(cells) else cv2.INTER_AREA
-    return np.asarray(cv2.resize(cells, (side_px, side_px), interpolation=how), dtype=np.uint8)

@@ -28,6 +28,9 @@ def pattern_box(target: Target) -> tuple[float, float, float, float]:
     side = target.square_m
     if target.kind == "marker":
         return (-0.5 * side, -0.5 * side, 0.5 * side, 0.5 * side)
+    if target.kind == "aprilgrid":
+        gap = target.spacing * side
+        return (-gap, -gap, target.columns * (side + gap), target.rows * (side + gap))
     start = 0.0 if target.kind == "charuco" else -side
     return (start, start, target.columns * side, target.rows * side)
 
@@ -42,6 +45,8 @@ def corners_m(sheet: Sheet) -> FloatArray:
     if target.kind == "marker":
         half = 0.5 * target.square_m
         flat = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    elif target.kind == "aprilgrid":
+        flat = np.concatenate([_around(it, target.square_m) for _, it in tags_m(target)])
     else:
         first, less = (1, 1) if target.kind == "charuco" else (0, 0)
         columns = np.arange(target.columns - less) + first
@@ -49,6 +54,30 @@ def corners_m(sheet: Sheet) -> FloatArray:
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         flat = target.square_m * grid.astype(float)
     return lift(sheet, sheet.scale * flat)
+
+
+def tags_m(target: Target) -> list[tuple[int, FloatArray]]:
+    """The ids of an AprilGrid's tags, and where the upper left corner of each is, (2,) [m].
+
+    As Kalibr prints them: row by row from the lower left.
+    """
+    pitch_m = (1.0 + target.spacing) * target.square_m
+    places = [(x, y) for y in reversed(range(target.rows)) for x in range(target.columns)]
+    return [
+        (target.marker_id + number, pitch_m * np.array(place, dtype=float))
+        for number, place in enumerate(places)
+    ]
+
+
+def _around(corner: FloatArray, side_m: float) -> FloatArray:
+    """(4, 2) the corners of a tag, clockwise from its upper left one [m]."""
+    right, down = side_m * np.eye(2)
+    return np.array([corner, corner + right, corner + right + down, corner + down])
+
+
+def found_in_part(target: Target) -> bool:
+    """Whether finders make do with a part of a board; others are found whole or not at all."""
+    return target.kind in ("charuco", "aprilgrid")
 
 
 def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:

@@ -38,9 +38,26 @@ def checkerboard_target() -> Target:
     )
 
 
+def aprilgrid_target() -> Target:
+    """An AprilGrid of 6x4 tags of 32 mm, as Kalibr prints them."""
+    return Target(
+        name="aprilgrid_6x4_32mm",
+        kind="aprilgrid",
+        columns=6,
+        rows=4,
+        square_m=0.032,
+        square_sigma_m=3.2e-5,
+        dictionary="DICT_APRILTAG_36h11",
+        marker_id=0,
+        spacing=0.3,
+        border=2,
+    )
+
+
 TARGETS: Mapping[str, Callable[[], Target]] = {
     "charuco_9x6_30mm": charuco_target,
     "checkerboard_9x6_25mm": checkerboard_target,
+    "aprilgrid_6x4_32mm": aprilgrid_target,
 }
 
 

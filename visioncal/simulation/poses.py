@@ -3,7 +3,14 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.simulation.boards import Sheet, centre_m, corners_m, outline_m, pattern_box
+from visioncal.simulation.boards import (
+    Sheet,
+    centre_m,
+    corners_m,
+    found_in_part,
+    outline_m,
+    pattern_box,
+)
 from visioncal.simulation.optics import rays, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.transforms import compose
@@ -50,8 +57,8 @@ def draw_views(
     """
     rotation = _rotations(options, count, rng)
     distance = rng.uniform(*working_distance_m(options), size=count)
-    # At most this share of the views may be cut; a checkerboard is found whole or not at all.
-    may_be_cut = rng.random(count) < (options.cut_views if options.target.kind == "charuco" else 0)
+    # At most this share of the views may be cut.
+    may_be_cut = rng.random(count) < (options.cut_views if found_in_part(options.target) else 0)
     reach = np.where(may_be_cut, 0.4, 0.3)[:, None]
     aim = (0.5 + reach * rng.uniform(-1.0, 1.0, size=(count, 2))) * np.array(
         options.camera.resolution

@@ -342,15 +342,18 @@ def _camera_table(cell: Cell) -> dict[str, Any]:
 def target_document(target: Target) -> dict[str, Any]:
     """What the file of a board says."""
     document: dict[str, Any] = {"kind": target.kind}
-    if target.kind == "marker":
-        document |= {"id": target.marker_id, "size_m": target.square_m}
-    else:
-        document |= {"columns": target.columns, "rows": target.rows, "square_m": target.square_m}
+    if target.kind != "marker":
+        document |= {"columns": target.columns, "rows": target.rows}
+    document["size_m" if target.kind in ("marker", "aprilgrid") else "square_m"] = target.square_m
     document["square_sigma_m"] = target.square_sigma_m
+    if target.dictionary:
+        document["dictionary"] = target.dictionary
+    if target.marker_id >= 0:
+        document["id"] = target.marker_id
     if target.kind == "charuco":
         document |= {"marker_m": target.marker_m, "legacy": target.legacy}
-    if target.kind != "checkerboard":
-        document["dictionary"] = target.dictionary
+    if target.kind == "aprilgrid":
+        document |= {"spacing": target.spacing, "border": target.border}
     return document
 
 

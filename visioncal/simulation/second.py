@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.simulation.boards import Sheet, centre_m, corners_m
+from visioncal.simulation.boards import Sheet, centre_m, corners_m, found_in_part
 from visioncal.simulation.optics import sees
 from visioncal.simulation.options import CellOptions, Second
 from visioncal.transforms import compose
@@ -106,6 +106,5 @@ def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     if not looks.any():
         return np.asarray(looks)
     share = sees(camera, points[looks], _EDGE_PX).mean(axis=1)
-    # A checkerboard is found whole or not at all.
-    looks[looks] = share >= (1.0 if sheet.target.kind == "checkerboard" else _LEAST_SHARE)
+    looks[looks] = share >= (_LEAST_SHARE if found_in_part(sheet.target) else 1.0)
     return np.asarray(looks)

@@ -9,7 +9,7 @@ from visioncal.errors import DataError
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.simulation.arms import forward
-from visioncal.simulation.boards import corners_m
+from visioncal.simulation.boards import corners_m, found_in_part
 from visioncal.simulation.layout import CELL, Swept
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.seen import Network, Sight, camera_named, sheet_named
@@ -56,8 +56,7 @@ def sweep_network(
     sigma = np.repeat([robot.sigma_rad, robot.sigma_m], 3)
     optics, sheet = camera_named(options, swept.camera).camera, sheet_named(options, swept.target)
     corners = corners_m(sheet)
-    # A checkerboard is found whole or not at all.
-    fewest = len(corners) if sheet.target.kind == "checkerboard" else _FEWEST_CORNERS
+    fewest = _FEWEST_CORNERS if found_in_part(sheet.target) else len(corners)
     sights: list[Sight] = []
     for taken_s in np.arange(0.5 / how.frames_hz, end_s, 1.0 / how.frames_hz).tolist():
         off, late_s = exp(sigma * rng.standard_normal((1, 6))), np.zeros(len(corners))

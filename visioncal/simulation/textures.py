@@ -1,5 +1,6 @@
 """What a simulated camera looks at: the printed sheet on its plate, and a table-top."""
 
+import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -8,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.errors import DataError
-from visioncal.simulation.boards import pattern_box
-from visioncal.types import FloatArray, Image, Target
+from visioncal.simulation.boards import pattern_box, tags_m
+from visioncal.types import FloatArray, Image, Mask, Target
 
 _Canvas: TypeAlias = npt.NDArray[np.float32]
 
@@ -46,12 +47,16 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
         DataError: OpenCV does not have the target's dictionary.
     """
     left, top, right, bottom = pattern_box(target)
-    columns, rows = (round((b - a) / target.square_m) for a, b in ((left, right), (top, bottom)))
+    # Whole squares of most boards; what is left over of a texel stays white.
+    width, height = (
+        math.ceil(round((b - a) / target.square_m * texels, 6))
+        for a, b in ((left, right), (top, bottom))
+    )
     margin = 2 * int(np.ceil(0.5 * _SHADOW_MARGIN * texels))
-    grey = np.full((rows * texels + 2 * margin, columns * texels + 2 * margin), _PLATE, np.uint8)
+    grey = np.full((height + 2 * margin, width + 2 * margin), _PLATE, np.uint8)
     paper = margin - round(_PAPER_MARGIN * texels)
     grey[paper:-paper, paper:-paper] = _PAPER
-    grey[margin:-margin, margin:-margin] = _print(target, columns, rows, texels)
+    grey[margin:-margin, margin:-margin] = _print(target, (height, width), texels)
     _draw_label(grey[-margin:-paper, margin:-margin], target, texels)
     plate = margin - round(_PLATE_MARGIN * texels)
     coverage = _shadow(grey.shape, plate, texels)
@@ -122,10 +127,13 @@ def _draw_label(strip: Image, target: Target, texels: int) -> None:
     cv2.putText(strip, words, at, font, 0.8 * scale, 110.0, thickness, cv2.LINE_AA)
 
 
-def _print(target: Target, columns: int, rows: int, texels: int) -> Image:
-    """The print itself, (rows * texels, columns * texels)."""
+def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
+    """The print itself, of so many texels down and across."""
     if target.kind == "marker":
         return _marker(target, target.marker_id, texels)
+    if target.kind == "aprilgrid":
+        return _inked(_aprilgrid(target, shape, texels))
+    rows, columns = (it // texels for it in shape)
     row, column = np.mgrid[:rows, :columns]
     # Boards from before OpenCV 4.6 start with a white square where the number of rows is even.
     shift = int(target.kind == "charuco" and target.legacy and rows % 2 == 0)
@@ -142,11 +150,55 @@ def _print(target: Target, columns: int, rows: int, texels: int) -> Image:
     return image
 
 
-def _marker(target: Target, number: int, side: int) -> Image:
+def _inked(dark: FloatArray) -> Image:
+    """Grey levels where a share (h, w) of each texel is dark."""
+    return np.asarray(np.rint(_PAPER + (_INK - _PAPER) * dark), np.uint8)
+
+
+def _aprilgrid(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
+    """Which share (h, w) of each texel is dark."""
+    dark = np.zeros(shape)
+    gap = target.spacing * texels
+    for number, corner in tags_m(target):
+        bits = _modules(target, number)[1:-1, 1:-1] == 0
+        cells = np.pad(bits[::-1, ::-1], target.border, constant_values=True)
+        _stamp(dark, cells, gap + corner / target.square_m * texels, texels / len(cells))
+    for x in range(target.columns + 1):
+        for y in range(target.rows + 1):
+            place = (texels + gap) * np.array([x, y], dtype=float)
+            _stamp(dark, np.ones((1, 1), bool), place, gap)
+    return dark
+
+
+def _stamp(dark: FloatArray, cells: Mask, corner: FloatArray, cell: float) -> None:
+    """Adds the dark of a grid of cells, whose first begins at a place [texels], by its area."""
+    down, across = (
+        _overlaps(start, cell, cells.shape[axis], dark.shape[axis])
+        for axis, start in enumerate(corner[::-1].tolist())
+    )
+    rows, columns = (slice(it[0], it[0] + it[1].shape[1]) for it in (down, across))
+    dark[rows, columns] += down[1].T @ cells @ across[1]
+
+
+def _overlaps(start: float, cell: float, count: int, texels: int) -> tuple[int, FloatArray]:
+    """The first texel that cells in a row touch, and (cells, texels) how much of each they have."""
+    edges = start + cell * np.arange(count + 1)
+    first, end = math.floor(edges[0]), min(math.ceil(edges[-1]), texels)
+    texel = np.arange(first, end)
+    low, high = (np.clip(texel[None] + more, edges[:-1, None], edges[1:, None]) for more in (0, 1))
+    return first, high - low
+
+
+def _modules(target: Target, number: int) -> Image:
+    """The modules of a marker with a border of one, light ones above zero."""
     if not hasattr(cv2.aruco, target.dictionary):
         raise DataError(f"simulation: OpenCV has no dictionary {target.dictionary!r}.")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-    modules = dictionary.generateImageMarker(number, dictionary.markerSize + 2)
+    return np.asarray(dictionary.generateImageMarker(number, dictionary.markerSize + 2), np.uint8)
+
+
+def _marker(target: Target, number: int, side: int) -> Image:
+    modules = _modules(target, number)
     # Edges between modules are rounded to texels; the corners of a target are not among them.
     bits = cv2.resize(modules, (side, side), interpolation=cv2.INTER_NEAREST)
     return np.where(bits > 0, _PAPER, _INK).astype(np.uint8)

@@ -332,6 +332,16 @@ def _check_layout(
     shown = sum(isinstance(look.found, Corners) for _, look in mine)
     if not misfits or len(misfits) <= shown:
         return
+    culprits = [f"view {it.number}" for it in misfits]
+    if target.kind != "charuco":
+        reasons = [it.reason for it in _rejections([look for _, look in mine if look.misfit])]
+        raise DataError(
+            f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views another "
+            f"board is seen: {max(set(reasons), key=reasons.count)}.",
+            culprits=culprits,
+            next_step="Mend the target's .toml, or name another: visioncal target check IMAGE says "
+            "what is printed.",
+        )
     images = [decode_image(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
     fitting = [fitting_layouts(it, target) for it in images if not isinstance(it, str)]
     common = [it for it in fitting[0] if all(it in others for others in fitting)]
@@ -340,7 +350,6 @@ def _check_layout(
         f"not lie as on a ChArUco board of {target.columns} x {target.rows} squares with "
         f"legacy = {str(target.legacy).lower()}"
     )
-    culprits = [f"view {it.number}" for it in misfits]
     if not common:
         raise DataError(
             f"{seen}, nor with columns and rows exchanged or in the other layout.",

@@ -1,0 +1,73 @@
+"""What is dark on a printed target: grids of cells."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.errors import DataError
+from visioncal.targets import corner_positions, marked_squares, marker_cells
+from visioncal.types import FloatArray, Mask, Target
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A grid of dark and light cells.
+
+    Attributes:
+        corner_m: (2,) the outer corner of the first cell in the target's frame [m].
+        cell_m: Side of a cell [m].
+        dark: (rows, columns) which cells are dark.
+    """
+
+    corner_m: FloatArray
+    cell_m: float
+    dark: Mask
+
+
+def dark_cells(target: Target) -> tuple[Cells, ...]:
+    """Lists what is dark on a target: no two grids share more than a point of their dark.
+
+    Raises:
+        DataError: It is a rig of points, which is not printed.
+    """
+    side = target.square_m
+    match target.kind:
+        case "marker":
+            dark = marker_cells(target.dictionary, target.marker_id)
+            return (Cells(np.full(2, -0.5 * side), side / len(dark), dark),)
+        case "checkerboard":
+            # The square diagonally outside corner 0 is dark.
+            row, column = np.indices((target.rows + 1, target.columns + 1))
+            return (Cells(np.full(2, -side), side, (row + column) % 2 == 0),)
+        case "charuco":
+            return _charuco(target)
+        case "aprilgrid":
+            return _aprilgrid(target)
+        case "points":
+            raise DataError(f"target {target.name} is a rig of points; a board can be printed.")
+
+
+def _charuco(target: Target) -> tuple[Cells, ...]:
+    light = marked_squares(target)
+    dark = np.ones((target.rows, target.columns), dtype=bool)
+    dark[light[:, 1], light[:, 0]] = False
+    grids = [Cells(np.zeros(2), target.square_m, dark)]
+    inset = (target.square_m - target.marker_m) / 2
+    for marker_id, square in enumerate(light):
+        cells = marker_cells(target.dictionary, marker_id)
+        corner_m = target.square_m * square + inset
+        grids.append(Cells(corner_m, target.marker_m / len(cells), cells))
+    return tuple(grids)
+
+
+def _aprilgrid(target: Target) -> tuple[Cells, ...]:
+    """The tags, turned by half a turn as on Kalibr's pages, and a square off each corner of one."""
+    side, gap = target.square_m, target.square_m * target.spacing
+    corners = corner_positions(target)[::4, :2]
+    grids = []
+    for number, corner_m in enumerate(corners, start=target.marker_id):
+        cells = np.rot90(marker_cells(target.dictionary, number, target.border), 2)
+        grids.append(Cells(corner_m, side / len(cells), cells))
+    x, y = np.meshgrid(np.arange(target.columns + 1), np.arange(target.rows + 1))
+    squares = (side + gap) * np.stack([x, y], axis=-1).reshape(-1, 2) - gap
+    return (*grids, *(Cells(it, gap, np.ones((1, 1), bool)) for it in squares))
