@@ -49,3 +49,9 @@ def aprilgrid(columns: int, rows: int, **options) -> Target:
     measures = {"square_m": 0.032, "square_sigma_m": 1e-5, "marker_id": 0} | options
     layout = {"spacing": 0.3, "border": 2, "dictionary": "DICT_APRILTAG_36h11"} | measures
     return Target("board", "aprilgrid", columns, rows, **layout)
+
+
+def circles(columns: int, rows: int, **options) -> Target:
+    """A grid of circles of 12 mm, in rows 20 mm apart."""
+    measures = {"square_m": 0.02, "square_sigma_m": 1e-5, "diameter_m": 0.012} | options
+    return Target("board", "circles", columns, rows, **measures)

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from visioncal.targets import corner_positions, marked_squares, marker_cells
@@ -61,6 +62,15 @@ def _print(target: Target):
         columns, rows = target.columns + 1, target.rows + 1
         light = np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 1
         lines = np.arange(columns + 1.0) - 1, np.arange(rows + 1.0) - 1
+    elif target.kind == "circles":
+        places = corner_positions(target)[:, :2] / target.square_m
+        lines = tuple(
+            np.array([end[0], end[1]])
+            for end in (
+                (places[:, axis].min() - 0.5, places[:, axis].max() + 0.5) for axis in (0, 1)
+            )
+        )
+        light = np.ones((1, 1), bool)
     elif target.kind == "aprilgrid":
         lines, light = _aprilgrid(target)
     else:
@@ -133,6 +143,8 @@ def photograph(target: Target, shot: Shot, seed: int = 0) -> tuple[np.ndarray, n
     board = board[..., :2] / board[..., 2:]
     ink = shot.ink_px / shot.square_px
     picture = _covered(board[..., 0], board[..., 1], lines, light, ink)
+    if target.kind == "circles":
+        picture = _discs(board, target, ink)
     picture = _through(picture, shot, rng.uniform(0, np.pi))
     picture = picture.reshape(height, SAMPLES, width, SAMPLES).mean(axis=(1, 3))
     return _read_out(picture, shot, rng), truth
@@ -167,6 +179,14 @@ def _covered(x, y, lines, light, ink):
         row[0] + (row[1] - row[0]) * share for row, share in zip(cells, share_x, strict=True)
     )
     return upper + (lower - upper) * share_y
+
+
+def _discs(board, target, ink):
+    """Likewise around circles, whose edges are straight within a sub-pixel."""
+    places = corner_positions(target)[:, :2] / target.square_m
+    radius = target.diameter_m / target.square_m / 2 + ink
+    away = KDTree(places).query(board.reshape(-1, 2))[0].reshape(board.shape[:2])
+    return _beyond(away, away - radius)
 
 
 def _nearest(places, lines):

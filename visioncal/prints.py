@@ -1,4 +1,4 @@
-"""What is dark on a printed target: grids of cells."""
+"""What is dark on a printed target: grids of cells, and discs."""
 
 from dataclasses import dataclass
 
@@ -43,8 +43,15 @@ def dark_cells(target: Target) -> tuple[Cells, ...]:
             return _charuco(target)
         case "aprilgrid":
             return _aprilgrid(target)
+        case "circles":
+            return ()
         case "points":
             raise DataError(f"target {target.name} is a rig of points; a board can be printed.")
+
+
+def dark_discs(target: Target) -> FloatArray:
+    """The (n, 2) middles of the dark discs on a target [m], of its diameter."""
+    return corner_positions(target)[:, :2] if target.kind == "circles" else np.zeros((0, 2))
 
 
 def _charuco(target: Target) -> tuple[Cells, ...]:

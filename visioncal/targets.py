@@ -1,9 +1,9 @@
 """Targets, printed ones and rigs of known points: their files, corners and symmetries.
 
 The target's frame: for a ChArUco board the origin is the outer corner of square 0, for a
-checkerboard inner corner 0, for an AprilGrid the outer corner of the tag at the upper left, for a
-single marker its centre; x runs along columns, y along rows (down the printed page), and z into the
-board. A rig of points has the frame that its table is in.
+checkerboard inner corner 0, for circles the first one's centre, for an AprilGrid the outer corner
+of the tag at the upper left, for a single marker its centre; x runs along columns, y along rows
+(down the printed page), and z into the board. A rig of points has the frame that its table is in.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,6 +44,8 @@ _MIN_TAGS, _MOST_SPACING, _MOST_BORDER = 1, 1.0, 2
 APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
 # A marker's corners, clockwise from its upper left, in its sides.
 _CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+# Circles leave so much white between them that their edges are told apart.
+_WIDEST = 0.85
 # Kinds that are found where the image shows a part of them.
 FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
 
@@ -138,8 +140,9 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     Args:
         document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for
             a single marker kind, id, size_m, dictionary; for an AprilGrid kind, columns, rows,
-            size_m, spacing and, where they are not Kalibr's, id, dictionary, border; for a rig kind
-            and points, the columns of its table as lists.
+            size_m, spacing and, where they are not Kalibr's, id, dictionary, border; for circles
+            kind, columns, rows, square_m, diameter_m, asymmetric; for a rig kind and points, the
+            columns of its table as lists.
         name: The name that the target gets.
 
     Raises:
@@ -153,6 +156,8 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
         return _aprilgrid(table, name)
     if kind == "points":
         return _rig(table, name)
+    if kind == "circles":
+        return _circles(table, name)
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
     square_m = _size(table, "square_m")
@@ -227,6 +232,29 @@ def _aprilgrid(table: Table, name: str) -> Target:
         marker_id=first,
         spacing=spacing,
         border=border,
+    )
+
+
+def _circles(table: Table, name: str) -> Target:
+    columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
+    rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    square_m = _size(table, "square_m")
+    asymmetric = table.flag("asymmetric", default=False)
+    diameter_m = table.number("diameter_m", positive=True)
+    # Nearer circles would touch.
+    apart_m = square_m * np.sqrt(2.0) if asymmetric else square_m
+    if diameter_m >= _WIDEST * apart_m:
+        needed = f"less than {_WIDEST:g} of the distance of neighbours, {apart_m:g} m,"
+        raise table.refuse("diameter_m", diameter_m, needed)
+    return Target(
+        name,
+        "circles",
+        columns,
+        rows,
+        square_m,
+        _sigma(table, square_m),
+        diameter_m=diameter_m,
+        asymmetric=asymmetric,
     )
 
 
@@ -324,6 +352,8 @@ def target_document(target: Target) -> dict[str, Any]:
         "square_m": target.square_m,
         "square_sigma_m": target.square_sigma_m,
     }
+    if target.kind == "circles":
+        document |= {"diameter_m": target.diameter_m, "asymmetric": target.asymmetric}
     if target.kind == "charuco":
         document |= {
             "marker_m": target.marker_m,
@@ -350,6 +380,9 @@ def corner_positions(target: Target) -> FloatArray:
     if target.kind == "aprilgrid":
         places = np.pad((1.0 + target.spacing) * tag_places(target), ((0, 0), (0, 1)))
         return np.asarray(side * (places[:, None] + _CLOCKWISE).reshape(-1, 3))
+    if target.kind == "circles":
+        places = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
+        return np.asarray(side * np.pad(places, ((0, 0), (0, 1))), dtype=float)
     inset = 1 if target.kind == "charuco" else 0
     rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
     flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
@@ -363,6 +396,12 @@ def tag_places(target: Target) -> IntArray:
     """
     rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
     return np.stack([columns, target.rows - 1 - rows], axis=1)
+
+
+def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
+    """The (n, 2) columns and rows of circles, row by row; of an asymmetric grid in half columns."""
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    return np.stack([2 * column + row % 2 if asymmetric else column, row], axis=1)
 
 
 def point_numbers(target: Target) -> tuple[int, ...]:
@@ -394,6 +433,9 @@ def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
         count = np.array([target.columns, target.rows])
         high = side * (count * (1.0 + target.spacing))
         return np.full(2, -side * target.spacing), high
+    if target.kind == "circles":
+        places, radius = corner_positions(target)[:, :2], target.diameter_m / 2
+        return places.min(axis=0) - radius, places.max(axis=0) + radius
     # A checkerboard's origin is its first inner corner, one square inside.
     low = np.full(2, 0.0 if target.kind == "charuco" else -side)
     return low, side * np.array([target.columns, target.rows], dtype=float)
@@ -445,13 +487,16 @@ def rotation_transforms(target: Target) -> FloatArray:
     Markers break every symmetry. The squares of a checkerboard of c x r inner corners have the
     colour of (column + row) mod 2 over c + 1 columns and r + 1 rows. A half turn takes square
     (i, j) to (c - i, r - j) and keeps the colours where c + r is even; a quarter turn takes it to
-    (c - j, i) and needs c = r, even.
+    (c - j, i) and needs c = r, even. Circles have no colours: a symmetric grid looks the same after
+    a half turn, and an asymmetric one of an even number of rows.
 
     Returns:
         (k, 4, 4) `target_from_turned`, the identity first: the pattern, carried along by any of
         them, covers itself.
     """
     identity = np.eye(4)
+    if target.kind == "circles":
+        return _turns_of_circles(target)
     if target.kind != "checkerboard" or (target.columns + target.rows) % 2:
         return identity[None]
     width_m = target.square_m * (target.columns - 1)
@@ -462,6 +507,22 @@ def rotation_transforms(target: Target) -> FloatArray:
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     quarter = transforms.compose(turn, np.array([width_m, 0.0, 0.0]))
     return np.stack([identity, quarter, half, transforms.invert(quarter)])
+
+
+def _turns_of_circles(target: Target) -> FloatArray:
+    """The turns about a grid's middle, by quarters, that carry every circle to one."""
+    places = corner_positions(target)
+    low, high = places.min(axis=0), places.max(axis=0)
+    turns = []
+    for quarters in range(4):
+        cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters]
+        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        turned = places @ turn.T
+        shift = (low + high - turned.min(axis=0) - turned.max(axis=0)) / 2
+        away = np.linalg.norm(turned[:, None] + shift - places, axis=2).min(axis=1)
+        if away.max() < 0.1 * target.square_m:
+            turns.append(transforms.compose(turn, shift))
+    return np.stack(turns)
 
 
 def rotations(target: Target) -> tuple[IntArray, ...]:

@@ -18,7 +18,9 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # stands still and reads a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
-TargetKind: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "marker", "points"]
+TargetKind: TypeAlias = Literal[
+    "charuco", "checkerboard", "aprilgrid", "circles", "marker", "points"
+]
 
 # The joint fit, or one of the closed forms.
 SolverName: TypeAlias = Literal[
@@ -53,11 +55,11 @@ class Target:
     Attributes:
         name: The name under which a session asks for it.
         kind: What is printed; `points` for a rig, of which detectors of others find the points.
-        columns: Squares (ChArUco), inner corners (checkerboard) or tags (AprilGrid) along x; 1 for
-            a marker, and the points for a rig.
+        columns: Squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along
+            x; 1 for a marker, and the points for a rig.
         rows: The same along y; 1 for a marker and for a rig.
         square_m: Side of a square; of the marker itself for a single marker and for an AprilGrid,
-            and the greatest extent of a rig [m].
+            the distance of rows of circles, and the greatest extent of a rig [m].
         square_sigma_m: How well that side is known, as a standard deviation [m]; 0 for a rig.
         marker_m: Side of the markers inside a ChArUco board [m]; 0 elsewhere.
         dictionary: ArUco dictionary by OpenCV's name, as `DICT_5X5_100`; empty without markers.
@@ -65,6 +67,9 @@ class Target:
         marker_id: The id of a single marker, and the least one of an AprilGrid; -1 elsewhere.
         spacing: White between the tags of an AprilGrid, as a share of a tag's side; 0 elsewhere.
         border: Dark modules around the bits of an AprilGrid's tags; 1 elsewhere.
+        diameter_m: Diameter of the circles of a grid [m]; 0 elsewhere.
+        asymmetric: Whether every second row of them is shifted by half of their distance in a row,
+            which is twice that of the rows.
         points_m: Places of a rig's points [m]; empty elsewhere.
         point_numbers: The numbers that its table gives them.
         point_sigmas_m: How well each place is known per axis, as a standard deviation [m]; empty
@@ -83,6 +88,8 @@ class Target:
     marker_id: int = -1
     spacing: float = 0.0
     border: int = 1
+    diameter_m: float = 0.0
+    asymmetric: bool = False
     points_m: tuple[tuple[float, float, float], ...] = ()
     point_numbers: tuple[int, ...] = ()
     point_sigmas_m: tuple[float, ...] = ()

@@ -22,8 +22,10 @@ from visioncal.simulation import (
     cell_names,
     charuco_target,
     checkerboard_target,
+    circles_target,
     simulate,
     simulate_warm_up,
+    symmetric_circles_target,
     touch,
     truth_path,
     write_session,
@@ -41,6 +43,8 @@ _BOARDS = {
     "charuco": charuco_target,
     "checkerboard": checkerboard_target,
     "aprilgrid": aprilgrid_target,
+    "circles": circles_target,
+    "symmetric-circles": symmetric_circles_target,
 }
 
 
@@ -55,7 +59,8 @@ def simulate_command(
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
     ] = "wide",
     board: Annotated[
-        Literal["charuco", "checkerboard", "aprilgrid"], typer.Option(help="What is printed.")
+        Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles"],
+        typer.Option(help="What is printed."),
     ] = "charuco",
     second_board: Annotated[
         bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")

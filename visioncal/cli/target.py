@@ -31,7 +31,7 @@ target_app = typer.Typer(
 )
 
 # The options that describe a board, by its kind.
-_Described: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "marker"]
+_Described: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "circles", "marker"]
 _USED: dict[_Described, tuple[str, ...]] = {
     "charuco": (
         "--columns",
@@ -53,6 +53,7 @@ _USED: dict[_Described, tuple[str, ...]] = {
         "--id",
         "--name",
     ),
+    "circles": ("--columns", "--rows", "--square-mm", "--diameter-mm", "--asymmetric", "--name"),
     "marker": ("--id", "--size-mm", "--dictionary", "--name"),
 }
 # Where no page is named, the first of these that has room.
@@ -84,13 +85,12 @@ def make_command(
     kind: Annotated[_Described | None, typer.Option(help="What to print.")] = None,
     columns: Annotated[
         int | None,
-        typer.Option(
-            help="Squares along x; inner corners of a checkerboard, tags of an AprilGrid."
-        ),
+        typer.Option(help="Squares along x; inner corners of a checkerboard, tags, circles."),
     ] = None,
     rows: Annotated[int | None, typer.Option(help="The same along y.")] = None,
     square_mm: Annotated[
-        float | None, typer.Option(help="Side of a square; left out: the largest that fits.")
+        float | None,
+        typer.Option(help="Side of a square, distance of rows of circles; left out: the largest."),
     ] = None,
     marker_mm: Annotated[
         float | None, typer.Option(help="Side of the markers of a ChArUco board.")
@@ -112,6 +112,10 @@ def make_command(
     border: Annotated[
         int | None, typer.Option(help="Dark modules around their bits: 2, as Kalibr has it.")
     ] = None,
+    diameter_mm: Annotated[float | None, typer.Option(help="Diameter of circles.")] = None,
+    asymmetric: Annotated[
+        bool, typer.Option("--asymmetric", help="Every second row of circles is shifted by half.")
+    ] = False,
     name: Annotated[str, typer.Option(help="Name of a board described by options.")] = "",
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
 ) -> None:
@@ -136,6 +140,8 @@ def make_command(
         "--size-mm": size_mm,
         "--spacing": spacing,
         "--border": border,
+        "--diameter-mm": diameter_mm,
+        "--asymmetric": asymmetric or None,
         "--name": name or None,
     }
     _refuse_unused(kind, [option for option, value in described.items() if value is not None])
@@ -154,6 +160,8 @@ def make_command(
             name,
             spacing,
             border,
+            diameter_mm,
+            asymmetric,
         )
     sized = request is None or request.square_mm is not None
     pages = _pages(page, landscape, larger=sized)

@@ -24,7 +24,7 @@ def find_target(image: Image, target: Target) -> Seen | NotFound:
         The corners, or why there are none.
     """
     match target.kind:
-        case "charuco" | "checkerboard" | "aprilgrid":
+        case "charuco" | "checkerboard" | "aprilgrid" | "circles":
             return find_board(image, target)
         case "marker":
             return find_marker(image, target)

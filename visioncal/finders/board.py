@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.finders.aprilgrid import find_aprilgrid
 from visioncal.finders.charuco import find_charuco
 from visioncal.finders.checkerboard import find_checkerboard
+from visioncal.finders.circles import find_circles
 from visioncal.finders.result import NotFound, Seen
 from visioncal.finders.template import refine
 from visioncal.targets import corner_positions
@@ -26,6 +27,7 @@ FINDERS: dict[TargetKind, Callable[[Image, Target], Seen | NotFound]] = {
     "charuco": find_charuco,
     "checkerboard": find_checkerboard,
     "aprilgrid": find_aprilgrid,
+    "circles": find_circles,
 }
 
 

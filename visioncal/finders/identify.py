@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.errors import DataError
 from visioncal.finders.charuco import find_charuco
+from visioncal.finders.circles import seen_grids
 from visioncal.finders.identify_aprilgrid import find_grid
 from visioncal.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
 from visioncal.finders.identify_checkerboard import find_squares
@@ -49,6 +50,8 @@ class Identity:
         first_id: The least id of an AprilGrid.
         spacing: White between its tags, as a share of their side.
         border: Dark modules around their bits.
+        asymmetric: Whether every second row of circles is shifted.
+        diameter_share: Their diameter over the distance of rows; 0 without circles.
         corners_seen: Corners that the finder of that kind finds.
         corners: Corners that the target has.
         notes: What else there is to know, in sentences.
@@ -69,6 +72,8 @@ class Identity:
     first_id: int = -1
     spacing: float = 0.0
     border: int = 1
+    asymmetric: bool = False
+    diameter_share: float = 0.0
     notes: tuple[str, ...] = ()
 
     def target(self, name: str, square_m: float) -> Target:
@@ -91,11 +96,13 @@ class Identity:
             marker_id=self.marker_ids[0] if self.kind == "marker" else self.first_id,
             spacing=self.spacing,
             border=self.border,
+            diameter_m=round(self.diameter_share * square_m, 5),
+            asymmetric=self.asymmetric,
         )
 
 
 def identify(image: Image) -> Identity:
-    """Names the target in an image: ChArUco board, AprilGrid, checkerboard or marker.
+    """Names the target in an image: ChArUco board, AprilGrid, checkerboard, circles or marker.
 
     Args:
         image: (h, w) grey image.
@@ -123,7 +130,8 @@ def identify(image: Image) -> Identity:
         f"No target is seen in this image of {width} x {height} pixels"
         + (f": {why}." if why else ".")
         + " Looked for were ChArUco boards and single markers of OpenCV's ArUco and AprilTag "
-        "dictionaries, AprilGrids, and checkerboards of 3 x 3 inner corners or more; "
+        "dictionaries, AprilGrids, grids of circles, and checkerboards of 3 x 3 inner corners or "
+        "more; "
         f"{len(decode_markers(image))} patterns looked like a marker.",
         culprits=["image"],
         next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
@@ -137,7 +145,8 @@ def _identity(image: Image) -> Identity | None:
     boards = _charucos(image, markers)
     singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
     grids = _aprilgrids(image)
-    found = [*boards.values(), *grids] or [*_checkerboards(image), *singles]
+    # Circles in staggered rows pass for a checkerboard.
+    found = [*boards.values(), *grids] or _circles(image) or [*_checkerboards(image), *singles]
     if not found:
         return None
     best = max(found, key=lambda it: it.corners_seen)
@@ -274,6 +283,33 @@ def _aprilgrids(image: Image) -> list[Identity]:
             first_id=target.marker_id,
             spacing=target.spacing,
             border=target.border,
+            notes=tuple(notes),
+        )
+    ]
+
+
+def _circles(image: Image) -> list[Identity]:
+    # Of the ways to number them, one as wide as it is high or wider, as people count.
+    grids = sorted(seen_grids(image), key=lambda it: not it.asymmetric and it.columns < it.rows)
+    if not grids:
+        return []
+    grid = grids[0]
+    notes = ["The circles' diameter is estimated by the image, which corners hardly depend on."]
+    if not grid.asymmetric or grid.rows % 2 == 0:
+        notes.append(
+            "This board looks the same upside down; an asymmetric one of an odd number of rows is "
+            "better."
+        )
+    return [
+        Identity(
+            "circles",
+            grid.columns,
+            grid.rows,
+            whole=True,
+            corners_seen=len(grid.px),
+            corners=len(grid.px),
+            asymmetric=grid.asymmetric,
+            diameter_share=grid.share,
             notes=tuple(notes),
         )
     ]

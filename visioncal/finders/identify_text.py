@@ -41,6 +41,11 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
         }
     if identity.kind == "aprilgrid":
         document |= {"spacing": identity.spacing, "border": identity.border}
+    if identity.kind == "circles":
+        document |= {
+            "asymmetric": identity.asymmetric,
+            "diameter_over_distance": identity.diameter_share,
+        }
     if square_m is not None:
         document["target"] = target_document(identity.target("board", square_m))
     return document
@@ -60,6 +65,8 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
         size, what, where = "size_m", "side of the dark square", "measured"
     if identity.kind == "aprilgrid":
         size, what, where = "size_m", "side of a tag", "measured over many tags"
+    if identity.kind == "circles":
+        what, where = "distance of neighbouring rows", "measured over all of them"
     lines = [f"# Seen in {one_line(source)}: {describe(identity)}."]
     lines += [f"# {note}" for note in identity.notes]
     if square_m is None:
@@ -68,14 +75,14 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
         )
     # Any size would do where it is not known: those lines are written out below.
     document = target_document(identity.target("board", 1.0 if square_m is None else square_m))
-    sized = {size, "square_sigma_m", "marker_m"}
+    sized = {size, "square_sigma_m", "marker_m", "diameter_m"}
     for key, value in document.items():
         if key not in sized or square_m is not None:
             lines.append(f"{key} = {_literal(value)}{_remark(identity, key)}")
         elif key == size:
             lines.append(f"# {size} =  # the {what} [m], {where}")
-        elif key == "marker_m":
-            lines.append(f"# marker_m ={_remark(identity, key)}")
+        elif key in ("marker_m", "diameter_m"):
+            lines.append(f"# {key} ={_remark(identity, key)}")
     return "\n".join(lines) + "\n"
 
 
@@ -88,6 +95,10 @@ def describe(identity: Identity) -> str:
     size = f"{least}{identity.columns} x {identity.rows}"
     if identity.kind == "checkerboard":
         return f"checkerboard of {size} inner corners, {seen}"
+    if identity.kind == "circles":
+        layout = "asymmetric" if identity.asymmetric else "symmetric"
+        share = f"diameter of {identity.diameter_share:.2f} of their rows' distance"
+        return f"{layout} grid of {size} circles, {share}, {seen}"
     if identity.kind == "aprilgrid":
         return (
             f"AprilGrid of {size} tags, {identity.dictionary} from id {identity.first_id}, "
@@ -103,6 +114,8 @@ def describe(identity: Identity) -> str:
 def _remark(identity: Identity, key: str) -> str:
     if key == "square_sigma_m":
         return "  # 0.1 %, as printers keep their size: replace it by how well you measured"
+    if key == "diameter_m":
+        return f"  # {identity.diameter_share:.2f} of square_m, by the image"
     if key != "marker_m":
         return ""
     share, sigma = identity.marker_share, identity.marker_share_sigma

@@ -21,6 +21,14 @@ markers and of their blurred edges are left out. All corners of an image are wor
 The corners of an AprilGrid's tags are such corners too, for each touches a small dark square. The
 white between tags takes the place of the squares' side: within it lie a corner's lines alone, and
 the next ones.
+
+Around the centre of a printed circle of radius r the product of edges becomes one edge,
+
+    E = erf((r - |b|) / (sqrt 2 s)),   s^2 = (s_x x^2 + s_y y^2) / |b|^2 of the squared widths,
+
+in the distance of neighbouring rows. As M is what the lens and the view make of the board there,
+the centre is the circle's own, and not that of the ellipse in the image. The radius is measured
+along with the blur, because ink spreads.
 """
 
 from contextlib import suppress
@@ -47,6 +55,8 @@ _HALF, _LEAST_PX, _MOST_PX = 0.42, 3.0, 20.0
 _FEWEST = 4
 # What is looked at around the outermost corners [px].
 _RIM_PX = 32
+# Larger circles are looked at in half of the size.
+_MOST_RADIUS_PX = 20.0
 # Bounds memory and time where corners are many.
 _MOST_PIXELS = 600_000
 # Corners that measure the blur, and what it starts from and stays above [px].
@@ -96,10 +106,14 @@ class _Pattern:
             AprilGrid one sign stands for the dark ones.
         inset: How far a light square's marker is from its edges, or the bits of a tag from its own
             [squares]; infinite without them.
+        half: Half-width of the patch around a corner [squares].
+        radius: That of the circle around it [squares]; 0 without one.
     """
 
     signs: FloatArray
     inset: float
+    half: float = _HALF
+    radius: float = 0.0
 
     @classmethod
     def of(cls, target: Target, ids: IntArray, board: FloatArray) -> Self:
@@ -107,6 +121,11 @@ class _Pattern:
             modules = len(marker_cells(target.dictionary, target.marker_id, target.border))
             # The tag is off its own corners in turn: below right, below left, and so on.
             return cls(np.where(ids % 2, -1.0, 1.0), target.border / (modules * target.spacing))
+        if target.kind == "circles":
+            radius = target.diameter_m / target.square_m / 2
+            # As far as half-way to the next circle.
+            half = np.sqrt(0.5) if target.asymmetric else 0.5
+            return cls(np.ones(len(ids)), np.inf, float(half), radius)
         odd = np.rint(board).astype(int).sum(axis=1) % 2
         if target.kind == "checkerboard":
             return cls(1.0 - 2.0 * odd, np.inf)
@@ -149,7 +168,13 @@ class _Windows:
 
     @classmethod
     def cut(
-        cls, smooth: _Float32Array, board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray
+        cls,
+        smooth: _Float32Array,
+        board: FloatArray,
+        px: FloatArray,
+        good: Mask,
+        chosen: IntArray,
+        pattern: _Pattern,
     ) -> Self:
         """Cuts the windows of the chosen ones among corners, whose good ones make the maps."""
         on_board, around, smoother = maps_about(board, px, good, chosen)
@@ -158,10 +183,12 @@ class _Windows:
         by_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
         by_board = np.asarray(np.linalg.inv(by_px), float)
         side_px = np.sqrt(np.abs(np.linalg.det(by_board)))
-        half = np.clip(_HALF, _LEAST_PX / side_px, _MOST_PX / side_px)
+        # Of a circle all of the edge is needed.
+        most = np.inf if pattern.radius else _MOST_PX
+        half = np.clip(pattern.half, _LEAST_PX / side_px, most / side_px)
         wanted = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
         affordable = max(_LEAST_PX, (np.sqrt(_MOST_PIXELS / len(chosen)) - 1.0) / 2.0)
-        reach = int(np.ceil(min(_MOST_PX, affordable, wanted)))
+        reach = int(np.ceil(min(most, affordable, wanted)))
         steps = np.arange(-reach, reach + 1)
         centre = np.rint(start).astype(int)
         # A map is smooth: cubics through 4 x 4 of its values are as good as all.
@@ -216,7 +243,8 @@ class _Step:
     Attributes:
         levels: (n, 2) offset, and contrast with the sign of the pattern [grey levels].
         shift: (n, 2) by how much the corners have to move [squares].
-        blur: (n, 2) by how much, as a logarithm, the edges are wider; (n, 0) unless asked for.
+        blur: (n, 2) by how much, as a logarithm, the edges are wider, and (n, 3) with by how much a
+            circle's radius is larger [squares]; (n, 0) unless asked for.
         covariance: (n, 2, 2) of the shift, by the residuals [squares^2].
         misfit: (n,) rms of the residuals over the contrast.
     """
@@ -242,6 +270,8 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     """
     share = target.spacing if target.kind == "aprilgrid" else 1.0
     board = corner_positions(target)[ids, :2] / (share * target.square_m)
+    if target.kind == "circles" and _is_large(target, board, px):
+        return _refined_smaller(image, target, ids, px)
     low = np.maximum(np.floor(px.min(axis=0)).astype(int) - _RIM_PX, 0)
     high = np.ceil(px.max(axis=0)).astype(int) + _RIM_PX + 1
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
@@ -256,17 +286,36 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     return Refined(px, nothing, (reason,) * len(ids), np.full(2, np.nan))
 
 
+def _is_large(target: Target, board: FloatArray, px: FloatArray) -> bool:
+    """Whether circles have so many pixels that windows around them are too large."""
+    if len(px) < _FEWEST:
+        return False
+    scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(board - board.mean(axis=0))
+    return bool(scale * target.diameter_m / target.square_m > 2 * _MOST_RADIUS_PX)
+
+
+def _refined_smaller(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
+    """Refines in an image of half the size, whose edges have as many pixels of noise to count."""
+    height, width = (2 * (side // 2) for side in image.shape)
+    small = cv2.resize(
+        image[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA
+    )
+    found = refine(np.asarray(small, np.uint8), target, ids, (px - 0.5) / 2)
+    return Refined(2 * found.px + 0.5, 2 * found.sigma_px, found.reasons, 2 * found.blur_px)
+
+
 def _refined(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) -> Refined:
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
     every, all_good = np.arange(len(px)), np.ones(len(px), bool)
     some = every[:: -(-len(px) // _BLUR_SAMPLE)]
-    windows = _Windows.cut(smooth, board, px, all_good, some)
-    blur_px = _measured_blur(windows, pattern.at(some))
-    windows = _Windows.cut(smooth, board, px, all_good, every)
+    windows = _Windows.cut(smooth, board, px, all_good, some, pattern)
+    blur_px, radius = _measured_blur(windows, pattern.at(some))
+    pattern = replace(pattern, radius=radius)
+    windows = _Windows.cut(smooth, board, px, all_good, every, pattern)
     shift, step = _fitted(windows, pattern, blur_px, np.zeros((len(px), 2, 2)))
     better = windows.moved(shift)
     good = np.array([not it for it in _reasons(windows, step, better - px)])
-    windows = _Windows.cut(smooth, board, np.where(good[:, None], better, px), good, every)
+    windows = _Windows.cut(smooth, board, np.where(good[:, None], better, px), good, every, pattern)
     slopes = windows.slopes(step.levels)
     # Glare and shadows have edges: where slopes do not explain more of a corner, it has none.
     tried = _step(windows, pattern, np.zeros_like(px), blur_px, slopes)
@@ -285,19 +334,22 @@ def _refined(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray)
     )
 
 
-def _measured_blur(windows: _Windows, pattern: _Pattern) -> FloatArray:
-    """(2,) widths of the smoothed image's edges, medians over the corners [px]."""
+def _measured_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, float]:
+    """(2,) widths of the smoothed image's edges, medians over the corners [px], and the radius."""
     side_px = 1.0 / np.median(windows.widths)
     blur_px = np.full(2, min(_BLUR_START_PX, 0.2 * side_px))
     shift = np.zeros((len(windows.px), 2))
     for _ in range(_BLUR_TURNS):
         step = _step(windows, pattern, shift, blur_px, np.zeros((len(shift), 2, 2)), blurs=True)
         shift = shift + _bounded(step.shift)
-        change = np.clip(np.nan_to_num([_median(it) for it in step.blur.T]), -0.5, 0.5)
+        changes = np.clip(np.nan_to_num([_median(it) for it in step.blur.T]), -0.5, 0.5)
+        change, grown = changes[:2], float(changes[2:].sum())
+        radius = np.clip(pattern.radius + grown, 0.5 * pattern.radius, 1.5 * pattern.radius)
+        pattern = replace(pattern, radius=float(radius))
         blur_px = np.clip(blur_px * np.exp(change), _BLUR_LEAST_PX, 0.5 * side_px)
         if np.abs(change).max() < 0.01:
             break
-    return blur_px
+    return blur_px, pattern.radius
 
 
 def _fitted(
@@ -352,13 +404,11 @@ def _step(
     if np.isfinite(pattern.inset):
         clear_x, clear_y = (np.float32(pattern.inset) - np.float32(_CLEAR) * it for it in (sx, sy))
         used = used & ~((np.abs(x) > clear_x) & (np.abs(y) > clear_y) & (signs * x * y > 0))
-    wide = bool(max(sx.max(), sy.max()) > _WIDE)
-    edge_x, slope_x, wider_x = _edges(x, sx, wide=wide)
-    edge_y, slope_y, wider_y = _edges(y, sy, wide=wide)
-    product = signs * edge_x * edge_y
-    columns = [np.ones_like(x), product, signs * slope_x * edge_y, signs * edge_x * slope_y]
-    if blurs:
-        columns += [signs * wider_x * edge_y, signs * edge_x * wider_y]
+    draw = _circle if pattern.radius else _crossing
+    product, *slopes_of = draw(pattern, x, y, sx, sy)
+    if pattern.radius:
+        used = used & (np.hypot(x, y) < np.float32(pattern.half))
+    columns = [np.ones_like(x), product, *slopes_of[: None if blurs else 2]]
     unknowns = len(columns)
     columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)
     stack = np.empty((count, unknowns + 1, *x.shape[1:]), np.float32)
@@ -379,10 +429,51 @@ def _step(
     return _Step(
         found[:, :2],
         -found[:, 2:4] / contrast,
-        found[:, 4:6] / contrast,
+        found[:, 4:] / contrast,
         inverse[:, 2:4, 2:4] * (variance / _NOISE_LEFT)[:, None, None] / contrast[:, :, None] ** 2,
         np.sqrt(variance) / np.abs(contrast[:, 0]),
     )
+
+
+def _crossing(
+    pattern: _Pattern,
+    x: _Float32Array,
+    y: _Float32Array,
+    sx: _Float32Array,
+    sy: _Float32Array,
+) -> tuple[_Float32Array, ...]:
+    """Two edges that cross: their product, and its derivatives.
+
+    These are by x and y, and by the logarithms of the widths.
+    """
+    signs = np.asarray(pattern.signs, np.float32)[:, None, None]
+    wide = bool(max(sx.max(), sy.max()) > _WIDE)
+    edge_x, slope_x, wider_x = _edges(x, sx, wide=wide)
+    edge_y, slope_y, wider_y = _edges(y, sy, wide=wide)
+    return (
+        signs * edge_x * edge_y,
+        signs * slope_x * edge_y,
+        signs * edge_x * slope_y,
+        signs * wider_x * edge_y,
+        signs * edge_x * wider_y,
+    )
+
+
+def _circle(
+    pattern: _Pattern,
+    x: _Float32Array,
+    y: _Float32Array,
+    sx: _Float32Array,
+    sy: _Float32Array,
+) -> tuple[_Float32Array, ...]:
+    """A disc, likewise; the last of its derivatives is by the radius."""
+    away = np.hypot(x, y) + np.float32(1e-6)
+    of_x, of_y = (sx * x / away) ** 2, (sy * y / away) ** 2
+    width = np.sqrt(of_x + of_y)
+    edge, slope, wider = _edges(np.float32(pattern.radius) - away, width, wide=False)
+    inward = -slope / away
+    by_width = wider / (of_x + of_y)
+    return edge, inward * x, inward * y, by_width * of_x, by_width * of_y, slope
 
 
 def _edges(

@@ -219,7 +219,12 @@ def camera_details(calibration: Calibration) -> dict[str, Any]:
 
 def _method(placed: _Placed, point: FloatArray) -> str:
     count, target = int(placed.seen.agrees.sum()), placed.shown.target
-    words = {"charuco": "ChArUco board", "aprilgrid": "AprilGrid", "points": "rig"}
+    words = {
+        "charuco": "ChArUco board",
+        "aprilgrid": "AprilGrid",
+        "circles": "grid of circles",
+        "points": "rig",
+    }
     images = "one image" if count == 1 else f"{count} images"
     told = f"{words.get(target.kind, target.kind)} {target.name} seen in {images}"
     if not point.any():

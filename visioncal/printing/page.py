@@ -146,7 +146,8 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
             return _centred(target, pattern, page, room)
     left, top, right, bottom = pattern.box
     needed = _room(target, pattern, pages[0])
-    what = "square" if target.kind in _OF_SQUARES else "side"
+    sides = {"charuco": "square", "checkerboard": "square", "circles": "distance"}
+    what = sides.get(target.kind, "side")
     largest = largest_side_mm(target, pages)
     smaller = f", or a {what} of {largest} mm, the largest that fits" if largest else ""
     raise DataError(
@@ -172,7 +173,12 @@ def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
     while fails - fits > 1:
         middle = (fits + fails) // 2
         scale = 1e-3 * middle / target.square_m
-        tried = replace(target, square_m=scale * target.square_m, marker_m=scale * target.marker_m)
+        tried = replace(
+            target,
+            square_m=scale * target.square_m,
+            marker_m=scale * target.marker_m,
+            diameter_m=scale * target.diameter_m,
+        )
         pattern = draw_pattern(tried)
         rooms = [(_room(tried, pattern, page), page) for page in pages]
         if any(it.width <= page.width_mm and it.height <= page.height_mm for it, page in rooms):
@@ -271,6 +277,17 @@ def _sentences(target: Target) -> tuple[str, str, str]:
                 f"Measure over all {target.columns} columns of tags, meant to be "
                 f"{1e3 * sides * target.square_m:g} mm; divide by {sides:g} and write the result "
                 "into size_m, in metres."
+            )
+        case "circles":
+            what = (
+                f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {target.columns} x "
+                f"{target.rows} circles of {1e3 * target.diameter_m:g} mm, rows {side_mm} apart"
+            )
+            origin = "the centre of the circle at the top left"
+            measure = (
+                f"Measure from the first row's centres to the last one's, meant to be "
+                f"{1e3 * (target.rows - 1) * target.square_m:g} mm; divide by {target.rows - 1} "
+                "and write the result into square_m, in metres."
             )
     if target.kind in _OF_SQUARES:
         count = target.columns + (target.kind == "checkerboard")

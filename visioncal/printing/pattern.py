@@ -4,12 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.prints import dark_cells
+from visioncal.prints import dark_cells, dark_discs
 from visioncal.targets import extent_m
 from visioncal.types import FloatArray, Mask, Target
 
 # White that finders need around squares; markers need one of their own modules.
 _QUIET_M = 0.0025
+# A circle: the middles of its sides are within a ten-thousandth of its radius.
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 240, endpoint=False)
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,8 @@ def draw_pattern(target: Target) -> Pattern:
     """
     (left, top), (right, bottom) = (it.tolist() for it in extent_m(target))
     grids = dark_cells(target)
-    loops = (it.corner_m + it.cell_m * loop for it in grids for loop in outlines(it.dark))
+    loops = [it.corner_m + it.cell_m * loop for it in grids for loop in outlines(it.dark)]
+    loops += [it + target.diameter_m / 2 * _CIRCLE for it in dark_discs(target)]
     quiet_m = grids[0].cell_m if target.kind == "marker" else _QUIET_M
     return Pattern(tuple(loops), (left, top, right, bottom), quiet_m)
 

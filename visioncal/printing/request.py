@@ -18,6 +18,8 @@ from visioncal.types import Target, TargetKind
 _MARKER_SHARE = 0.75
 # Kalibr's pages have so much white between their tags, as a share of a tag's side.
 _SPACING = 0.3
+# The diameter of circles as a share of the distance of neighbours: as much edge as white between.
+_DIAMETER_SHARE = 0.5
 # Kinds whose size is that of a tag.
 OF_TAGS = ("marker", "aprilgrid")
 # Smaller squares are lost to the printer's dots.
@@ -33,7 +35,8 @@ class Request:
 
     Attributes:
         kind: What is printed.
-        columns: Squares (ChArUco), inner corners (checkerboard) or tags (AprilGrid) along x.
+        columns: Squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles
+            along x.
         rows: The same along y.
         square_mm: Side of a square; of the marker itself for a single marker and an AprilGrid [mm].
         marker_mm: Side of the markers in a ChArUco board [mm].
@@ -43,6 +46,8 @@ class Request:
         name: The target's name.
         spacing: White between the tags of an AprilGrid, as a share of their side.
         border: Dark modules around their bits.
+        diameter_mm: Diameter of circles [mm].
+        asymmetric: Whether every second row of them is shifted.
     """
 
     kind: TargetKind
@@ -56,6 +61,8 @@ class Request:
     name: str = ""
     spacing: float | None = None
     border: int | None = None
+    diameter_mm: float | None = None
+    asymmetric: bool = False
 
 
 def side_metres(option: str, side_mm: float) -> float:
@@ -112,6 +119,15 @@ def _target(request: Request, square_mm: float) -> Target:
         spacing = _SPACING if request.spacing is None else request.spacing
         wishes |= {"spacing": spacing, "border": request.border}
     document |= {key: value for key, value in wishes.items() if value is not None}
+    if request.kind == "circles":
+        share = _DIAMETER_SHARE * (1.4 if request.asymmetric else 1.0)
+        diameter_mm = round(share * square_mm, 6)
+        if request.diameter_mm is not None:
+            diameter_mm = request.diameter_mm
+        document |= {
+            "diameter_m": side_metres("--diameter-mm", diameter_mm),
+            "asymmetric": request.asymmetric,
+        }
     if request.kind == "charuco":
         marker_mm = request.marker_mm
         if marker_mm is None:
@@ -145,4 +161,5 @@ def _name(target: Target) -> str:
         family = family if family.startswith("a") else f"aruco_{family}"
         return f"{family}_id{target.marker_id}_{side}"
     legacy = "_legacy" if target.legacy else ""
-    return f"{target.kind}_{target.columns}x{target.rows}_{side}{legacy}"
+    layout = "_asymmetric" if target.asymmetric else legacy
+    return f"{target.kind}_{target.columns}x{target.rows}_{side}{layout}"

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from visioncal.prints import dark_cells
+from visioncal.prints import dark_cells, dark_discs
 from visioncal.recording import colours
 from visioncal.targets import corner_positions, extent_m
 from visioncal.types import FloatArray, Image, Target
@@ -83,4 +83,8 @@ def picture(target: Target) -> Image:
         there = page[top : top + rows, left : left + columns]
         drawn = cv2.resize(light, (columns, rows), interpolation=how)
         np.minimum(there, drawn[: there.shape[0], : there.shape[1]], out=there)
+    for middle in scale * (dark_discs(target) - low) - 0.5:
+        x, y = np.rint(16.0 * middle).astype(int).tolist()
+        radius = round(8.0 * scale * target.diameter_m)
+        cv2.circle(page, (x, y), radius, 0.0, -1, cv2.LINE_AA, shift=4)
     return page

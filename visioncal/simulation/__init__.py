@@ -34,7 +34,9 @@ from visioncal.simulation.options import (
     aprilgrid_target,
     charuco_target,
     checkerboard_target,
+    circles_target,
     exact,
+    symmetric_circles_target,
 )
 from visioncal.simulation.records import (
     Truth,
@@ -91,6 +93,7 @@ __all__ = [
     "cell_names",
     "charuco_target",
     "checkerboard_target",
+    "circles_target",
     "exact",
     "fine_camera",
     "fisheye_camera",
@@ -110,6 +113,7 @@ __all__ = [
     "simulate_warm_up",
     "sweep",
     "sweep_session",
+    "symmetric_circles_target",
     "touch",
     "touch_network",
     "truth_path",

@@ -31,6 +31,9 @@ def pattern_box(target: Target) -> tuple[float, float, float, float]:
     if target.kind == "aprilgrid":
         gap = target.spacing * side
         return (-gap, -gap, target.columns * (side + gap), target.rows * (side + gap))
+    if target.kind == "circles":
+        places, radius = circles_m(target), 0.5 * target.diameter_m
+        return (-radius, -radius, *(places.max(axis=0) + radius).tolist())
     start = 0.0 if target.kind == "charuco" else -side
     return (start, start, target.columns * side, target.rows * side)
 
@@ -45,6 +48,8 @@ def corners_m(sheet: Sheet) -> FloatArray:
     if target.kind == "marker":
         half = 0.5 * target.square_m
         flat = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    elif target.kind == "circles":
+        flat = circles_m(target)
     elif target.kind == "aprilgrid":
         flat = np.concatenate([_around(it, target.square_m) for _, it in tags_m(target)])
     else:
@@ -54,6 +59,19 @@ def corners_m(sheet: Sheet) -> FloatArray:
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         flat = target.square_m * grid.astype(float)
     return lift(sheet, sheet.scale * flat)
+
+
+def circles_m(target: Target) -> FloatArray:
+    """(n, 2) centres of circles, row by row; a shifted row is half a column farther on [m]."""
+    wide, shift = (2, 1) if target.asymmetric else (1, 0)
+    return target.square_m * np.array(
+        [
+            (wide * column + shift * (row % 2), row)
+            for row in range(target.rows)
+            for column in range(target.columns)
+        ],
+        dtype=float,
+    )
 
 
 def tags_m(target: Target) -> list[tuple[int, FloatArray]]:

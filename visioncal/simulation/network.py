@@ -200,6 +200,8 @@ def _as_detected(sheet: Sheet, exact: Corners, px: FloatArray) -> Corners:
 
 def is_symmetric(target: Target) -> bool:
     """Whether a board looks alike when it is turned by half a turn."""
+    if target.kind == "circles":
+        return not target.asymmetric or target.rows % 2 == 0
     return target.kind == "checkerboard" and (target.columns + target.rows) % 2 == 0
 
 

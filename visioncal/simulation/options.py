@@ -54,10 +54,39 @@ def aprilgrid_target() -> Target:
     )
 
 
+def circles_target() -> Target:
+    """An asymmetric grid of 5x9 circles of 14 mm, in rows 20 mm apart."""
+    return Target(
+        name="circles_5x9_20mm_asymmetric",
+        kind="circles",
+        columns=5,
+        rows=9,
+        square_m=0.020,
+        square_sigma_m=2e-5,
+        diameter_m=0.014,
+        asymmetric=True,
+    )
+
+
+def symmetric_circles_target() -> Target:
+    """A symmetric grid of 8x6 circles of 15 mm, 30 mm apart: it looks the same upside down."""
+    return Target(
+        name="circles_8x6_30mm",
+        kind="circles",
+        columns=8,
+        rows=6,
+        square_m=0.030,
+        square_sigma_m=3e-5,
+        diameter_m=0.015,
+    )
+
+
 TARGETS: Mapping[str, Callable[[], Target]] = {
     "charuco_9x6_30mm": charuco_target,
     "checkerboard_9x6_25mm": checkerboard_target,
     "aprilgrid_6x4_32mm": aprilgrid_target,
+    "circles_5x9_20mm_asymmetric": circles_target,
+    "circles_8x6_30mm": symmetric_circles_target,
 }
 
 

@@ -352,6 +352,8 @@ def target_document(target: Target) -> dict[str, Any]:
         document["id"] = target.marker_id
     if target.kind == "charuco":
         document |= {"marker_m": target.marker_m, "legacy": target.legacy}
+    if target.kind == "circles":
+        document |= {"diameter_m": target.diameter_m, "asymmetric": target.asymmetric}
     if target.kind == "aprilgrid":
         document |= {"spacing": target.spacing, "border": target.border}
     return document

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.errors import DataError
-from visioncal.simulation.boards import pattern_box, tags_m
+from visioncal.simulation.boards import circles_m, pattern_box, tags_m
 from visioncal.types import FloatArray, Image, Mask, Target
 
 _Canvas: TypeAlias = npt.NDArray[np.float32]
@@ -133,6 +133,8 @@ def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
         return _marker(target, target.marker_id, texels)
     if target.kind == "aprilgrid":
         return _inked(_aprilgrid(target, shape, texels))
+    if target.kind == "circles":
+        return _inked(_circles(target, shape, texels))
     rows, columns = (it // texels for it in shape)
     row, column = np.mgrid[:rows, :columns]
     # Boards from before OpenCV 4.6 start with a white square where the number of rows is even.
@@ -167,6 +169,20 @@ def _aprilgrid(target: Target, shape: tuple[int, int], texels: int) -> FloatArra
         for y in range(target.rows + 1):
             place = (texels + gap) * np.array([x, y], dtype=float)
             _stamp(dark, np.ones((1, 1), bool), place, gap)
+    return dark
+
+
+def _circles(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
+    """Which share (h, w) of each texel is dark: a texel is so small that its side is straight."""
+    dark = np.zeros(shape)
+    radius = 0.5 * target.diameter_m / target.square_m * texels
+    for middle in radius + circles_m(target) / target.square_m * texels:
+        low, high = (np.clip(middle + it, 0, shape[::-1]) for it in (-radius - 1, radius + 2))
+        (left, top), (right, bottom) = low.astype(int), high.astype(int)
+        x, y = np.arange(left, right) + 0.5 - middle[0], np.arange(top, bottom) + 0.5 - middle[1]
+        inside = np.clip(radius - np.hypot(x[None], y[:, None]) + 0.5, 0.0, 1.0)
+        window = dark[top:bottom, left:right]
+        np.maximum(window, inside, out=window)
     return dark
 
 
