@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -13,7 +13,13 @@ from visioncal.calibration.edge import Edge, edge_document, read_covariance, rea
 from visioncal.calibration.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
 from visioncal.calibration.frame import Frame, present
 from visioncal.calibration.lens import camera_document, read_camera
-from visioncal.calibration.parts import CameraResult, RobotResult, Verdict, VerdictStatus
+from visioncal.calibration.parts import CameraResult, NeedMet, RobotResult, Verdict
+from visioncal.calibration.verdicts import (
+    need_document,
+    read_need,
+    read_verdict,
+    verdict_document,
+)
 from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.estimation.tree import Branch, Step, Tree
@@ -135,6 +141,7 @@ class Alignment:
         stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`,
             `uncertainty`.
         left_out: How observations were left out of fits in turn, in words; empty where none was.
+        need: What the task needs, and how likely picks meet it; None where that is not said.
     """
 
     session_name: str
@@ -158,6 +165,7 @@ class Alignment:
     placed: Mapping[str, Frame] = field(default_factory=dict)
     stages: Mapping[str, Any] = field(default_factory=dict)
     left_out: str = ""
+    need: NeedMet | None = None
 
     @property
     def transforms(self) -> dict[str, RigidTransform]:
@@ -254,7 +262,8 @@ class Alignment:
             "moved": moved_document(self.moved),
             "untied": [vars(it) for it in self.untied],
             "weakest": self.weakest,
-            "verdict": {"status": self.verdict.status, "reasons": list(self.verdict.reasons)},
+            "verdict": verdict_document(self.verdict),
+            **need_document(self.need),
             "details": dict(self.details),
         }
 
@@ -325,9 +334,6 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
     if document.get("schema") != SCHEMA:
         raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
     check(document, _FORM)
-    verdict = document["verdict"]
-    if verdict["status"] not in get_args(VerdictStatus):
-        raise ValueError(f"verdict.status is {verdict['status']!r}")
     return {
         "session_name": document["session"]["name"],
         "session_sha256": document["session"]["sha256"],
@@ -343,6 +349,7 @@ def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
         "moved": read_moved(document["moved"]),
         "untied": tuple(Untied(**it) for it in document["untied"]),
         "weakest": document["weakest"],
-        "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
+        "verdict": read_verdict(document["verdict"]),
+        "need": read_need(document),
         "details": dict(document["details"]),
     }

@@ -19,9 +19,13 @@ from visioncal.calibration.parts import (
     Rms,
     SolverResult,
     Validation,
-    Verdict,
-    VerdictStatus,
     ViewResult,
+)
+from visioncal.calibration.verdicts import (
+    need_document,
+    read_need,
+    read_verdict,
+    verdict_document,
 )
 from visioncal.calibration.whole import whole_document
 from visioncal.documents import Kinds, shown
@@ -34,12 +38,14 @@ if TYPE_CHECKING:
 
 # What the fields hold beside numbers, by their names.
 KINDS = Kinds(
-    re.compile("reasons?|method|status|level|name|source|created|mount|words|weight"),
+    re.compile(
+        "reasons?|method|status|level|name|source|created|mount|words|weight|cause|sentence"
+    ),
     re.compile(
         "session|transforms|joint_covariance|solvers|noise|rms|validation|held_out|verdict|need"
         "|kinematics|elastic|thermal|uncertainty|noise_95|joint_fit|observability|camera|conditions"
     ),
-    re.compile("views|levels|parameters|left_out|stops|joints|course|observations"),
+    re.compile("views|levels|parameters|left_out|stops|joints|course|observations|causes"),
 )
 
 
@@ -70,10 +76,8 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
         "views": [present(vars(view)) for view in calibration.views],
         "rms": present(vars(calibration.rms)),
         "validation": _validation_document(calibration.validation),
-        "verdict": {
-            "status": calibration.verdict.status,
-            "reasons": list(calibration.verdict.reasons),
-        },
+        "verdict": verdict_document(calibration.verdict),
+        **need_document(calibration.need),
     }
     if calibration.frames:
         document["frames"] = frames_document(calibration.frames)
@@ -97,7 +101,8 @@ def _validation_document(validation: Validation) -> dict[str, Any]:
 
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "created", "session", "mount", "transforms", "joint_covariance"}
-    | {"solvers", "camera", "robot", "noise", "views", "rms", "validation", "verdict", "frames"}
+    | {"solvers", "camera", "robot", "noise", "views", "rms", "validation", "verdict", "need"}
+    | {"frames"}
 )
 
 
@@ -112,13 +117,10 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     check(document, CALIBRATION)
     if document["mount"] not in get_args(Mount):
         raise ValueError(f"mount is {document['mount']!r}")
-    if document["verdict"]["status"] not in get_args(VerdictStatus):
-        raise ValueError(f"verdict.status is {document['verdict']['status']!r}")
     if not document["transforms"]:
         raise ValueError("transforms is empty")
     camera = document.get("camera")
     robot = document.get("robot")
-    verdict = document["verdict"]
     return {
         "session_name": document["session"]["name"],
         "session_sha256": document["session"]["sha256"],
@@ -131,7 +133,8 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "views": tuple(_view(it) for it in document["views"]),
         "rms": Rms(**_figures(document["rms"])),
         "validation": _validation(document["validation"]),
-        "verdict": Verdict(verdict["status"], tuple(verdict["reasons"])),
+        "verdict": read_verdict(document["verdict"]),
+        "need": read_need(document),
         "camera": None if camera is None else read_camera(camera),
         "robot": None if robot is None else Robot.from_document(robot),
         "frames": read_frames(document.get("frames", {})),

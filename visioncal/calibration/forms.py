@@ -13,7 +13,20 @@ Form: TypeAlias = "type | list[Any] | Mapping[str, Any]"
 SCHEMA = 1
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 _RMS: Form = {"mm": float, "deg?": float, "px?": float}
-VERDICT: Form = {"status": str, "reasons": [str]}
+VERDICT: Form = {
+    "status": str,
+    "reasons": [str],
+    "good_for_mm?": float,
+    "causes?": [
+        {"cause": str, "probability": float, "sentence": str, "without_it?": str, "do?": str}
+    ],
+}
+_NEED: Form = {
+    "mm?": float,
+    "deg?": float,
+    "probability": float,
+    "pairs?": [{"camera": str, "robot": str, "probability": float}],
+}
 FRAME: Form = {
     "oriented": bool,
     "method": str,
@@ -51,6 +64,7 @@ CALIBRATION: Form = MappingProxyType(
         "rms": _RMS,
         "validation": {"method": str, "held_out": _RMS, "holdout?": _RMS},
         "verdict": VERDICT,
+        "need?": _NEED,
         "frames?": {"": FRAME},
         "board?": _BOARD,
         "boards?": {"": _BOARD},
@@ -102,6 +116,7 @@ WHOLE: Form = MappingProxyType(
         "untied": [UNTIED],
         "weakest": str,
         "verdict": VERDICT,
+        "need?": _NEED,
         "frames?": {"": FRAME},
         "details": {},
         "boards?": {"": _BOARD},

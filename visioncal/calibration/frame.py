@@ -4,11 +4,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, Self
 
 from visioncal.calibration.edge import Edge, edge_document, read_edge
 from visioncal.calibration.forms import FRAME, check
-from visioncal.calibration.parts import Verdict, VerdictStatus
+from visioncal.calibration.parts import Verdict
+from visioncal.calibration.verdicts import read_verdict, verdict_document
 from visioncal.documents import parse_stored
 from visioncal.errors import DataError
 from visioncal.files import read_bytes, write_atomically
@@ -119,7 +120,7 @@ def _frame_document(frame: Frame) -> dict[str, Any]:
         "rms_mm": frame.rms_mm,
         "noise_mm": frame.noise_mm,
         "observations": [present(vars(it)) for it in frame.observations],
-        "verdict": {"status": frame.verdict.status, "reasons": list(frame.verdict.reasons)},
+        "verdict": verdict_document(frame.verdict),
         "details": dict(frame.details),
     }
 
@@ -148,9 +149,6 @@ def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
 
 def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
     check(document, FRAME)
-    verdict = document["verdict"]
-    if verdict["status"] not in get_args(VerdictStatus):
-        raise ValueError(f"verdict.status is {verdict['status']!r}")
     return Frame(
         read_edge(document, name),
         document["oriented"],
@@ -160,6 +158,6 @@ def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
         document["rms_mm"],
         document["noise_mm"],
         tuple(Observation(**it) for it in document["observations"]),
-        Verdict(verdict["status"], tuple(verdict["reasons"])),
+        read_verdict(document["verdict"]),
         dict(document["details"]),
     )

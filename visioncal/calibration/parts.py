@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeAlias
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.robot import Robot
-from visioncal.types import Camera, FloatArray
+from visioncal.types import Camera, FloatArray, Need
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 # Why a view is in no fit although nothing is wrong with it.
@@ -117,8 +117,66 @@ class Validation:
 
 
 @dataclass(frozen=True)
+class Cause:
+    """What may be why a result is not good.
+
+    Attributes:
+        cause: What it is, as a short name that stays.
+        probability: How likely it is.
+        sentence: What it is, with its figures.
+        without_it: What the result would be without it, in a sentence; empty where not computed.
+        do: What to do about it; a command where one does it.
+    """
+
+    cause: str
+    probability: float
+    sentence: str
+    without_it: str = ""
+    do: str = ""
+
+
+@dataclass(frozen=True)
 class Verdict:
-    """Whether the result can be trusted: a status and the reasons in plain sentences."""
+    """Whether the result can be trusted.
+
+    Attributes:
+        status: In one word.
+        reasons: Why, in plain sentences.
+        good_for_mm: The least need that it would be good for [mm]; None where something is
+            unexplained, and it is good for none.
+        causes: What may be why it is not good, likeliest first.
+    """
 
     status: VerdictStatus
     reasons: tuple[str, ...]
+    good_for_mm: float | None = None
+    causes: tuple[Cause, ...] = ()
+
+
+@dataclass(frozen=True)
+class Picker:
+    """How likely picks by one robot of what one camera sees land within what is needed."""
+
+    camera: str
+    robot: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class NeedMet:
+    """What the task needs, and how likely a pick lands within it.
+
+    Attributes:
+        need: What it needs.
+        probability: How likely a pick lands within it; of a whole cell, by the worst of its pairs.
+        pairs: Each camera and robot of a whole cell that pick together; empty elsewhere.
+    """
+
+    need: Need
+    probability: float
+    pairs: tuple[Picker, ...] = ()
+
+    def of(self, camera: str, robot: str) -> "NeedMet":
+        """What is said of one camera and robot; of those that are no pair, of all."""
+        mine = [it for it in self.pairs if (it.camera, it.robot) == (camera, robot)]
+        return NeedMet(self.need, mine[0].probability) if mine else self

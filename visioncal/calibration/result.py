@@ -17,6 +17,7 @@ from visioncal.calibration.edge import Edge
 from visioncal.calibration.frame import Frame
 from visioncal.calibration.parts import (
     CameraResult,
+    NeedMet,
     Rms,
     SolverResult,
     Validation,
@@ -57,6 +58,7 @@ class Calibration:
         stages: One document for each further stage that ran, by name.
         cell: The whole cell that it stands for, whose frames `edges` places; None for one camera,
             one robot and their targets. What is of one camera or robot, `of` takes out of it.
+        need: What the task needs, and how likely picks meet it; None where that is not said.
     """
 
     session_name: str
@@ -76,6 +78,7 @@ class Calibration:
     frames: Mapping[str, Frame] = field(default_factory=dict)
     stages: Mapping[str, Any] = field(default_factory=dict)
     cell: Alignment | None = None
+    need: NeedMet | None = None
 
     @classmethod
     def whole(cls, cell: Alignment) -> Self:

@@ -40,6 +40,7 @@ def whole_fields(cell: Alignment) -> dict[str, Any]:
         "verdict": cell.verdict,
         "frames": cell.placed,
         "cell": cell,
+        "need": cell.need,
     }
 
 
@@ -84,6 +85,7 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
             **_joint_fit(cell, chosen, slopes),
         },
         "cell": None,
+        "need": None if cell.need is None else cell.need.of(*_pair(chosen)),
     }
 
 
@@ -123,6 +125,11 @@ def _chosen(cell: Alignment, choice: Choice, needs: Collection[Part]) -> Chosen:
         camera=chosen.camera if "camera" in kept else "",
         target=chosen.target if "target" in kept else "",
     )
+
+
+def _pair(chosen: Chosen) -> tuple[str, str]:
+    """Camera and robot by the names of their tables."""
+    return thing_name(chosen.camera, "camera"), chosen.robot or "robot"
 
 
 def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:

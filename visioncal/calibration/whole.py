@@ -6,7 +6,7 @@ What differs: `tree` says what each frame hangs on, `reference` which frame the 
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +25,13 @@ from visioncal.calibration.parts import (
     HELD_BACK,
     Rms,
     RobotResult,
-    Verdict,
-    VerdictStatus,
     ViewResult,
+)
+from visioncal.calibration.verdicts import (
+    need_document,
+    read_need,
+    read_verdict,
+    verdict_document,
 )
 from visioncal.robot import Robot
 from visioncal.session import frame_name
@@ -40,7 +44,7 @@ _OWN_KEYS = frozenset(
     {"schema", "visioncal", "created", "session", "reference", "tree", "transforms", "noise"}
     | {"validation"}
     | {"joint_covariance", "cameras", "robots", "targets", "views", "rms", "moved", "untied"}
-    | {"weakest", "verdict", "frames", "details"}
+    | {"weakest", "verdict", "need", "frames", "details"}
 )
 
 
@@ -74,7 +78,8 @@ def whole_document(cell: Alignment) -> dict[str, Any]:
         "moved": moved_document(cell.moved),
         "untied": [vars(it) for it in cell.untied],
         "weakest": cell.weakest,
-        "verdict": {"status": cell.verdict.status, "reasons": list(cell.verdict.reasons)},
+        "verdict": verdict_document(cell.verdict),
+        **need_document(cell.need),
         "details": dict(cell.details),
     }
     if cell.left_out:
@@ -93,9 +98,7 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
     if document.get("schema") != SCHEMA:
         raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
     check(document, WHOLE)
-    verdict, tree = document["verdict"], dict(document["tree"])
-    if verdict["status"] not in get_args(VerdictStatus):
-        raise ValueError(f"verdict.status is {verdict['status']!r}")
+    tree = dict(document["tree"])
     return Alignment(
         session_name=document["session"]["name"],
         session_sha256=document["session"]["sha256"],
@@ -114,7 +117,8 @@ def read_whole(document: Mapping[str, Any]) -> Alignment:
         moved=read_moved(document["moved"]),
         untied=tuple(Untied(**it) for it in document["untied"]),
         weakest=document["weakest"],
-        verdict=Verdict(verdict["status"], tuple(verdict["reasons"])),
+        verdict=read_verdict(document["verdict"]),
+        need=read_need(document),
         details=dict(document["details"]),
         arms={name: _arm(it) for name, it in document["robots"].items()},
         targets={name: dict(it) for name, it in document["targets"].items()},

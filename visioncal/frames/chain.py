@@ -16,6 +16,7 @@ from visioncal.calibration import Calibration
 from visioncal.errors import DataError
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
+from visioncal.estimation.intervals import freedom_of
 from visioncal.transforms import adjoint, invert, skew
 from visioncal.types import Camera, FloatArray, Mount
 
@@ -26,10 +27,6 @@ Pose: TypeAlias = FloatArray | RigidTransform
 FAR_M = 20.0
 # Poses come with five digits or more; a matrix that is off by more is no rotation.
 _RIGID = 1e-4
-# The normal quantile that a 95 % interval reaches to.
-_TWO_SIDED_95 = 1.96
-# Noise that cannot be told from none is known as well as by a handful of stops, at the least.
-_LEAST_FREEDOM = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,17 +252,6 @@ def _arm_sigma(calibration: Calibration) -> float:
 
 
 def noise_freedom(calibration: Calibration) -> float:
-    """Degrees of freedom of the noise's levels, by the width of their 95 % intervals.
-
-    A level with n degrees of freedom has a logarithm known to 1 / sqrt(2 n). Rotation and
-    translation contribute about alike at half a metre from the flange, where arms err by 0.6 mm
-    for each mrad, so that their degrees add up (Satterthwaite 1946). One of which the residuals
-    say little adds little.
-    """
+    """Degrees of freedom of the noise's levels; see `estimation.intervals.freedom_of`."""
     intervals = calibration.stages.get("uncertainty", {}).get("noise_95", {})
-    found = [
-        2.0 * (_TWO_SIDED_95 / np.log(high / low)) ** 2
-        for low, high in intervals.values()
-        if 0.0 < low < high
-    ]
-    return max(float(sum(found)), _LEAST_FREEDOM) if intervals else np.inf
+    return freedom_of(intervals.values()) if intervals else np.inf

@@ -71,6 +71,12 @@ def _sources(solved: Solved) -> Sources:
     )
 
 
+def columns_of_boards(solved: Solved) -> IntArray:
+    """The problem's columns of boards' shapes, as far as they are free."""
+    found = (it for name, it in _looks(solved).items() if name.startswith("board"))
+    return np.concatenate([np.zeros(0, dtype=np.int64), *found])
+
+
 def _looks(solved: Solved) -> dict[str, IntArray]:
     """Columns of each lens and each board, as far as they are free."""
     seen, looks = solved.seen, solved.looks

@@ -23,6 +23,7 @@ from visioncal.pipeline.solving import Solved
 from visioncal.pipeline.ties import robot_motion
 from visioncal.stages.cell import Cell
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.stages.need import Picks
 from visioncal.types import Mask, Rejection
 
 
@@ -38,6 +39,7 @@ def findings_of(
     spared: Collection[int],
     warnings: Sequence[str],
     notes: Sequence[str],
+    picks: Sequence[Picks] = (),
 ) -> Findings:
     """Puts together what a whole cell is judged by.
 
@@ -52,6 +54,7 @@ def findings_of(
         spared: Views that are not needed, and those that are held back.
         warnings: Reasons for doubt that were found before.
         notes: What is good to know.
+        picks: What picks err by.
     """
     tree = solved.cell.tree
     tied = [it for it in sights if {it.seer, it.seen} <= tree.branches.keys()]
@@ -71,6 +74,8 @@ def findings_of(
         (*(it.words for it in faults), *warnings),
         notes,
         "instrument" if all(it.seer.startswith("instrument") for it in tied) else "eye-to-hand",
+        solved.cell.session.need,
+        picks,
     )
 
 

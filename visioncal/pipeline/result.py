@@ -24,6 +24,7 @@ from visioncal.stages.dense import Dense
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES, compare_solvers
 from visioncal.stages.kinematics import check_level
+from visioncal.stages.need import need_met
 from visioncal.stages.proposing import with_proposal
 from visioncal.stages.readings import Readings
 from visioncal.targets import first_corners
@@ -158,6 +159,7 @@ def result_of(known: Known) -> Calibration:
         camera=_camera(known),
         robot=known.robot,
         stages=_further(known),
+        need=need_met(findings.need, findings.picks),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.chain import robot_part
+from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import FEWEST_VIEWS, directions, refuse_too_few
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.problem import Problem
@@ -28,12 +29,13 @@ from visioncal.stages.arms import check_arms
 from visioncal.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.stages.choose import choose_by
 from visioncal.stages.clocks import set_clocks, waits_for_clock
-from visioncal.stages.diagnose import diagnose
+from visioncal.stages.diagnose import Diagnosis, diagnose, sources
 from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.judge import Arm as ArmFindings
 from visioncal.stages.judge import Findings, Pair, Place, Sensor, judge
 from visioncal.stages.kinematics import check_asked, doubts, findings
 from visioncal.stages.loads import check_stops
+from visioncal.stages.need import Fitted, picks_of
 from visioncal.stages.observed import all_held_back, nothing_seen
 from visioncal.stages.place import place
 from visioncal.stages.pnp import ViewPoses
@@ -42,6 +44,7 @@ from visioncal.stages.readings import mounted, read_instrument
 from visioncal.stages.refine import held, look, refine
 from visioncal.stages.robots import check_joints, read_robots
 from visioncal.stages.side import FramesSide
+from visioncal.stages.validate import HeldOut
 from visioncal.transforms import invert, rotation_angle
 from visioncal.types import FloatArray, Rejection
 
@@ -431,8 +434,26 @@ def _judge(known: Known) -> Known:
         (*agreed.doubts(), *known.warnings),
         known.notes,
         known.session.mount,
+        known.session.need,
+        picks_of(_fitted(known, held, diagnosis), known.session.need),
     )
     return replace(known, findings=findings, verdict=judge(findings))
+
+
+def _fitted(known: Known, held: HeldOut, diagnosis: Diagnosis) -> Fitted:
+    """What picks are predicted from."""
+    result, no_columns = known.solved, np.zeros(0, dtype=np.int64)
+    return Fitted(
+        known.problem(known.used),
+        result.state,
+        result.noise,
+        result.covariance,
+        held,
+        middles_of(known),
+        {ROBOT: freedom_of(diagnosis.intervals.tolist())},
+        {ROBOT: known.arm_at_stops},
+        sources(result.problem, known.session.mount, known.free).columns.get("board", no_columns),
+    )
 
 
 STAGES: tuple[Stage, ...] = (

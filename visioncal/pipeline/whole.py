@@ -11,9 +11,10 @@ import numpy as np
 from visioncal.calibration import Alignment, CameraResult, Edge, RobotResult, Sight, Untied
 from visioncal.errors import DataError
 from visioncal.estimation.arm import stops_of
-from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.intervals import freedom_of, noise_intervals
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import covariance_of
-from visioncal.pipeline.budget import budget_mm, left_out
+from visioncal.pipeline.budget import budget_mm, columns_of_boards, left_out
 from visioncal.pipeline.faults import (
     PoseFault,
     Version,
@@ -49,6 +50,7 @@ from visioncal.stages.delays import FoundDelay
 from visioncal.stages.diagnose import misfits
 from visioncal.stages.judge import judge
 from visioncal.stages.kinematics import check_level
+from visioncal.stages.need import Fitted, need_met, picks_of
 from visioncal.stages.observed import Observed
 from visioncal.stages.offset import Clock
 from visioncal.stages.priors import prior_words
@@ -179,6 +181,7 @@ def alignment_of(
             *notes_on_arms(solved.arms, told),
             *(words for words, is_doubt in of_rest if not is_doubt),
         ),
+        picks=picks_of(_fitted(solved, part, spread, held_out), session.need),
     )
     return Alignment(
         session_name=session.name,
@@ -207,17 +210,41 @@ def alignment_of(
                 "noise_95": _intervals(solved),
             },
         },
+        need=need_met(findings.need, findings.picks, whole=True),
     )
+
+
+def _fitted(solved: Solved, part: Problem, spread: FloatArray, held_out: HeldOut) -> Fitted:
+    """What picks are predicted from."""
+    fit = solved.agreed.fit
+    intervals = noise_intervals(part, fit.state, fit.noise)
+    freedom = [freedom_of(it.tolist()) for it in intervals]
+    return Fitted(
+        part,
+        fit.state,
+        fit.noise,
+        spread,
+        held_out,
+        _middles(solved.cell.session),
+        dict(zip(part.robots, freedom, strict=True)),
+        solved.arms,
+        columns_of_boards(solved),
+    )
+
+
+def _middles(session: Session) -> dict[str, FloatArray]:
+    """(3,) the middle of each target by its frame, in that [m]."""
+    return {
+        frame_name("target", name): corner_positions(it).mean(axis=0)
+        for name, it in session.plates.items()
+    }
 
 
 def _found_of_arms(
     solved: Solved, spread: FloatArray, convention: Convention | None
 ) -> dict[str, ArmFound]:
     """What the stops tell of the arms, by robot."""
-    agreed, plates = solved.agreed, solved.cell.session.plates
-    middles = {
-        frame_name("target", name): corner_positions(it).mean(axis=0) for name, it in plates.items()
-    }
+    agreed, middles = solved.agreed, _middles(solved.cell.session)
     part = agreed.problem.subset(agreed.used)
     return {
         name: arm.found(part, agreed.fit, spread, middles, convention)

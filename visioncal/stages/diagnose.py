@@ -92,7 +92,7 @@ def diagnose(
         nothing = Misfit(Neighbours(1.0, is_significant=False), None)
         # A closed form is not at rest, and that would pass for a misfit.
         shown = misfits(problem, fit_problem(problem, state)).get(ROBOT, nothing)
-        parts = covariance_by_source(problem, state, noise, _sources(problem, mount, free))
+        parts = covariance_by_source(problem, state, noise, sources(problem, mount, free))
         size = 6 * len(problem.unknown)
         if arm is not None and not arm.is_estimated:
             of_arm = misfit_covariance(problem, state, noise, ROBOT, arm)
@@ -138,7 +138,7 @@ def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
     return found
 
 
-def _sources(problem: Problem, mount: Mount, free: Free | None) -> Sources:
+def sources(problem: Problem, mount: Mount, free: Free | None) -> Sources:
     """What makes the result uncertain."""
     owners: dict[str, IntArray] = {}
     for name, at in problem.effect_columns.items():

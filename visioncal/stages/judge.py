@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration import Rms, Verdict, VerdictStatus, ViewResult
+from visioncal.calibration import NeedMet, Rms, Verdict, VerdictStatus, ViewResult
 from visioncal.estimation.observability import Direction
 from visioncal.figures import figure
+from visioncal.stages.need import CHECK, GOOD, Picks, need_met
 from visioncal.stages.proposing import with_proposal
-from visioncal.types import Mount, Rejection
+from visioncal.types import Mount, Need, Rejection
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
 _ROUNDING = 1e-6
@@ -158,6 +159,8 @@ class Findings:
         warnings: What earlier stages had to say.
         notes: What of it is no reason for doubt.
         mount: What observed whom.
+        need: What the task needs; None where that is not said.
+        picks: What picks err by, by each camera and robot; empty where that is not predicted.
     """
 
     pairs: Sequence[Pair]
@@ -168,6 +171,8 @@ class Findings:
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     mount: Mount = "eye-in-hand"
+    need: Need | None = None
+    picks: Sequence[Picks] = ()
 
     @property
     def rms(self) -> Rms:
@@ -199,10 +204,19 @@ class Findings:
 
 @dataclass(frozen=True)
 class _Doubt:
-    """A reason not to trust the result, and whether it settles the matter."""
+    """A reason not to trust the result.
+
+    Attributes:
+        sentence: What it is.
+        is_fatal: Whether it settles the matter.
+        until_mm: The need of a task from which on it is none [mm]: zero where it says how large
+            errors are, which any need says better than a limit; infinite where it is of what is
+            not explained.
+    """
 
     sentence: str
     is_fatal: bool = False
+    until_mm: float = np.inf
 
 
 def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
@@ -213,7 +227,9 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         limits: Where doubt begins.
 
     Returns:
-        `bad` with a reason that settles it, `check` with doubts, `good` without.
+        `bad` with a reason that settles it, `check` with doubts, `good` without. Where the task
+        says what it needs, the chance that picks land within it decides: good from 0.95, check from
+        0.5, bad below, and never good where something is not explained.
     """
     limits = limits or Limits()
     scatter = list(_scatter_doubts(findings, limits))
@@ -231,15 +247,83 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         *([] if scatter else _robot_doubts(findings, limits)),
         *(_Doubt(sentence) for sentence in findings.warnings),
     ]
-    if not doubts:
-        return Verdict("good", (_praise(findings), *findings.notes))
-    status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
+    good_for_mm = _good_for_mm(findings.picks, doubts)
+    met = need_met(findings.need, findings.picks)
+    status: VerdictStatus = "good" if not doubts else "check"
+    if met is None:
+        status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
+    elif met.probability >= GOOD:
+        doubts = [it for it in doubts if it.until_mm > (met.need.mm or 0.0)]
+        status = "check" if doubts else "good"
+    else:
+        status = "check" if met.probability >= CHECK else "bad"
     ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
-    sentences = tuple(doubt.sentence for doubt in ordered)
-    if any(it.pixel_px is not None for it in sensors):
-        modelled = all(it.modelled for it in findings.arms)
-        sentences = with_proposal(sentences, modelled=modelled)
-    return Verdict(status, (*sentences, *findings.notes))
+    sentences = [doubt.sentence for doubt in ordered] if doubts else [_praise(findings)]
+    if met is not None:
+        sentences.insert(len(ordered) * (met.probability >= GOOD), met_words(findings, met))
+    elif good_for_mm is not None:
+        sentences[0] += f" {_good_for_words(findings.picks, good_for_mm)}"
+    told = tuple(sentences)
+    if doubts and any(it.pixel_px is not None for it in sensors):
+        told = with_proposal(told, modelled=all(it.modelled for it in findings.arms))
+    return Verdict(status, (*told, *findings.notes), good_for_mm)
+
+
+def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[_Doubt]) -> float | None:
+    """The least need that would be met by all pairs; None where none would, or none is known."""
+    least = max((it.until_mm for it in doubts), default=0.0)
+    if not picks or np.isinf(least):
+        return None
+    return max(least, *(it.good_for_mm for it in picks))
+
+
+def _good_for_words(picks: Sequence[Picks], good_for_mm: float) -> str:
+    worst = max(picks, key=lambda it: it.good_for_mm)
+    return (
+        f"It is good for tasks of {figure(good_for_mm)} mm and more at "
+        f"{figure(worst.distance_m)} m from the camera."
+    )
+
+
+def met_words(findings: Findings, met: NeedMet) -> str:
+    """How likely picks land within what is needed, and what limits that."""
+    need, worst = met.need, min(findings.picks, key=lambda it: it.probability(met.need))
+    within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]
+    where = "where the views looked" if need.at == "views" else f"at {list(need.at)} m in the base"
+    who = f" by robot {worst.robot} of what {worst.camera} sees" if len(findings.picks) > 1 else ""
+    budget = worst.budget_mm
+    parts = {name: it for name, it in budget.items() if name != "total"}
+    largest = max(parts, key=lambda name: parts[name], default="")
+    told = (
+        f"A pick{who} {where} lands within {' and '.join(within)} with a probability of "
+        f"{_percent(met.probability)}; 95 % land within {figure(worst.good_for_mm)} mm."
+    )
+    if met.probability >= GOOD or not largest:
+        return told
+    return (
+        f"{told} Of its {figure(budget['total'])} mm (sigma), {figure(parts[largest])} mm come "
+        f"from {_LIMITED_BY[largest]}"
+    )
+
+
+# What picks are limited by, and what helps.
+_LIMITED_BY: Mapping[str, str] = {
+    "calibration": "the calibration itself. Add views in which the robot stands otherwise.",
+    "look": "the robot's own noise where it looks, which more views do not change. Look several "
+    "times from different stops, and take the mean.",
+    "pick": "the robot's own noise where it picks, which no calibration changes.",
+    "arm": "the arm's own errors, which more views do not change. Record joint angles, name the "
+    "arm's model, and calibrate it (--level kinematics).",
+    "left out": "what left-out views err by beyond what is predicted: something is not explained. "
+    "Look at the worst views.",
+}
+
+
+def _percent(probability: float) -> str:
+    """A probability in words; none is certain."""
+    if probability > 0.99:
+        return "over 99 %"
+    return "under 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
 
 
 def is_scattered(findings: Findings, limits: Limits | None = None) -> bool:
@@ -288,6 +372,7 @@ def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
             f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
             "views for their noise. Add 5 or more, tilted about different axes.",
             ratio > limits.optimism[1],
+            until_mm=0.0,
         )
 
 
@@ -317,6 +402,7 @@ def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
             f"{_worst_views(views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
             "arm with large model errors.",
             is_fatal,
+            until_mm=0.0,
         )
 
 
@@ -426,7 +512,8 @@ def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 f"{limits.sigma_mm[0]:g}). {board if seen else ''}Add views in "
                 "which the arm stands otherwise, all over the workspace."
             )
-            yield _Doubt(_named(_robot(it), sentence), it.workspace_mm > limits.sigma_mm[1])
+            is_fatal = it.workspace_mm > limits.sigma_mm[1]
+            yield _Doubt(_named(_robot(it), sentence), is_fatal, until_mm=0.0)
 
 
 def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
@@ -447,6 +534,7 @@ def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
             f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg. Add views tilted by "
             "20 to 40 degrees about axes across these directions.",
             is_fatal,
+            until_mm=0.0,
         )
 
 
@@ -468,6 +556,7 @@ def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
         + "."
         + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
         budget["total"] > limits.sigma_mm[1],
+        until_mm=0.0,
     )
 
 
@@ -481,7 +570,7 @@ def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 f"Only {counted} are used; {check} or more give the result something to be checked "
                 "with."
             )
-            yield _Doubt(_named(_robot(it), sentence), it.stops < bad)
+            yield _Doubt(_named(_robot(it), sentence), it.stops < bad, until_mm=0.0)
 
 
 def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
@@ -526,11 +615,15 @@ def _robot(arm: Arm) -> str:
 
 
 def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
-    """An arm is a good instrument: what looks like its error is often something else's."""
+    """An arm is a good instrument: what looks like its error is often something else's.
+
+    A task that needs ten times as much has an arm that is as good as it has to be.
+    """
     for it in findings.arms:
         if it.away_mm is None or it.away_deg is None or it.errs:
             continue
-        if it.away_mm > limits.robot_mm or it.away_deg > limits.robot_deg:
+        beyond = max(it.away_mm / limits.robot_mm, it.away_deg / limits.robot_deg)
+        if beyond > 1.0:
             cause = (
                 "the instrument reads worse than is stated of it, was moved, or the arm's model is "
                 "off by as much. Read a few stops twice to see how well readings repeat."
@@ -544,4 +637,5 @@ def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 f"mm and {figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More "
                 f"likely {cause}"
             )
-            yield _Doubt(_named(_robot(it), sentence))
+            until_mm = 10.0 * beyond * limits.robot_mm
+            yield _Doubt(_named(_robot(it), sentence), until_mm=until_mm)
