@@ -17,7 +17,8 @@ CLOCK = "cam_side and robot b"
 
 @pytest.fixture(scope="module")
 def swept():
-    cell = cell_of(NetworkOptions(stops=16, seed=1))
+    arms = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)
+    cell = cell_of(NetworkOptions(tuple(arms), stops=16, seed=4))
     return cell, *swept_session(cell)
 
 
@@ -31,8 +32,8 @@ def test_the_offset_of_one_camera_is_found_by_the_motion(found):
     clock = found.details["clocks"][CLOCK]
     assert clock["method"] == "motion"
     assert clock["sigma_s"] < 1e-4
-    # Four sigma: one run in fifteen thousand.
-    assert abs(clock["camera_minus_robot_s"] - AHEAD_S) < 4 * clock["sigma_s"]
+    # Three sigma: one run in 370. What the motion tells of the arm as stated is off by more.
+    assert abs(clock["camera_minus_robot_s"] - AHEAD_S) < 3 * clock["sigma_s"]
     ahead_ms = 1e3 * clock["camera_minus_robot_s"]
     said = f"{CLOCK}: the fit of the whole cell has the camera's clock {ahead_ms:+.2f} ms ahead"
     assert any(it.startswith(said) for it in found.verdict.reasons)
@@ -46,8 +47,8 @@ def test_the_clock_of_one_camera_and_robot_goes_with_them(found):
 
 def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, found):
     cell, session, _ = swept
-    edge = found.between("base_a", "cam_side")
-    away = log(invert(cell.between("base_a", "cam_side")) @ edge.matrix)
+    edge = found.between("cam_left", "cam_side")
+    away = log(invert(cell.between("cam_left", "cam_side")) @ edge.matrix)
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert away @ np.linalg.solve(edge.covariance, away) < 22.0
     assert edge.sigma_mm < 0.2
@@ -74,13 +75,13 @@ def test_a_clock_of_no_camera_is_refused(swept):
 
 
 def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
-    """A twentieth of the sweep: too short to say when."""
+    """Some frames of the sweep: too few to say when."""
     _, session, corners = swept
     timed = [it for it in session.views if it.stamp_s is not None]
-    views = tuple(it for it in session.views if it.stamp_s is None or it in timed[:8])
+    views = tuple(it for it in session.views if it.stamp_s is None or it in timed[:5])
     found = align(replace(session, views=views), corners=corners)
     lost = [it for it in found.sights if it.seer == "cam_side"]
-    assert len(lost) == 8
+    assert len(lost) == 5
     assert all(not it.used and "clock" in it.reason for it in lost)
     assert "cam_side" in {it.frame for it in found.untied}
     assert any(it.startswith(CLOCK) for it in found.verdict.reasons)

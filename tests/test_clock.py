@@ -31,6 +31,7 @@ from visioncal.simulation import (
 )
 from visioncal.stages.clocks import set_clocks
 from visioncal.stages.observed import Observed
+from visioncal.stages.offset import LARGEST_SIGMA_S, Clock
 from visioncal.stages.pnp import given_poses
 from visioncal.transforms import exp, invert, log
 from visioncal.verification import verify
@@ -324,6 +325,18 @@ def test_what_is_open_about_the_clocks_counts(session):
     # The used views themselves tell the offset to better than 5 ms, but not for nothing.
     assert spreads[1][1] > spreads[0][1]
     assert spreads[1][0] > spreads[0][0]
+
+
+def test_frames_that_are_in_the_fit_tell_the_offset_once():
+    clock = Clock(0.02, 1e-4, "motion", None, 100, 0.9, dict.fromkeys(range(75), np.ones(6)))
+    # A quarter of the frames tells half as well.
+    assert clock.known_s() == pytest.approx(2e-4)
+    assert replace(clock, frames=75).known_s() == LARGEST_SIGMA_S
+    # The arm as stated was told by, and its errors are sought.
+    assert clock.known_s(erring=True) == LARGEST_SIGMA_S
+    assert replace(clock, method="stated", frames=0).known_s(erring=True) == 1e-4
+    (effect,) = clock.effects([3, 80])
+    assert effect.known.information[0, 0] == pytest.approx(2e-4**-2.0)
 
 
 def test_views_with_poses_of_their_own_ask_no_stream(moved, session):

@@ -210,7 +210,7 @@ class Known(Observed):
     def problem(self, views: Sequence[int]) -> Problem:
         """What some views measured, each with its first or chosen pose."""
         poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
-        covariance, effects = None, []
+        covariance, effects, arm = None, [], self.arm_at(first)
         if self.readings is not None:
             covariance = np.array([it.covariance[0] for it in poses])
             effects = self.readings.effects(poses)
@@ -224,8 +224,9 @@ class Known(Observed):
             covariance = np.array([it.covariance[0] for it in poses]).reshape(-1, 6, 6)
         if self.clock is not None and self.clock.speeds:
             of_stops = np.isin(views, first)
-            effects += [it.of_stops(of_stops) for it in self.clock.effects(views)]
-        effects += self.arm_at(first).effects()
+            erring = arm.frees_errors()
+            effects += [it.of_stops(of_stops) for it in self.clock.effects(views, erring=erring)]
+        effects += arm.effects()
         return chain(
             self.session.mount,
             self.flange_poses(first),

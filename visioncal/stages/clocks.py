@@ -4,7 +4,7 @@ Every pair of a camera and a robot has clocks of its own, whose offset is estima
 that both have seen.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import TypeVar
 
@@ -106,20 +106,29 @@ def _stated_s(session: Session, camera: str) -> float | None:
     return clock.camera_minus_robot_s if clock.model_fields_set else None
 
 
-def clock_effects(cell: Cell, clocks: Mapping[Pair, Clocked]) -> tuple[Effect, ...]:
-    """The errors of offsets and times within images [s], as effects on the cell's rows."""
+def clock_effects(
+    cell: Cell, clocks: Mapping[Pair, Clocked], erring: Collection[str] = ()
+) -> tuple[Effect, ...]:
+    """The errors of offsets and times within images [s], as effects on the cell's rows.
+
+    Args:
+        cell: The cell.
+        clocks: What was found of clocks.
+        erring: The robots, as the problem has them, whose arms' errors are unknowns of the fit.
+    """
     views = [it.view for it in cell.rows]
     found: list[Effect] = []
     for pair, clocked in clocks.items():
         if clocked.clock.speeds and robot_key(pair.robot) in cell.poses:
-            found.append(_effect(cell, pair, clocked.clock))
+            errs = robot_key(pair.robot) in erring
+            found.append(_effect(cell, pair, clocked.clock, clocked.clock.known_s(erring=errs)))
             found += [
                 it.effect(views, pair.delay(it.of)) for it in clocked.clock.delays if it.is_clear
             ]
     return tuple(found)
 
 
-def _effect(cell: Cell, pair: Pair, clock: Clock) -> Effect:
+def _effect(cell: Cell, pair: Pair, clock: Clock, sigma_s: float) -> Effect:
     speeds = clock.speeds
     concerned = np.array([it.view in speeds for it in cell.rows], dtype=bool)
     robot = robot_key(pair.robot)
@@ -127,5 +136,5 @@ def _effect(cell: Cell, pair: Pair, clock: Clock) -> Effect:
     for row in cell.rows:
         if row.view in speeds:
             moving[row.station] = speeds[row.view]
-    found = clock_effect(moving, clock.sigma_s, pair.effect, robot)
+    found = clock_effect(moving, sigma_s, pair.effect, robot)
     return replace(found, concerned=concerned)

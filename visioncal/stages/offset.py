@@ -52,16 +52,32 @@ class Clock:
     speeds: Mapping[int, FloatArray]
     delays: tuple[FoundDelay, ...] = ()
 
-    def effects(self, views: Sequence[int]) -> tuple[Effect, ...]:
+    def known_s(self, *, erring: bool = False) -> float:
+        """How well the offset is known beside the views that are used [s].
+
+        These are in the fit themselves: of the motion, the share of frames that are no such views
+        tells besides.
+
+        Args:
+            erring: Whether errors of the arm are unknowns of that fit. The motion told the offset
+                of an arm as stated, whose errors are the same ones in all frames.
+        """
+        if self.method != "motion":
+            return self.sigma_s
+        share = 0.0 if erring else max(0.0, 1.0 - len(self.speeds) / self.frames)
+        return 1.0 / max(1.0 / LARGEST_SIGMA_S, float(np.sqrt(share)) / self.sigma_s)
+
+    def effects(self, views: Sequence[int], *, erring: bool = False) -> tuple[Effect, ...]:
         """The errors of offset and times within images as unknowns of the chain of some views.
 
-        Each is known beforehand as well as it was told: the few used views, slow ones, count twice
-        in that, and tell little of it.
+        Args:
+            views: The views.
+            erring: As `known_s` has it.
         """
         still = np.zeros(6)
         speeds = np.array([self.speeds.get(view, still) for view in views]).reshape(-1, 6)
         delays = (it.effect(views) for it in self.delays if it.is_clear)
-        return clock_effect(speeds, self.sigma_s), *delays
+        return clock_effect(speeds, self.known_s(erring=erring)), *delays
 
     def document(self) -> dict[str, object]:
         """What calibration.json says of it."""
