@@ -105,8 +105,8 @@ def test_the_verdict_is_about_the_need(sigma_mm: float, status: str) -> None:
     assert verdict.status == status
     assert "where the views looked lands within 0.5 mm with a probability of" in verdict.reasons[0]
     assert verdict.good_for_mm == pytest.approx(sigma_mm * np.sqrt(7.815), rel=5e-3)
-    helps = "Add views in which the robot stands otherwise" in verdict.reasons[0]
-    assert helps == (status != "good")
+    causes = [] if status == "good" else ["calibration"]
+    assert [it.cause for it in verdict.causes] == causes
 
 
 def test_both_have_to_hold() -> None:

@@ -19,6 +19,13 @@ def figure(value: float) -> str:
     return text.rstrip("0").rstrip(".") if decimals else text
 
 
+def percent(probability: float) -> str:
+    """Writes a probability; none is certain."""
+    if probability > 0.99:
+        return "over 99 %"
+    return "under 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
+
+
 def decimals_for(sigma: float) -> int:
     """Decimals at which a standard deviation shows two significant digits."""
     if not math.isfinite(sigma) or sigma <= 0.0:

@@ -6,12 +6,15 @@ from typing import Any, Literal, TypeAlias
 
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.figures import percent
 from visioncal.robot import Robot
 from visioncal.types import Camera, FloatArray, Need
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 # Why a view is in no fit although nothing is wrong with it.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
+# So many causes stand on top, if they are as likely as this.
+_SHOWN_CAUSES, _LEAST_LIKELY = 3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +154,27 @@ class Verdict:
     reasons: tuple[str, ...]
     good_for_mm: float | None = None
     causes: tuple[Cause, ...] = ()
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The reasons for people: the likeliest causes on top with how likely they are.
+
+        What a cause says in other words than a reason comes behind what it explains.
+        """
+        top = [it for it in self.causes if it.probability >= _LEAST_LIKELY][:_SHOWN_CAUSES]
+        told, words = [*self.reasons], []
+        for at, cause in enumerate(top):
+            mine = [it for it in told if it.startswith(cause.sentence)]
+            told = [it for it in told if it not in mine]
+            # A reason says itself what to do.
+            rest = (cause.without_it,) if mine else (cause.without_it, cause.do)
+            said = filter(None, (*(mine or [cause.sentence]), *rest))
+            how = "Then" if at else "Most likely"
+            words.append(f"{how} ({percent(cause.probability)}): {' '.join(said)}")
+        sentences = tuple(it.sentence for it in self.causes)
+        of_causes = [at for at, it in enumerate(self.reasons) if it.startswith(sentences)]
+        first = min(of_causes, default=len(self.reasons))
+        return (*told[:first], *words, *told[first:])
 
 
 @dataclass(frozen=True)

@@ -81,8 +81,8 @@ def print_verdict(verdict: Verdict, name: str) -> None:
     """Prints whether something can be trusted, and why."""
     console, colour = messages(), _COLOURS[verdict.status]
     console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
-    for reason in verdict.reasons:
-        console.print(f"  - {escape(reason)}")
+    for line in verdict.lines:
+        console.print(f"  - {escape(line)}")
 
 
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:

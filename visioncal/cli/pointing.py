@@ -29,7 +29,11 @@ def told_of(calibration: Calibration, session: Path) -> Calibration:
     """A calibration whose reasons, to be printed, name the session by its path."""
     verdict = calibration.verdict
     reasons = tuple(_named(it, session) for it in verdict.reasons)
-    return replace(calibration, verdict=replace(verdict, reasons=reasons))
+    causes = tuple(
+        replace(it, sentence=_named(it.sentence, session), do=_named(it.do, session))
+        for it in verdict.causes
+    )
+    return replace(calibration, verdict=replace(verdict, reasons=reasons, causes=causes))
 
 
 def _named(advice: str, session: Path) -> str:

@@ -20,6 +20,7 @@ from visioncal.pipeline.unseen import held_back
 from visioncal.pipeline.views import view_evidence
 from visioncal.robot import CONVENTIONS, Convention
 from visioncal.session import Session
+from visioncal.stages.causes import with_misread
 from visioncal.stages.dense import Dense
 from visioncal.stages.diagnose import Diagnosis
 from visioncal.stages.handeye import SOLVER_NAMES, compare_solvers
@@ -116,7 +117,7 @@ def _with_reading(known: Known, seen: Known | None) -> Known:
     hint = reading_hint(seen)
     if not hint:
         return known
-    return replace(known, verdict=replace(known.verdict, reasons=(hint, *known.verdict.reasons)))
+    return replace(known, verdict=with_misread(known.verdict, hint))
 
 
 def result_of(known: Known) -> Calibration:

@@ -453,6 +453,8 @@ def _fitted(known: Known, held: HeldOut, diagnosis: Diagnosis) -> Fitted:
         {ROBOT: freedom_of(diagnosis.intervals.tolist())},
         {ROBOT: known.arm_at_stops},
         sources(result.problem, known.session.mount, known.free).columns.get("board", no_columns),
+        result.problem,
+        diagnosis.inflation,
     )
 
 

@@ -229,6 +229,7 @@ def _fitted(solved: Solved, part: Problem, spread: FloatArray, held_out: HeldOut
         dict(zip(part.robots, freedom, strict=True)),
         solved.arms,
         columns_of_boards(solved),
+        part,
     )
 
 

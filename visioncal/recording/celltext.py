@@ -11,7 +11,7 @@ from visioncal.session import View
 def verdict_markdown(found: Alignment) -> str:
     """The verdict with its reasons, the transforms, and the observations that were left out."""
     lines = [f"# {HEADLINES[found.verdict.status]}", ""]
-    lines += [f"- {plain(it)}" for it in found.verdict.reasons]
+    lines += [f"- {plain(it)}" for it in found.verdict.lines]
     lines += ["", plain(found.weakest), ""]
     lines += [f"- {plain(it.frame)} is not tied. {plain(it.remedy)}" for it in found.untied]
     lines += [f"The frame of the cell is that of {plain(found.reference)}.", ""]

@@ -80,7 +80,7 @@ def verdict_markdown(calibration: Calibration) -> str:
     """The verdict with its reasons, the transforms, and the views that were left out."""
     verdict = calibration.verdict
     lines = [f"# {HEADLINES[verdict.status]}", ""]
-    lines += [f"- {plain(reason)}" for reason in verdict.reasons]
+    lines += [f"- {plain(reason)}" for reason in verdict.lines]
     lines += [
         f"- {plain(name)}: {HEADLINES[it.verdict.status]}, see Tools and fixtures."
         for name, it in calibration.frames.items()

@@ -110,7 +110,7 @@ def next_steps(calibration: Calibration, found: Sequence[Suspects]) -> tuple[str
     advice = list(
         dict.fromkeys(
             sentence
-            for sentence in _sentences(calibration.verdict.reasons)
+            for sentence in _sentences(calibration.verdict.lines)
             if _IMPERATIVE.match(sentence)
         )
     )

@@ -114,7 +114,8 @@ def _kinds(found: Alignment) -> str:
 
 def _key_figures(found: Alignment) -> list[Fact]:
     used = sum(it.used for it in found.sights)
-    facts = [Fact("observations used", f"{used} of {len(found.sights)}")]
+    facts = [*content.need_facts(found.need, found.verdict)]
+    facts.append(Fact("observations used", f"{used} of {len(found.sights)}"))
     bases = [it for it in found.frames if it.startswith("base") and found.frames[it] == "cell"]
     for base in [it for it in bases if it != bases[0]]:
         edge = found.between(bases[0], base)

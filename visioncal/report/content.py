@@ -8,10 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration import Calibration, Edge, Rms, SolverResult, Verdict, ViewResult
+from visioncal.calibration import (
+    Calibration,
+    Edge,
+    NeedMet,
+    Rms,
+    SolverResult,
+    Verdict,
+    ViewResult,
+)
 from visioncal.camera import intrinsics
 from visioncal.compare import intrinsics_names
-from visioncal.figures import decimals_for, fixed, matched, significant
+from visioncal.figures import decimals_for, fixed, matched, percent, significant
 from visioncal.recording.findings import read_stage
 from visioncal.recording.kinematics import Kinematics
 from visioncal.report.advice import Suspects, contradicts, outlying_views
@@ -259,6 +267,20 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     if arm is not None and arm.workspace_mm is not None:
         sigma = f"{significant(arm.workspace_mm[0])} mm"
         facts.insert(2, Fact("all over the workspace, sigma", sigma))
+    return (*need_facts(calibration.need, calibration.verdict), *facts)
+
+
+def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
+    """What the task needs and how likely that is met, and what the result is good for."""
+    facts = []
+    if met is not None:
+        both = ((met.need.mm, " mm"), (met.need.deg, "\N{DEGREE SIGN}"))
+        asked = " and ".join(f"{value:g}{unit}" for value, unit in both if value is not None)
+        facts.append(Fact(f"picks within {asked}", percent(met.probability)))
+    if verdict.good_for_mm is not None:
+        facts.append(
+            Fact("good for tasks of", f"{significant(verdict.good_for_mm)} mm", "and more")
+        )
     return tuple(facts)
 
 

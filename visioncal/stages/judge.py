@@ -7,7 +7,8 @@ import numpy as np
 
 from visioncal.calibration import NeedMet, Rms, Verdict, VerdictStatus, ViewResult
 from visioncal.estimation.observability import Direction
-from visioncal.figures import figure
+from visioncal.figures import figure, percent
+from visioncal.stages.causes import Doubt, ranked, warned
 from visioncal.stages.need import CHECK, GOOD, Picks, need_met
 from visioncal.stages.proposing import with_proposal
 from visioncal.types import Mount, Need, Rejection
@@ -202,23 +203,6 @@ class Findings:
         return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
 
 
-@dataclass(frozen=True)
-class _Doubt:
-    """A reason not to trust the result.
-
-    Attributes:
-        sentence: What it is.
-        is_fatal: Whether it settles the matter.
-        until_mm: The need of a task from which on it is none [mm]: zero where it says how large
-            errors are, which any need says better than a limit; infinite where it is of what is
-            not explained.
-    """
-
-    sentence: str
-    is_fatal: bool = False
-    until_mm: float = np.inf
-
-
 def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
     """Says whether the result can be trusted, why, and what to do next.
 
@@ -245,7 +229,7 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
         *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
         *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
         *([] if scatter else _robot_doubts(findings, limits)),
-        *(_Doubt(sentence) for sentence in findings.warnings),
+        *(warned(it, _agreeing(findings)) for it in findings.warnings),
     ]
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
@@ -266,10 +250,16 @@ def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
     told = tuple(sentences)
     if doubts and any(it.pixel_px is not None for it in sensors):
         told = with_proposal(told, modelled=all(it.modelled for it in findings.arms))
-    return Verdict(status, (*told, *findings.notes), good_for_mm)
+    causes = () if status == "good" else ranked(doubts, findings.picks, met)
+    return Verdict(status, (*told, *findings.notes), good_for_mm, causes)
 
 
-def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[_Doubt]) -> float | None:
+def _agreeing(findings: Findings) -> str:
+    """How well views agree that are not left out."""
+    return f"Without them, views that are left out in turn agree to {_both(findings.held_out)}."
+
+
+def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Doubt]) -> float | None:
     """The least need that would be met by all pairs; None where none would, or none is known."""
     least = max((it.until_mm for it in doubts), default=0.0)
     if not picks or np.isinf(least):
@@ -286,44 +276,15 @@ def _good_for_words(picks: Sequence[Picks], good_for_mm: float) -> str:
 
 
 def met_words(findings: Findings, met: NeedMet) -> str:
-    """How likely picks land within what is needed, and what limits that."""
+    """How likely picks land within what is needed."""
     need, worst = met.need, min(findings.picks, key=lambda it: it.probability(met.need))
     within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]
     where = "where the views looked" if need.at == "views" else f"at {list(need.at)} m in the base"
     who = f" by robot {worst.robot} of what {worst.camera} sees" if len(findings.picks) > 1 else ""
-    budget = worst.budget_mm
-    parts = {name: it for name, it in budget.items() if name != "total"}
-    largest = max(parts, key=lambda name: parts[name], default="")
-    told = (
-        f"A pick{who} {where} lands within {' and '.join(within)} with a probability of "
-        f"{_percent(met.probability)}; 95 % land within {figure(worst.good_for_mm)} mm."
-    )
-    if met.probability >= GOOD or not largest:
-        return told
     return (
-        f"{told} Of its {figure(budget['total'])} mm (sigma), {figure(parts[largest])} mm come "
-        f"from {_LIMITED_BY[largest]}"
+        f"A pick{who} {where} lands within {' and '.join(within)} with a probability of "
+        f"{percent(met.probability)}; 95 % land within {figure(worst.good_for_mm)} mm."
     )
-
-
-# What picks are limited by, and what helps.
-_LIMITED_BY: Mapping[str, str] = {
-    "calibration": "the calibration itself. Add views in which the robot stands otherwise.",
-    "look": "the robot's own noise where it looks, which more views do not change. Look several "
-    "times from different stops, and take the mean.",
-    "pick": "the robot's own noise where it picks, which no calibration changes.",
-    "arm": "the arm's own errors, which more views do not change. Record joint angles, name the "
-    "arm's model, and calibrate it (--level kinematics).",
-    "left out": "what left-out views err by beyond what is predicted: something is not explained. "
-    "Look at the worst views.",
-}
-
-
-def _percent(probability: float) -> str:
-    """A probability in words; none is certain."""
-    if probability > 0.99:
-        return "over 99 %"
-    return "under 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
 
 
 def is_scattered(findings: Findings, limits: Limits | None = None) -> bool:
@@ -359,7 +320,7 @@ def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
     return pairs
 
 
-def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     yield from _pair_doubts(findings, limits)
     ratios = [
         outside / within
@@ -368,7 +329,7 @@ def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     ]
     ratio = max(ratios, default=0.0)
     if ratio > limits.optimism[0]:
-        yield _Doubt(
+        yield Doubt(
             f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
             "views for their noise. Add 5 or more, tilted about different axes.",
             ratio > limits.optimism[1],
@@ -376,7 +337,7 @@ def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
         )
 
 
-def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     words, views, is_fatal = [], list[ViewResult](), False
     for pair in findings.pairs:
         held = pair.held_out
@@ -396,13 +357,14 @@ def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
             views += pair.views
             is_fatal |= any(it for _, it in beyond)
     if words:
-        yield _Doubt(
+        yield Doubt(
             f"Left out of the fit, views disagree with the others by "
             f"{', '.join(words)}, rms; the worst are "
             f"{_worst_views(views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
             "arm with large model errors.",
             is_fatal,
             until_mm=0.0,
+            cause="unexplained",
         )
 
 
@@ -412,17 +374,21 @@ def _worst_views(views: Sequence[ViewResult]) -> str:
     return ", ".join(f"view {view.view} ({_residual(view)})" for view in measured[:_LISTED_VIEWS])
 
 
-def _disagreement_doubts(pair: Pair) -> Iterator[_Doubt]:
+def _disagreement_doubts(pair: Pair) -> Iterator[Doubt]:
     """Names the views that were left out because they contradict the others."""
     out = pair.disagreeing
+    without_it = f"Without them, views that are left out in turn agree to {_both(pair.held_out)}."
     if not out:
         return
     if len(out) == 1:
-        yield _Doubt(_named(pair.name, f"View {out[0].view} was left out: it {out[0].reason}."))
+        sentence = f"View {out[0].view} was left out: it {out[0].reason}."
+        yield Doubt(_named(pair.name, sentence), cause="wrong_views", without_it=without_it)
         return
     named, first = ", ".join(str(it.view) for it in out), out[0].view
-    sentence = f"Views {named} were left out; view {first} {out[0].reason}.{_run(pair)}"
-    yield _Doubt(_named(pair.name, sentence))
+    run = _run(pair)
+    sentence = f"Views {named} were left out; view {first} {out[0].reason}.{run}"
+    cause = "something_moved" if run else "wrong_views"
+    yield Doubt(_named(pair.name, sentence), cause=cause, without_it=without_it)
 
 
 def _run(pair: Pair) -> str:
@@ -439,7 +405,7 @@ def _run(pair: Pair) -> str:
     return f" They follow each other: {when}, something had moved."
 
 
-def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     """Names single views whose residual stands out from the others'.
 
     Where the corners tell how well each view sees the board, the consensus has judged them better.
@@ -454,7 +420,7 @@ def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 "at it: look at its image and its pose, and take it out of views.csv if one of "
                 "them is wrong."
             )
-            yield _Doubt(_named(pair.name, sentence))
+            yield Doubt(_named(pair.name, sentence), cause="wrong_views")
 
 
 def outlying_views(
@@ -474,7 +440,7 @@ def _residual(view: ViewResult, between: str = ", ") -> str:
     return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
-def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[_Doubt]:
+def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Doubt]:
     holdout, held = pair.holdout, pair.held_out
     if holdout is None:
         return
@@ -487,10 +453,10 @@ def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[_Doubt
             "times worse than views left out in turn. They lie where the result does not hold, or "
             f"their poses or {observed} are wrong."
         )
-        yield _Doubt(_named(pair.name, sentence))
+        yield Doubt(_named(pair.name, sentence), cause="holdout")
 
 
-def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     """Judges the answer where it counts.
 
     Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
@@ -513,10 +479,10 @@ def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 "which the arm stands otherwise, all over the workspace."
             )
             is_fatal = it.workspace_mm > limits.sigma_mm[1]
-            yield _Doubt(_named(_robot(it), sentence), is_fatal, until_mm=0.0)
+            yield Doubt(_named(_robot(it), sentence), is_fatal, until_mm=0.0)
 
 
-def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     weak, is_fatal = [], False
     for direction in findings.worst:
         scale, unit, (check, bad) = (
@@ -529,7 +495,7 @@ def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
             weak.append(f"{direction.words} ({figure(sigma)} {unit})")
             is_fatal |= bool(sigma > bad)
     if weak:
-        yield _Doubt(
+        yield Doubt(
             f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt begins "
             f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg. Add views tilted by "
             "20 to 40 degrees about axes across these directions.",
@@ -538,7 +504,7 @@ def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
         )
 
 
-def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     """Says what makes the result uncertain where it is to be used."""
     beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
     if not beyond:
@@ -549,7 +515,7 @@ def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     others = [
         f"{it.words} ({figure(it.budget_mm['total'])} mm)" for it in beyond if it is not worst
     ]
-    yield _Doubt(
+    yield Doubt(
         f"{worst.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
         f"within {figure(worst.radius95_mm)} mm): "
         + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
@@ -560,7 +526,7 @@ def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
     )
 
 
-def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     used = sum(view.used for it in findings.pairs for view in it.views)
     check, bad = limits.stops
     for it in findings.arms:
@@ -570,10 +536,10 @@ def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 f"Only {counted} are used; {check} or more give the result something to be checked "
                 "with."
             )
-            yield _Doubt(_named(_robot(it), sentence), it.stops < bad, until_mm=0.0)
+            yield Doubt(_named(_robot(it), sentence), it.stops < bad, until_mm=0.0)
 
 
-def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
+def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
     lost, used = sensor.lost, sensor.used
     share = len(lost) / max(used + len(lost), 1)
     if share > limits.lost_share[0]:
@@ -586,10 +552,10 @@ def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
             told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             told += others[0].reason
         sentence = f"{len(lost)} of {used + len(lost)} views are not used{told}."
-        yield _Doubt(_named(sensor.name, sentence), share > limits.lost_share[1])
+        yield Doubt(_named(sensor.name, sentence), share > limits.lost_share[1], cause="lost_views")
 
 
-def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
+def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
     check, bad = limits.pixel_px
     noise = sensor.pixel_px
     if noise is None:
@@ -600,21 +566,21 @@ def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[_Doubt]:
             f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
             "are blurred."
         )
-        yield _Doubt(_named(sensor.name, sentence), noise > bad)
+        yield Doubt(_named(sensor.name, sentence), noise > bad, cause="corner_noise")
     if sensor.level > limits.level:
         sentence = (
             f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
             "of few pixels, blur, or a lens that is not as stated. Go nearer, or show it larger "
             "squares."
         )
-        yield _Doubt(_named(sensor.name, sentence))
+        yield Doubt(_named(sensor.name, sentence), cause="corner_noise")
 
 
 def _robot(arm: Arm) -> str:
     return f"Robot {arm.name}" if arm.name else ""
 
 
-def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
+def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
     """An arm is a good instrument: what looks like its error is often something else's.
 
     A task that needs ten times as much has an arm that is as good as it has to be.
@@ -638,4 +604,4 @@ def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[_Doubt]:
                 f"likely {cause}"
             )
             until_mm = 10.0 * beyond * limits.robot_mm
-            yield _Doubt(_named(_robot(it), sentence), until_mm=until_mm)
+            yield Doubt(_named(_robot(it), sentence), until_mm=until_mm, cause="unexplained")

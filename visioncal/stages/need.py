@@ -7,15 +7,15 @@ Where the robot arrives differs from the thing by
                   unknowns together, through the same slopes that the fit has. What is open about
                   the board counts by what it did to these; the thing is another
     look          the robot's noise at the look, where it carries the camera
-    arm           errors that follow the arm's posture, which no session without a calibrated arm
-                  tells apart; once, as look and pick share most of them
+    arm           errors that follow the arm's posture and were not calibrated
     pick          the noise of the flange when it goes there; a tool's length adds to it
     left out      as far as views that were left out of the fit err by more than is predicted of
                   them and than chance explains
 
-No camera finds a thing without noise; that is the task's own, and not among them. Of an arm that
-was calibrated, whose first and last link nothing tells from its frames, the place is compared with
-where the chain as a whole puts it.
+No camera finds a thing without noise; that is the task's own, and not among them. Where the arm
+errs with its posture, calibrated or not, the place is compared with where the chain as a whole puts
+it: what its first and last link do looks the same in all views, the frames of camera and target
+have taken it up, and an arm that picks does it again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ import numpy as np
 
 from visioncal.calibration import NeedMet, Picker
 from visioncal.chance import chi2_limit
-from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.arm import ArmErrors, misfit_slopes
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.within import chance_within, radius_within
@@ -71,6 +71,11 @@ class Picks:
         shift_m = np.inf if need.mm is None else 1e-3 * need.mm
         return chance_within(self.spreads, turn_rad, shift_m, self.freedom)
 
+    def without(self, source: str) -> "Picks":
+        """Picks that do not err by one of the sources."""
+        parts = {name: it for name, it in self.parts.items() if name != source}
+        return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
+
     @property
     def good_for_mm(self) -> float:
         """The least need of places alone that would be met [mm]."""
@@ -114,6 +119,8 @@ class Fitted:
         freedom: Degrees of freedom of each robot's noise.
         arms: The robots' arms, at the problem's stops.
         of_boards: The problem's columns of boards' shapes.
+        whole: The observations of all pairs, merged or not, that the fit was made from.
+        inflation: By how much the covariance was multiplied because neighbouring stops err alike.
     """
 
     problem: Problem
@@ -125,6 +132,8 @@ class Fitted:
     freedom: Mapping[str, float]
     arms: Mapping[str, RobotArm]
     of_boards: IntArray
+    whole: Problem
+    inflation: float = 1.0
 
 
 def picks_of(fitted: Fitted, need: Need | None = None) -> tuple[Picks, ...]:
@@ -167,16 +176,26 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     )
     carries = np.array([_is_between(problem, it, base, robot) for it in seen.observers])
     calibrated = arm is not None and arm.model is not None
+    errors = None if arm is None or calibrated else arm.errors
+    unfitted = errors if errors is not None and not errors.is_estimated else None
     level = np.diag(np.repeat(noise.robots[problem.robots.index(robot)], 3) ** 2)
-    if calibrated:
+    whole = calibrated or unfitted is not None
+    if whole:
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
         looking, at_m = problem, middles
     else:
         looking, at_m = _to_base(fitted, base, in_base), _carried(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
-    linear = looking.linear(state, ideal=True)
-    parts = {"calibration": linear.spread(fitted.covariance)}
+    linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
+    if unfitted is not None:
+        off = unfitted.sigma * misfit_slopes(fitted.whole, state, noise, robot, unfitted)
+        # Errors that follow the posture are why neighbours err alike.
+        covariance = covariance - fitted.inflation * off @ off.T
+        parts["arm"] = _left_by_arm(fitted, robot, unfitted, off)
+    elif errors is not None:
+        parts["arm"] = _of_arm(problem, robot, errors)
+    parts["calibration"] = linear.spread(covariance)
     if problem.is_combined:
         # Noise of both as one counts as the robot's, where it carries the camera.
         turned = adjoint(in_base)
@@ -184,11 +203,9 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     else:
         look = looking.total_covariance(linear, noise) - looking.covariance(noise)
     parts["look"] = look
-    if arm is not None and arm.errors is not None and not calibrated:
-        parts["arm"] = _of_arm(problem, robot, arm.errors)
     placed = {name: _at_points(it, at_m) for name, it in parts.items()}
-    # Of a calibrated arm before a camera that stands still, it is among the chain's already.
-    goes = carries | (not calibrated)
+    # Of a whole chain before a camera that stands still, it is among the chain's already.
+    goes = carries | (not whole)
     placed["pick"] = np.where(goes[:, None, None], level, 0.0)
     placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
     return Picks(
@@ -249,6 +266,24 @@ def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
     slopes = np.broadcast_to(np.eye(6), spreads.shape).copy()
     slopes[:, 3:, :3] = -skew(points_m)
     return np.asarray(slopes @ spreads @ np.swapaxes(slopes, 1, 2))
+
+
+def _left_by_arm(fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray) -> FloatArray:
+    """(n, 6, 6) what errors that a fit takes for noise leave of each observation.
+
+    Args:
+        fitted: The fit.
+        robot: Whose they are.
+        errors: They.
+        off: (p, q) by how much the fit is off with each of them, in its own size.
+    """
+    problem, state = fitted.problem, fitted.state
+    widened = problem.with_effects([*problem.effects, errors.effect(robot)])
+    values = np.concatenate([state.values, np.zeros(off.shape[1])])
+    slopes = widened.linear(replace(state, values=values), ideal=True).jacobian
+    size = problem.size
+    left = slopes[:, :, :size] @ off - errors.sigma * slopes[:, :, size:]
+    return np.asarray(left @ np.swapaxes(left, 1, 2))
 
 
 def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
