@@ -12,8 +12,10 @@ from visioncal.dense import library
 from visioncal.dense.blur import Blur, transfer
 from visioncal.dense.fit import fit_corners
 from visioncal.dense.prints import Print
+from visioncal.dense.shown import MIDDLE, explain
 from visioncal.errors import DataError
 from visioncal.finders.template import refine
+from visioncal.types import Camera
 
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
 SHOT = Shot(square_px=32, noise=2)
@@ -121,6 +123,41 @@ def test_too_few_corners_or_one_row_give_none():
     image, truth = photograph(CHECKERBOARD, SHOT, 1)
     for ids in (np.arange(5), np.arange(6)):
         assert fit_corners(image, CHECKERBOARD, ids, truth[ids], np.full(2, 0.5)) is None
+
+
+def explained(target, shot, shift_px=0.0):
+    """The picture, its true corners, and how far corners moved by so much explain it."""
+    image, truth = photograph(target, shot, 1)
+    ids = np.arange(len(truth))
+    seen = refine(image, target, ids, truth)
+    fit = fit_corners(image, target, ids, seen.px, seen.blur_px)
+    # The lens of these pictures is no camera's; what bends them is left to the map.
+    size = image.shape[::-1]
+    camera = Camera("brown", size, np.array([1300.0, 1300.0, *np.array(size) / 2]), np.zeros(5))
+    px = truth + np.array([shift_px, 0.0])
+    return image, truth, explain(image, target, ids, px, camera, fit.blur, fit.tone)
+
+
+@pytest.mark.usefixtures("torch")
+@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+@pytest.mark.parametrize("blurred", [{}, {"disc_px": 3}, {"motion_px": 6}])
+def test_an_image_is_explained_up_to_its_noise(target, blurred):
+    image, truth, found = explained(target, replace(SHOT, uneven=0.3, **blurred))
+    # Markers have cells of three pixels, which both sides draw a little otherwise when sharp.
+    assert found.rest_rms == pytest.approx(2.0, rel=0.2)
+    u, v = np.rint(truth[0]).astype(int)
+    near = (slice(v - 5, v + 6), slice(u - 5, u + 6))
+    assert np.abs(found.drawn[near].astype(float) - image[near]).max() < 12
+    # Around the board, the image is shown as it is, and nothing is said to be unexplained.
+    np.testing.assert_array_equal(found.drawn[0], image[0])
+    assert set(found.rest[0].tolist()) == {MIDDLE}
+
+
+@pytest.mark.usefixtures("torch")
+def test_a_board_that_is_elsewhere_is_not_explained():
+    right, wrong = (explained(CHARUCO, SHOT, it)[2] for it in (0.0, 0.3))
+    assert wrong.rest_rms > 3 * right.rest_rms
+    assert np.std(wrong.rest.astype(float)) > 2 * np.std(right.rest.astype(float))
 
 
 def test_derivatives_of_the_blur(torch):

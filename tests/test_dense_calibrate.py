@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from commands import visioncal
@@ -20,11 +21,23 @@ from visioncal.simulation import (
     simulate,
     simulate_network,
 )
+from visioncal.simulation.optics import wide_camera
+from visioncal.simulation.options import checkerboard_target
 from visioncal.simulation.records import pairs_session
 from visioncal.stages import dense as stage
 from visioncal.stages.detect import detect
 
-OPTIONS = CellOptions(views=10, seed=3, blur_px=0.5, robot_sigma_m=0.0, robot_sigma_rad=0.0)
+CAMERA = wide_camera()
+# A quarter of the pixels, a robot without noise.
+OPTIONS = CellOptions(
+    views=10,
+    seed=3,
+    blur_px=0.5,
+    robot_sigma_m=0.0,
+    robot_sigma_rad=0.0,
+    target=checkerboard_target(),
+    camera=replace(CAMERA, resolution=(640, 400), matrix=CAMERA.matrix / 2),
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +62,20 @@ def both(session):
     return run(session), run_dense(session)
 
 
-def off_m(cell, found):
-    true = cell.transforms["flange_from_cam"][:3, 3]
-    return np.linalg.norm(found.calibration.edges["flange_from_cam"].transform.translation - true)
+def off_px(cell, found):
+    """Rms of what all corners are off."""
+    exact = {it.view: dict(zip(it.ids.tolist(), it.px, strict=True)) for it in cell.exact_corners}
+    off = [
+        it.corners.px - np.array([exact[it.view][number] for number in it.corners.ids.tolist()])
+        for it in found.evidence
+    ]
+    return np.sqrt(np.mean(np.concatenate(off) ** 2))
 
 
 def test_dense_corners_are_nearer_to_the_truth_and_both_predictions_are_told(cell, both):
     plain, found = both
-    # A third to a half of the template's over seeds.
-    assert off_m(cell, found) < 0.8 * off_m(cell, plain)
+    # The template's blur has two widths; a line has one direction.
+    assert off_px(cell, found) < 0.8 * off_px(cell, plain)
     assert found.calibration.noise["pixel_px"] < 0.8 * plain.calibration.noise["pixel_px"]
     document = found.calibration.stages["dense"]
     assert document["kept"]
@@ -75,6 +93,19 @@ def test_blur_is_told_with_its_cause(both):
     assert told.startswith("Motion smears 10 of 10 images, by up to 6.")
     lengths = [it["motion_px"] for it in found.stages["dense"]["images"]]
     np.testing.assert_allclose(lengths, 6.0, atol=0.5)
+
+
+def test_every_image_is_explained(session, both):
+    found = both[1]
+    for seen in found.evidence:
+        drawn, rest = (
+            cv2.imdecode(np.frombuffer(it, np.uint8), cv2.IMREAD_GRAYSCALE)
+            for it in (seen.explained.drawn, seen.explained.rest)
+        )
+        assert drawn.shape == rest.shape == session.resolution[::-1]
+        # An exact robot and exact images: JPEG and the noise are left, four times as strong.
+        assert np.std(rest.astype(float)) < 12
+        assert seen.explained.words.startswith("**Smeared by motion.**")
 
 
 def test_a_result_with_dense_corners_can_be_written_and_read(both, tmp_path):

@@ -13,6 +13,21 @@ _SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
+class ExplainedImage:
+    """How far a calibration, with blur and light as measured, explains an image.
+
+    Attributes:
+        drawn: The image with the board as it should look in its place, as JPEG.
+        rest: What that leaves of the image, magnified, about a middle grey, as JPEG.
+        words: What blurs the image, and how much is left, in Markdown.
+    """
+
+    drawn: bytes
+    rest: bytes
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
 class ViewEvidence:
     """What was seen and computed of one view, for the report and the recording.
 
@@ -23,6 +38,8 @@ class ViewEvidence:
         base_from_flange: (4, 4) as the controller reported it, or as the calibrated arm has it
             where there is one.
         cam_from_target: (4, 4) as this view alone shows it.
+        explained: How far its image is explained, where that was looked at; it is drawn, and not
+            read back.
     """
 
     view: int
@@ -30,6 +47,7 @@ class ViewEvidence:
     predicted_px: FloatArray | None = None
     base_from_flange: FloatArray | None = None
     cam_from_target: FloatArray | None = None
+    explained: ExplainedImage | None = None
 
 
 def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:

@@ -70,3 +70,38 @@ def _terms(at: FloatArray) -> FloatArray:
     x, y = at[..., 0], at[..., 1]
     ones, xx, xy, yy = np.ones_like(x), x * x, x * y, y * y
     return np.stack([ones, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
+
+
+def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """One map from places to the whole board: a homography and a cubic polynomial on top.
+
+    Args:
+        board: (n, 2) corners on the board [squares].
+        places: (n, 2) where they are, by any two coordinates of a plane.
+
+    Returns:
+        What maps places (..., 2) to the board.
+
+    Raises:
+        numpy.linalg.LinAlgError: The corners lie as no board's do.
+    """
+    middle, scale = places.mean(axis=0), float(np.abs(places - places.mean(axis=0)).max())
+    found = cv2.findHomography((places - middle) / scale, board)[0]
+    if found is None:
+        raise np.linalg.LinAlgError
+    flat_from_places = np.asarray(found, float)
+    centre, size = board.mean(axis=0), float(np.abs(board - board.mean(axis=0)).max())
+
+    def flat(at: FloatArray) -> FloatArray:
+        return np.asarray((_mapped(flat_from_places, (at - middle) / scale) - centre) / size)
+
+    off = (board - centre) / size - flat(places)
+    terms = _terms(flat(places))
+    ridge = len(board) * _RIDGE
+    bends = np.linalg.solve(terms.T @ terms + ridge, terms.T @ off)
+
+    def on_board(at: FloatArray) -> FloatArray:
+        near = flat(at)
+        return np.asarray(centre + size * (near + _terms(near) @ bends))
+
+    return on_board

@@ -13,7 +13,7 @@ from visioncal.figures import figure
 from visioncal.pipeline.result import Run, run
 from visioncal.robot import Convention
 from visioncal.session import Session
-from visioncal.stages.dense import Dense
+from visioncal.stages.dense import Dense, explained
 from visioncal.types import Progress, SolverName
 
 # What is worse by less standard errors is chance.
@@ -111,7 +111,12 @@ def run_dense(
         "images": list(_images(found.dense)),
     }
     words = [_words(*both, kept=kept), *found.dense.notes()]
-    return _telling(found if kept else plain, document, words)
+    chosen = found if kept else plain
+    if chosen.calibration.camera is not None:
+        camera = chosen.calibration.camera.camera
+        evidence = explained(session, chosen.evidence, found.dense, camera)
+        chosen = replace(chosen, evidence=evidence)
+    return _telling(chosen, document, words)
 
 
 def _images(dense: Dense) -> Iterator[dict[str, Any]]:

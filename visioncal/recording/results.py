@@ -21,7 +21,7 @@ from visioncal.calibration import Calibration, to_document
 from visioncal.errors import DataError
 from visioncal.evidence import ViewEvidence
 from visioncal.files import named_errors, sha256
-from visioncal.recording import armtext, notes, overlays, paths, tools
+from visioncal.recording import armtext, explained, notes, overlays, paths, tools
 from visioncal.recording.frames import Frame, append, read_payload, scan
 from visioncal.recording.messages import recording_id
 from visioncal.recording.reader import chunks, read_session
@@ -151,6 +151,7 @@ def _draw(
     stream = recorder.stream
     scene = Scene.of(session, calibration, evidence)
     overlay = overlays.Overlay.of(session, calibration, evidence)
+    explains = explained.is_drawn(evidence.values())
     scene.log_static(stream)
     if calibration is not None:
         notes.log_static(stream, calibration)
@@ -164,6 +165,8 @@ def _draw(
         seen = evidence.get(view.number, ViewEvidence(view.number))
         scene.log_view(stream, view, seen)
         overlay.log_view(stream, seen)
+        if explains:
+            explained.log_view(stream, seen)
         if view.number in results:
             notes.log_view(stream, results[view.number], ends)
         if drift is not None:

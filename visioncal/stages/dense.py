@@ -7,21 +7,26 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 
 from visioncal.dense.blur import Blur
 from visioncal.dense.fit import Fitted, fit_corners
 from visioncal.dense.library import ONE_TORCH_THREAD
+from visioncal.dense.shown import MAGNIFIED, Explained, explain
+from visioncal.evidence import ExplainedImage, ViewEvidence
 from visioncal.finders.template import Refined, refine
 from visioncal.session import Session, View
 from visioncal.stages.detect import image_of
-from visioncal.types import Corners, FloatArray, Progress, Rejection
+from visioncal.types import Camera, Corners, FloatArray, Image, Progress, Rejection
 
 # Views that show whether smoothing helps, its sigma [px], and by how much it has to.
 _SAMPLE, _SMOOTH_PX, _HELPS = 4, 0.7, 0.95
 # Of a view where less than this share of the corners could be fitted, those of the template serve.
 _LEAST_FITTED = 0.5
 _KINDS = ("charuco", "checkerboard")
+# Of pictures for people.
+_QUALITY = 90
 # What the template has of an image, and what all pixels have.
 _Look: TypeAlias = tuple[Refined, Fitted | None]
 
@@ -171,4 +176,59 @@ def _weighed(seen: Corners, fit: Fitted | None, weights: FloatArray) -> Corners:
         px=fit.px[known],
         blur_px=fit.blur.width_px,
         weights=weights[known],
+    )
+
+
+def explained(
+    session: Session, evidence: Sequence[ViewEvidence], dense: Dense, camera: Camera
+) -> tuple[ViewEvidence, ...]:
+    """Adds to the evidence of views how far a calibration explains their images.
+
+    Args:
+        session: What was recorded.
+        evidence: Of its views, with the corners where the calibration puts them.
+        dense: What blurs the images.
+        camera: The camera as calibrated.
+    """
+    rows = {view.number: view for view in session.views}
+
+    def explained(seen: ViewEvidence) -> ViewEvidence:
+        fit, px = dense.fits.get(seen.view), seen.predicted_px
+        if fit is None or px is None or seen.corners is None:
+            return seen
+        view = rows[seen.view]
+        image = image_of(session, view)
+        if isinstance(image, Rejection):
+            return seen
+        target = session.boards[session.board_of(view)]
+        found = explain(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
+        if found is None:
+            return seen
+        drawn, rest = (_as_jpeg(it) for it in (found.drawn, found.rest))
+        return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, found)))
+
+    with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return tuple(pool.map(explained, evidence))
+
+
+def _as_jpeg(image: Image) -> bytes:
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+
+
+def _words(fit: Fitted, found: Explained) -> str:
+    """What blurs an image, and how much of it is not explained."""
+    blur = fit.blur
+    cause = {
+        "motion": "**Smeared by motion.** ",
+        "focus": "**Out of focus.** ",
+        "": "**Sharp.** ",
+    }[blur.cause]
+    return (
+        f"{cause}Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian of "
+        f"{blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
+        f"{blur.length_px:.2f} px at {blur.direction_deg:.0f} deg from the image's rows.\n\n"
+        f"What is not explained has an rms of {found.rest_rms:.1f} grey levels on the board, about "
+        f"its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. Edges that "
+        "show on one side light and on the other dark are where the board is not where the "
+        "calibration has it."
     )

@@ -61,6 +61,7 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         _overview(contents, eye),
         *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
         *([] if calibration is None or Drift.of(calibration) is None else [_warming()]),
+        *([_explained()] if calibration is not None and "dense" in calibration.stages else []),
         _residuals(contents),
         _coverage(contents),
         rrb.Horizontal(
@@ -103,6 +104,22 @@ def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Contain
     )
     right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _explained() -> rrb.Container:
+    """The image, the board as it should look in it, and what is left."""
+    images = rrb.Horizontal(
+        *(
+            rrb.Spatial2DView(name=name, origin=entity, contents=["$origin"])
+            for name, entity in (
+                ("Image", paths.IMAGE),
+                ("As calibration, blur and light have it", paths.DRAWN),
+                ("Not explained", paths.REST),
+            )
+        )
+    )
+    note = rrb.TextDocumentView(name="What blurs it", origin=paths.BLUR_NOTE)
+    return rrb.Vertical(images, note, name="Images explained", row_shares=[4, 1])
 
 
 def _warming() -> rrb.Container:
