@@ -650,6 +650,22 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     assert {found.arms[it].stages["kinematics"]["level"] for it in "ab"} == {"offsets"}
 
 
+def test_boards_of_three_sizes_are_found_beside_arms_that_err():
+    """What all three have in common the arms' links may have, too: free together none is clear."""
+    robots = (replace(it, offset_sigma_rad=1e-3) for it in NetworkOptions().robots)
+    scales = {"floor": 1.002, "plate_a": 0.999, "plate_b": 1.001}
+    boards = (replace(it, scale=scales[it.name]) for it in NetworkOptions().boards)
+    found = aligned(
+        simulate_network(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
+    )
+    shapes = {name: found.stages["boards"][name]["shape"]["scale"] for name in scales}
+    # Against each other they are known to some hundred-thousandths.
+    assert shapes["floor"] - shapes["plate_a"] == pytest.approx(0.003, abs=1e-4)
+    assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)
+    # 0.03 mm is planted: sizes that stay wrong count as ten times that.
+    assert max(found.noise[it]["translation_mm"] for it in "ab") < 0.06
+
+
 def test_errors_of_an_arm_that_are_free_on_the_way_may_be_no_unknowns_at_the_end():
     """Boards of slightly other sizes look like errors of both arms, until they are free."""
     scales = 1.0 + 1e-3 * np.random.default_rng([47, 41]).standard_normal(3)

@@ -175,17 +175,32 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
         and not np.isin(it, stated.moving).any()
         and moved_surprise(wide, it) > chance_limit(len(it))
     ]
-    kept += [
-        place
-        for board in looks.printed
-        if np.isin(place := looks.scale_of(board), answer.moving).all()
-        and measured_scale(erring, wide, board).is_another
-    ]
-    places = np.concatenate([stated.moving, *kept])
+    sizes, wide = _still_other_sizes(erring, wide)
+    places = np.concatenate([stated.moving, *kept, *sizes])
     unstated = places[np.isinf(looks.prior_sigma[places])]
     restated = stated.looks.without_prior(unstated.tolist())
     restated = restated.with_values(places, wide.looks.values[places])
     return settle(restated, erring, np.unique(places), answer.frames)
+
+
+def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitted]:
+    """The scales of boards that are others than stated, and the fit with these alone free.
+
+    What all boards have in common, links of arms may have, too, and free together none is clear:
+    the least clear one is as stated, and the rest are measured anew beside it.
+    """
+    looks = wide.looks
+    free = [it for it in looks.printed if np.isin(looks.scale_of(it), wide.moving).all()]
+    while free:
+        measured = [measured_scale(erring, wide, board) for board in free]
+        least = min(measured, key=lambda it: abs(it.scale) / it.sigma)
+        if least.is_another:
+            break
+        free.remove(least.board)
+        place = looks.scale_of(least.board)
+        held = wide.looks.with_values(place, looks.stated[place])
+        wide = again(wide, erring, np.setdiff1d(wide.moving, place), held)
+    return [looks.scale_of(it) for it in free], wide
 
 
 def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
