@@ -11,6 +11,7 @@ from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import drift, neighbours
 from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.solve import covariance_of
+from visioncal.estimation.variance import profile_interval
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.transforms import exp
 
@@ -118,6 +119,16 @@ def test_intervals_of_the_noise_hold_the_truth():
         inside += (low <= truth) & (truth <= high)
     # 95 % of 20 are 19; under 16 comes in one run of four hundred.
     assert np.all(inside >= 16)
+
+
+def test_an_interval_is_about_the_level_that_was_found():
+    """Also where another one, far away, is likelier."""
+
+    def profile(logarithm):
+        return 2.0 * min((logarithm - np.log(1e-4)) ** 2, (logarithm - np.log(1e-2)) ** 2 - 5.0)
+
+    low, high = profile_interval(profile, 1e-4, -10.0)
+    assert low < 1e-4 < high < 1e-3
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])

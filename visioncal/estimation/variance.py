@@ -139,6 +139,10 @@ def profile_interval(
         high of fifty times the sigma where they do not speak against that.
     """
     middle = float(np.log(max(sigma, LEAST_SIGMA)))
+    # A fit that rests at another maximum than the highest has its interval about that.
+    here = profile(middle)
+    if 2.0 * (here - lowest) > _SURPRISE_95:
+        lowest = here
 
     def surprise(logarithm: float) -> float:
         return 2.0 * (profile(logarithm) - lowest) - _SURPRISE_95
