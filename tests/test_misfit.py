@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of
+from problems import observed, world
 
+from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.misfit import drift, neighbours
@@ -129,6 +131,26 @@ def test_an_interval_is_about_the_level_that_was_found():
 
     low, high = profile_interval(profile, 1e-4, -10.0)
     assert low < 1e-4 < high < 1e-3
+
+
+def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
+    rng = np.random.default_rng(0)
+    problem = observed(world(rng, stops=8), rng)
+    # Six errors, of which four are told.
+    errors = ArmErrors(np.zeros((8, 6, 6)), 1e-3, 100.0, True)
+    erring = problem.with_effects([errors.effect("a")])
+    arm = erring.effect_columns["arm of a"]
+    spread = np.zeros((erring.size, erring.size))
+    spread[arm, arm] = np.diag([1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
+    # The place of a frame makes up for one that is not told.
+    spread[0, arm.start] = spread[arm.start, 0] = -5e-7
+    spread[0, 0] = 3e-7
+    more = covariance_of_size(erring, spread, "a", errors)
+    # Student's t of four degrees has twice the variance of the normal.
+    np.testing.assert_allclose(np.diag(more[arm, arm]), [1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
+    assert more[0, arm.start] == pytest.approx(-5e-7)
+    # Of the frame's variance, the part that the error makes up for.
+    assert more[0, 0] == pytest.approx(2.5e-7)
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])

@@ -233,6 +233,31 @@ def misfit_covariance(
     return np.asarray(answer @ answer.T)
 
 
+def covariance_of_size(
+    problem: Problem, spread: FloatArray, robot: str, errors: ArmErrors
+) -> FloatArray:
+    """What it adds to a fit's covariance that the size of an arm's errors was estimated, too.
+
+    What the observations do not tell of the errors is drawn from a distribution whose variance was
+    found from the k that they do tell: it follows Student's t, whose variance is k / (k - 2) times
+    that. To first order in the variance of the errors, for all unknowns.
+
+    Args:
+        problem: The observations, with these errors among the unknowns.
+        spread: (p, p) the fit's covariance.
+        robot: The robot.
+        errors: The arm's errors.
+
+    Returns:
+        (p, p) among the unknowns.
+    """
+    arm, variance = problem.effect_columns[f"arm of {robot}"], errors.sigma**2
+    with_arm = spread[arm]
+    told = len(with_arm) - float(np.trace(with_arm[:, arm])) / variance
+    # Two or fewer would leave it without bound.
+    return np.asarray(2.0 / (max(told - 2.0, 1.0) * variance) * with_arm.T @ with_arm)
+
+
 def misfit_slopes(
     problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
 ) -> FloatArray:

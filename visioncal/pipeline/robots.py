@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.arm import misfit_covariance
+from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.misfit import inflation
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution, held_shift
+from visioncal.estimation.solve import Solution, covariance_of, held_shift
 from visioncal.stages import thermal
 from visioncal.stages.arms import ArmFound, RobotArm
 from visioncal.stages.cell import Cell, robot_key
@@ -43,7 +43,7 @@ def covariance_beside_noise(
     Args:
         problem: The observations that agree.
         fit: Their fit.
-        arms: The arms; errors that are no unknowns count.
+        arms: The arms; errors that are no unknowns count, and how well the size of others is known.
         found: What their residuals show.
     """
     parts, shift = {}, held_shift(problem, fit)
@@ -53,6 +53,11 @@ def covariance_beside_noise(
         if arm.errors is not None and not arm.errors.is_estimated:
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
             parts[f"arm {robot}"] = errors
+        elif arm.errors is not None:
+            spread = covariance_of(problem, fit)
+            parts[f"size of errors of arm {robot}"] = covariance_of_size(
+                problem, spread, robot, arm.errors
+            )
     for robot, it in found.items():
         if it.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
