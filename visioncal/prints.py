@@ -1,12 +1,15 @@
 """What is dark on a printed target: grids of cells, and discs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.targets import corner_positions, marked_squares, marker_cells
+from visioncal.targets import corner_positions, marked_squares, marker_cells, tag_corners
 from visioncal.types import FloatArray, Mask, Target
+
+# A tag's measured corners are off those of a square by no more of its side.
+_SQUARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,18 +20,20 @@ class Cells:
         corner_m: (2,) the outer corner of the first cell in the target's frame [m].
         cell_m: Side of a cell [m].
         dark: (rows, columns) which cells are dark.
+        turn: (2, 2) the directions of its columns and of its rows, as columns of a rotation.
     """
 
     corner_m: FloatArray
     cell_m: float
     dark: Mask
+    turn: FloatArray = field(default_factory=lambda: np.eye(2))
 
 
 def dark_cells(target: Target) -> tuple[Cells, ...]:
     """Lists what is dark on a target: no two grids share more than a point of their dark.
 
     Raises:
-        DataError: It is a rig of points, which is not printed.
+        DataError: It is a rig of points other than tags in the plane z = 0.
     """
     side = target.square_m
     match target.kind:
@@ -46,7 +51,34 @@ def dark_cells(target: Target) -> tuple[Cells, ...]:
         case "circles":
             return ()
         case "points":
-            raise DataError(f"target {target.name} is a rig of points; a board can be printed.")
+            return _tags(target)
+
+
+def _tags(target: Target) -> tuple[Cells, ...]:
+    """The tags of a rig, as they lie by their corners."""
+    known, places = tag_corners(target), corner_positions(target)
+    if not known or np.ptp(places[:, 2]) > 0.0 or min(it.min() for it in known.values()) < 0:
+        raise DataError(
+            f"target {target.name} is a rig of points; a board can be printed, or a rig in one "
+            "plane z = 0 whose points are all four corners of tags.",
+            culprits=[target.name],
+        )
+    grids = []
+    for number, corners in known.items():
+        quad = places[corners, :2]
+        cells = marker_cells(target.dictionary, number)
+        across, down = quad[1] - quad[0], quad[3] - quad[0]
+        side_m = float(np.linalg.norm(across))
+        square = np.array([[-across[1], across[0]], quad[2] - quad[0] - across])
+        if np.abs(square - down).max() > _SQUARE * side_m:
+            raise DataError(
+                f"target {target.name}: the corners of tag {number} are no square, clockwise from "
+                "its upper left.",
+                culprits=[f"tag {number}"],
+            )
+        turn = np.stack([across, down], axis=1) / side_m
+        grids.append(Cells(quad[0], side_m / len(cells), cells, turn))
+    return tuple(grids)
 
 
 def dark_discs(target: Target) -> FloatArray:

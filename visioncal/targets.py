@@ -30,8 +30,9 @@ LEAST_SIGMA_M = 1e-8
 # No printed square is larger; a larger number is in millimetres.
 LARGEST_M = 1.0
 
-# The columns of a rig's table; sigma_m may be absent.
-RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m")
+# The columns of a rig's table; sigma_m may be absent, and tag and corner, together.
+RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
+_WHOLE_NUMBERS = ("point", "tag", "corner")
 # No rig of one cell is larger [m]: a larger number is in millimetres. A pose takes four points.
 _LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
 
@@ -47,7 +48,7 @@ _CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 # Circles leave so much white between them that their edges are told apart.
 _WIDEST = 0.85
 # Kinds that are found where the image shows a part of them.
-FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
+FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid", "points"))
 
 
 def _shipped() -> dict[str, Path]:
@@ -103,14 +104,14 @@ def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
     if unknown or missing:
         raise DataError(
             f"{path}: its columns are {', '.join(table.columns)}; point, x_m, y_m, z_m and, where "
-            "it is known, sigma_m are needed.",
+            "it is known, sigma_m are needed; tag and corner where they are corners of tags.",
             culprits=[f"{path.name}: {it}" for it in (*missing, *unknown)],
         )
     return {name: _column(table, at) for at, name in enumerate(table.columns)}
 
 
 def _column(table: TextTable, at: int) -> list[Any]:
-    read = int if table.columns[at] == "point" else float
+    read = int if table.columns[at] in _WHOLE_NUMBERS else float
     values = []
     for row, cells in enumerate(table.rows):
         try:
@@ -262,14 +263,16 @@ def _rig(table: Table, name: str) -> Target:
     columns = table.content.get("points")
     if not isinstance(columns, Mapping) or not all(it in columns for it in RIG_COLUMNS[:4]):
         raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
-    lists = [columns[it] for it in RIG_COLUMNS if it in columns]
+    names = [it for it in RIG_COLUMNS if it in columns]
+    lists = [columns[it] for it in names]
     try:
         values = np.array(lists, dtype=float)
     except (TypeError, ValueError):
         values = np.zeros((0, 0))
     if values.ndim != 2 or not np.isfinite(values).all():
         raise table.refuse("points", "a table with gaps", "a finite number in every cell")
-    numbers, places_m, sigmas_m = values[0], values[1:4].T, values[4:].ravel()
+    numbers, places_m = values[0], values[1:4].T
+    sigmas_m = values[names.index("sigma_m")] if "sigma_m" in names else np.zeros(0)
     if len(numbers) < _FEWEST_POINTS:
         raise table.refuse("points", f"a table of {len(numbers)}", "four points or more")
     repeated = sorted({int(it) for it in numbers if np.sum(numbers == it) > 1})
@@ -292,7 +295,33 @@ def _rig(table: Table, name: str) -> Target:
         points_m=tuple((x, y, z) for x, y, z in places_m.tolist()),
         point_numbers=tuple(numbers.astype(int).tolist()),
         point_sigmas_m=tuple(sigmas_m.tolist()),
+        **_tags_of_rig(table, columns),
     )
+
+
+def _tags_of_rig(table: Table, columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Which corners of which tags a rig's points are, and the tags' dictionary."""
+    given = [it for it in ("tag", "corner") if it in columns]
+    if not given:
+        return {}
+    if len(given) == 1:
+        raise table.refuse(
+            "points", f"a table with {given[0]} alone", "tag and corner, or neither,"
+        )
+    dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
+    markers = _dictionary_size(table, dictionary)
+    pairs = list(zip(columns["tag"], columns["corner"], strict=True))
+    for tag, corner in pairs:
+        if tag not in range(markers) or corner not in range(4):
+            given_here = f"a table with tag {tag}, corner {corner}"
+            raise table.refuse("points", given_here, f"tags 0 to {markers - 1}, corners 0 to 3,")
+        if pairs.count((tag, corner)) > 1:
+            twice = f"a table with corner {corner} of tag {tag} twice"
+            raise table.refuse("points", twice, "each corner once,")
+    return {
+        "dictionary": dictionary,
+        "point_tags": tuple((int(tag), int(corner)) for tag, corner in pairs),
+    }
 
 
 def _dictionary_size(table: Table, name: str) -> int:
@@ -320,6 +349,7 @@ def metres(millimetres: float) -> float:
 
 def target_document(target: Target) -> dict[str, Any]:
     """Writes a target as the content of a `.toml`, which `target_from_document` reads back."""
+    document: dict[str, Any]
     if target.kind == "marker":
         return {
             "kind": "marker",
@@ -341,11 +371,13 @@ def target_document(target: Target) -> dict[str, Any]:
             "border": target.border,
         }
     if target.kind == "points":
-        places = corner_positions(target).T.tolist()
-        columns = (list(target.point_numbers), *places, list(target.point_sigmas_m))
+        x_m, y_m, z_m = corner_positions(target).T.tolist()
+        tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
+        columns = (list(target.point_numbers), x_m, y_m, z_m, list(target.point_sigmas_m), *tags)
         rig = dict(zip(RIG_COLUMNS, columns, strict=True))
-        return {"kind": "points", "points": {name: it for name, it in rig.items() if it}}
-    document: dict[str, Any] = {
+        document = {"kind": "points", "points": {name: it for name, it in rig.items() if it}}
+        return document | ({"dictionary": target.dictionary} if target.point_tags else {})
+    document = {
         "kind": target.kind,
         "columns": target.columns,
         "rows": target.rows,
@@ -412,6 +444,14 @@ def point_numbers(target: Target) -> tuple[int, ...]:
 def numbered_positions(targets: Sequence[Target]) -> FloatArray:
     """The (c, 3) corners of several targets, numbered through, each in its own target's frame."""
     return np.concatenate([np.zeros((0, 3)), *map(corner_positions, targets)])
+
+
+def tag_corners(target: Target) -> dict[int, IntArray]:
+    """The places (4,) of a rig's tags' corners among its points, by their ids; -1 without one."""
+    found: dict[int, IntArray] = {}
+    for at, (tag, corner) in enumerate(target.point_tags):
+        found.setdefault(tag, np.full(4, -1))[corner] = at
+    return found
 
 
 def first_corners(targets: Sequence[Target]) -> IntArray:

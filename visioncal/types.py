@@ -74,6 +74,8 @@ class Target:
         point_numbers: The numbers that its table gives them.
         point_sigmas_m: How well each place is known per axis, as a standard deviation [m]; empty
             where they are exact.
+        point_tags: The id of the tag of which each point is a corner, and which one, from 0 to 3
+            clockwise from the upper left; empty where the points are none of tags.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Target:
     points_m: tuple[tuple[float, float, float], ...] = ()
     point_numbers: tuple[int, ...] = ()
     point_sigmas_m: tuple[float, ...] = ()
+    point_tags: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

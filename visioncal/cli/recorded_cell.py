@@ -113,8 +113,8 @@ def scene_of(
 
 
 def _findable(target: Target) -> Target:
-    """Refuses a rig of points, which is not found in images."""
-    if target.kind == "points":
+    """Refuses a rig of points that is not found in images."""
+    if target.kind == "points" and not target.point_tags:
         raise DataError(
             f"record: target {target.name} is a rig of points, which no image is searched for.",
             culprits=["--target"],

@@ -26,6 +26,7 @@ from visioncal.simulation import (
     simulate,
     simulate_warm_up,
     symmetric_circles_target,
+    tags_target,
     touch,
     truth_path,
     write_session,
@@ -45,6 +46,7 @@ _BOARDS = {
     "aprilgrid": aprilgrid_target,
     "circles": circles_target,
     "symmetric-circles": symmetric_circles_target,
+    "tags": tags_target,
 }
 
 
@@ -59,7 +61,7 @@ def simulate_command(
         typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
     ] = "wide",
     board: Annotated[
-        Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles"],
+        Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"],
         typer.Option(help="What is printed."),
     ] = "charuco",
     second_board: Annotated[

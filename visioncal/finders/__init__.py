@@ -7,6 +7,7 @@ from visioncal.finders.charuco import fitting_layouts
 from visioncal.finders.imaging import blur_at_corners
 from visioncal.finders.marker import find_marker
 from visioncal.finders.result import NotFound, Seen
+from visioncal.finders.tags import find_tags
 from visioncal.finders.template import refine
 from visioncal.types import FloatArray, Image, IntArray, Target
 
@@ -28,6 +29,8 @@ def find_target(image: Image, target: Target) -> Seen | NotFound:
             return find_board(image, target)
         case "marker":
             return find_marker(image, target)
+        case "points" if target.point_tags:
+            return find_tags(image, target)
         case "points":
             return NotFound(
                 f"target {target.name} is a rig of points, which no image is searched for: "

@@ -333,7 +333,8 @@ def _singles(markers: tuple[Marker, ...]) -> list[Identity]:
         listed = ", ".join(map(str, others[:_LISTED])) + (" ..." if len(others) > _LISTED else "")
         notes.append(
             f"Also seen: {listed}. A target is one marker, and the largest is taken; where they "
-            "are a board's, show more of it."
+            "are a board's, show more of it; where they lie freely, describe them by a table of "
+            'their corners (kind = "points").'
         )
     if len(names) > 1:
         notes.append(f"{_listed(names[1:])} hold the same markers: any of them finds this one.")

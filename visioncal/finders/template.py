@@ -55,6 +55,9 @@ _HALF, _LEAST_PX, _MOST_PX = 0.42, 3.0, 20.0
 _FEWEST = 4
 # What is looked at around the outermost corners [px].
 _RIM_PX = 32
+# The patch of a tag's corner, in modules, and what is left out around the corner itself, in widths
+# of an edge.
+_TAG_HALF, _SLANT = 1.2, 1.5
 # Larger circles are looked at in half of the size.
 _MOST_RADIUS_PX = 20.0
 # Bounds memory and time where corners are many.
@@ -108,12 +111,20 @@ class _Pattern:
             [squares]; infinite without them.
         half: Half-width of the patch around a corner [squares].
         radius: That of the circle around it [squares]; 0 without one.
+        lone: (n, 2) signs of x and y where the one dark square of a tag's corner is; 0 where two
+            dark squares meet.
+        outside: How far around a lone one white reaches [squares].
+        axes: (n, 2, 2) from the board to each corner's own axes and squares; None where these are
+            the board's.
     """
 
     signs: FloatArray
     inset: float
     half: float = _HALF
     radius: float = 0.0
+    lone: FloatArray | None = None
+    outside: float = np.inf
+    axes: FloatArray | None = None
 
     @classmethod
     def of(cls, target: Target, ids: IntArray, board: FloatArray) -> Self:
@@ -135,7 +146,8 @@ class _Pattern:
 
     def at(self, chosen: IntArray) -> Self:
         """The pattern around some corners."""
-        return replace(self, signs=self.signs[chosen])
+        lone, axes = (None if it is None else it[chosen] for it in (self.lone, self.axes))
+        return replace(self, signs=self.signs[chosen], lone=lone, axes=axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +190,13 @@ class _Windows:
     ) -> Self:
         """Cuts the windows of the chosen ones among corners, whose good ones make the maps."""
         on_board, around, smoother = maps_about(board, px, good, chosen)
+        axes = np.eye(2) if pattern.axes is None else pattern.axes[chosen]
+
+        def on_own(places: FloatArray) -> FloatArray:
+            return np.asarray(on_board(places) @ np.swapaxes(axes, -1, -2))
+
         start = px[chosen]
-        ends = on_board(start[:, None] + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
+        ends = on_own(start[:, None] + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
         by_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
         by_board = np.asarray(np.linalg.inv(by_px), float)
         side_px = np.sqrt(np.abs(np.linalg.det(by_board)))
@@ -195,7 +212,7 @@ class _Windows:
         nodes = np.cos(np.pi * (np.arange(4) + 0.5) / 4)
         spread = np.vander(steps / reach, 4) @ np.linalg.inv(np.vander(nodes, 4))
         grid = np.stack(np.meshgrid(reach * nodes, reach * nodes), axis=-1).reshape(-1, 2)
-        values = on_board(centre[:, None] + grid).reshape(-1, 4, 4, 2)
+        values = on_own(centre[:, None] + grid).reshape(-1, 4, 4, 2)
         x, y = (np.asarray(spread @ values[..., axis] @ spread.T, np.float32) for axis in (0, 1))
         height, width = smooth.shape
         rows, columns = centre[:, 1, None] + steps, centre[:, 0, None] + steps
@@ -216,7 +233,8 @@ class _Windows:
             within,
             inside,
             around,
-            smoother,
+            # Slopes are by a corner's own axes.
+            _turned(smoother, axes),
         )
 
     def at(self, chosen: IntArray) -> Self:
@@ -272,18 +290,55 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     board = corner_positions(target)[ids, :2] / (share * target.square_m)
     if target.kind == "circles" and _is_large(target, board, px):
         return _refined_smaller(image, target, ids, px)
+    return _placed(image, _Pattern.of(target, ids, board), board, px)
+
+
+def refine_tags(image: Image, modules: int, board: FloatArray, px: FloatArray) -> Refined:
+    """Refines the corners of tags in one plane, likewise.
+
+    Around a corner the print is dark in one square, (1 + E(x)) (1 + E(y)), and white as far as a
+    module reaches; of the tag itself its border is looked at.
+
+    Args:
+        image: (h, w) grey image.
+        modules: Modules along a tag's side, its border included.
+        board: (t, 4, 2) where the corners are, clockwise from each tag's upper left, in any unit.
+        px: (t, 4, 2) where a detector has them [px].
+
+    Returns:
+        The corners, four of each tag.
+    """
+    inward = np.tile([[1.0, 1], [-1, 1], [-1, -1], [1, -1]], (len(board), 1))
+    sides = np.stack([board[:, 1] - board[:, 0], board[:, 3] - board[:, 0]], axis=1)
+    unit = float(np.mean(np.linalg.norm(sides, axis=2)))
+    lengths = np.sum(sides**2, axis=2, keepdims=True)
+    module = 1.0 / modules
+    pattern = _Pattern(
+        inward.prod(axis=1),
+        module,
+        # What the corners around tell of the lens's bend, one tag alone does not.
+        module * (_TAG_HALF if len(board) > 1 else 1.0),
+        lone=inward,
+        outside=module,
+        axes=np.repeat(unit * sides / lengths, 4, axis=0),
+    )
+    return _placed(image, pattern, board.reshape(-1, 2) / unit, px.reshape(-1, 2))
+
+
+def _placed(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) -> Refined:
+    """Refines (n, 2) corners at places of the board, in the part of the image that shows them."""
     low = np.maximum(np.floor(px.min(axis=0)).astype(int) - _RIM_PX, 0)
     high = np.ceil(px.max(axis=0)).astype(int) + _RIM_PX + 1
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     flat = all(np.linalg.matrix_rank(it - it.mean(axis=0)) == 2 for it in (board, px))
     # Corners that cannot be fitted may lead to anything; they are sorted out afterwards.
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-        if len(ids) >= _FEWEST and flat and part.size:
-            refined = _refined(part, _Pattern.of(target, ids, board), board, px - low)
+        if len(px) >= _FEWEST and flat and part.size:
+            refined = _refined(part, pattern, board, px - low)
             return replace(refined, px=refined.px + low)
-    nothing = np.full(len(ids), np.nan)
+    nothing = np.full(len(px), np.nan)
     reason = "the corners found are too few, or lie as no board's do"
-    return Refined(px, nothing, (reason,) * len(ids), np.full(2, np.nan))
+    return Refined(px, nothing, (reason,) * len(px), np.full(2, np.nan))
 
 
 def _is_large(target: Target, board: FloatArray, px: FloatArray) -> bool:
@@ -343,7 +398,7 @@ def _measured_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, fl
         step = _step(windows, pattern, shift, blur_px, np.zeros((len(shift), 2, 2)), blurs=True)
         shift = shift + _bounded(step.shift)
         changes = np.clip(np.nan_to_num([_median(it) for it in step.blur.T]), -0.5, 0.5)
-        change, grown = changes[:2], float(changes[2:].sum())
+        change, grown = changes[:2], float(changes[2]) if pattern.radius else 0.0
         radius = np.clip(pattern.radius + grown, 0.5 * pattern.radius, 1.5 * pattern.radius)
         pattern = replace(pattern, radius=float(radius))
         blur_px = np.clip(blur_px * np.exp(change), _BLUR_LEAST_PX, 0.5 * side_px)
@@ -404,6 +459,14 @@ def _step(
     if np.isfinite(pattern.inset):
         clear_x, clear_y = (np.float32(pattern.inset) - np.float32(_CLEAR) * it for it in (sx, sy))
         used = used & ~((np.abs(x) > clear_x) & (np.abs(y) > clear_y) & (signs * x * y > 0))
+    if pattern.lone is not None:
+        lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
+        far_x, far_y = (np.float32(_CLEAR) * it - np.float32(pattern.outside) for it in (sx, sy))
+        used = used & (lone_x * x > far_x) & (lone_y * y > far_y)
+        # Where a view slants the corner, its blur is not the product of two.
+        used = used & (
+            (np.abs(x) > np.float32(_SLANT) * sx) | (np.abs(y) > np.float32(_SLANT) * sy)
+        )
     draw = _circle if pattern.radius else _crossing
     product, *slopes_of = draw(pattern, x, y, sx, sy)
     if pattern.radius:
@@ -450,6 +513,9 @@ def _crossing(
     wide = bool(max(sx.max(), sy.max()) > _WIDE)
     edge_x, slope_x, wider_x = _edges(x, sx, wide=wide)
     edge_y, slope_y, wider_y = _edges(y, sy, wide=wide)
+    if pattern.lone is not None:
+        lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
+        edge_x, edge_y = edge_x + lone_x, edge_y + lone_y
     return (
         signs * edge_x * edge_y,
         signs * slope_x * edge_y,
@@ -474,6 +540,12 @@ def _circle(
     inward = -slope / away
     by_width = wider / (of_x + of_y)
     return edge, inward * x, inward * y, by_width * of_x, by_width * of_y, slope
+
+
+def _turned(smoother: FloatArray, axes: FloatArray) -> FloatArray:
+    """What makes polynomials (m, 10, k), with their slopes by other axes (m, 2, 2)."""
+    slopes = np.linalg.inv(np.swapaxes(axes, -1, -2)) @ smoother[:, 1:3]
+    return np.concatenate([smoother[:, :1], slopes, smoother[:, 3:]], axis=1)
 
 
 def _edges(

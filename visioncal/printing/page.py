@@ -278,6 +278,10 @@ def _sentences(target: Target) -> tuple[str, str, str]:
                 f"{1e3 * sides * target.square_m:g} mm; divide by {sides:g} and write the result "
                 "into size_m, in metres."
             )
+        case "points":
+            what = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
+            origin = "the origin of the table of their corners"
+            measure = "Measure the tags' corners and write them into that table, in metres."
         case "circles":
             what = (
                 f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {target.columns} x "

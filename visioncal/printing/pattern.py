@@ -40,9 +40,12 @@ def draw_pattern(target: Target) -> Pattern:
     """
     (left, top), (right, bottom) = (it.tolist() for it in extent_m(target))
     grids = dark_cells(target)
-    loops = [it.corner_m + it.cell_m * loop for it in grids for loop in outlines(it.dark)]
+    loops = [
+        it.corner_m + it.cell_m * loop @ it.turn.T for it in grids for loop in outlines(it.dark)
+    ]
     loops += [it + target.diameter_m / 2 * _CIRCLE for it in dark_discs(target)]
-    quiet_m = grids[0].cell_m if target.kind == "marker" else _QUIET_M
+    of_tags = target.kind in ("marker", "points")
+    quiet_m = max(it.cell_m for it in grids) if of_tags else _QUIET_M
     return Pattern(tuple(loops), (left, top, right, bottom), quiet_m)
 
 

@@ -37,6 +37,7 @@ from visioncal.simulation.options import (
     circles_target,
     exact,
     symmetric_circles_target,
+    tags_target,
 )
 from visioncal.simulation.records import (
     Truth,
@@ -114,6 +115,7 @@ __all__ = [
     "sweep",
     "sweep_session",
     "symmetric_circles_target",
+    "tags_target",
     "touch",
     "touch_network",
     "truth_path",

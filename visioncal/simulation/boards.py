@@ -31,6 +31,9 @@ def pattern_box(target: Target) -> tuple[float, float, float, float]:
     if target.kind == "aprilgrid":
         gap = target.spacing * side
         return (-gap, -gap, target.columns * (side + gap), target.rows * (side + gap))
+    if target.kind == "points":
+        places = np.array(target.points_m)[:, :2]
+        return (*places.min(axis=0).tolist(), *places.max(axis=0).tolist())
     if target.kind == "circles":
         places, radius = circles_m(target), 0.5 * target.diameter_m
         return (-radius, -radius, *(places.max(axis=0) + radius).tolist())
@@ -50,6 +53,8 @@ def corners_m(sheet: Sheet) -> FloatArray:
         flat = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     elif target.kind == "circles":
         flat = circles_m(target)
+    elif target.kind == "points":
+        flat = np.array(target.points_m)[:, :2]
     elif target.kind == "aprilgrid":
         flat = np.concatenate([_around(it, target.square_m) for _, it in tags_m(target)])
     else:
@@ -59,6 +64,14 @@ def corners_m(sheet: Sheet) -> FloatArray:
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         flat = target.square_m * grid.astype(float)
     return lift(sheet, sheet.scale * flat)
+
+
+def unit_m(target: Target) -> float:
+    """Side of a square, or of the first of free tags, by which a sheet is drawn [m]."""
+    if target.kind != "points":
+        return target.square_m
+    first, second = target.points_m[:2]
+    return float(np.linalg.norm(np.subtract(second, first)))
 
 
 def circles_m(target: Target) -> FloatArray:
@@ -95,7 +108,7 @@ def _around(corner: FloatArray, side_m: float) -> FloatArray:
 
 def found_in_part(target: Target) -> bool:
     """Whether finders make do with a part of a board; others are found whole or not at all."""
-    return target.kind in ("charuco", "aprilgrid")
+    return target.kind in ("charuco", "aprilgrid", "points")
 
 
 def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:

@@ -81,12 +81,39 @@ def symmetric_circles_target() -> Target:
     )
 
 
+def tags_target() -> Target:
+    """Seven tags of 40 to 60 mm on a plate, whose corners were measured."""
+    tags = (
+        *((3, 0.000, 0.000, 0.050), (17, 0.085, 0.010, 0.040), (42, 0.160, 0.000, 0.060)),
+        *((5, 0.010, 0.075, 0.040), (101, 0.140, 0.085, 0.050), (64, 0.075, 0.070, 0.045)),
+        (9, 0.205, 0.090, 0.040),
+    )
+    points = [
+        (x + across * side, y + down * side, 0.0)
+        for _, x, y, side in tags
+        for across, down in ((0, 0), (1, 0), (1, 1), (0, 1))
+    ]
+    return Target(
+        name="tags",
+        kind="points",
+        columns=len(points),
+        rows=1,
+        square_m=0.245,
+        square_sigma_m=0.0,
+        dictionary="DICT_APRILTAG_36h11",
+        points_m=tuple(points),
+        point_numbers=tuple(range(len(points))),
+        point_tags=tuple((it[0], corner) for it in tags for corner in range(4)),
+    )
+
+
 TARGETS: Mapping[str, Callable[[], Target]] = {
     "charuco_9x6_30mm": charuco_target,
     "checkerboard_9x6_25mm": checkerboard_target,
     "aprilgrid_6x4_32mm": aprilgrid_target,
     "circles_5x9_20mm_asymmetric": circles_target,
     "circles_8x6_30mm": symmetric_circles_target,
+    "tags": tags_target,
 }
 
 

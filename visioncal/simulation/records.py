@@ -341,6 +341,12 @@ def _camera_table(cell: Cell) -> dict[str, Any]:
 
 def target_document(target: Target) -> dict[str, Any]:
     """What the file of a board says."""
+    if target.kind == "points":
+        x_m, y_m, z_m = map(list, zip(*target.points_m, strict=True))
+        tags, corners = map(list, zip(*target.point_tags, strict=True))
+        points = {"point": list(target.point_numbers), "x_m": x_m, "y_m": y_m, "z_m": z_m}
+        points |= {"tag": tags, "corner": corners}
+        return {"kind": "points", "dictionary": target.dictionary, "points": points}
     document: dict[str, Any] = {"kind": target.kind}
     if target.kind != "marker":
         document |= {"columns": target.columns, "rows": target.rows}

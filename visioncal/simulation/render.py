@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from visioncal.errors import DataError
-from visioncal.simulation.boards import bow_depth_m, outline_m
+from visioncal.simulation.boards import bow_depth_m, outline_m, unit_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
@@ -80,7 +80,7 @@ def prepare_scene(cell: Cell, board: int = 0) -> Scene:
     cell = replace(cell, sheet=sheet, options=replace(cell.options, target=sheet.target))
     target, camera = cell.options.target, cell.options.camera
     nearest = float(np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1).min())
-    samples = _SAMPLES * float(camera.matrix[0]) * target.square_m / max(nearest, 0.05)
+    samples = _SAMPLES * float(camera.matrix[0]) * unit_m(target) / max(nearest, 0.05)
     texels = 2 ** int(np.clip(np.round(np.log2(samples)), 4, 10))
     # A board of many squares stays within some 30 million texels.
     while target.columns * target.rows * texels**2 > 3e7:

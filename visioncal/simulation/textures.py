@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.errors import DataError
-from visioncal.simulation.boards import circles_m, pattern_box, tags_m
+from visioncal.simulation.boards import circles_m, pattern_box, tags_m, unit_m
 from visioncal.types import FloatArray, Image, Mask, Target
 
 _Canvas: TypeAlias = npt.NDArray[np.float32]
@@ -49,7 +49,7 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
     left, top, right, bottom = pattern_box(target)
     # Whole squares of most boards; what is left over of a texel stays white.
     width, height = (
-        math.ceil(round((b - a) / target.square_m * texels, 6))
+        math.ceil(round((b - a) / unit_m(target) * texels, 6))
         for a, b in ((left, right), (top, bottom))
     )
     margin = 2 * int(np.ceil(0.5 * _SHADOW_MARGIN * texels))
@@ -71,7 +71,7 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
                 cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8
             )
         )
-    finest = target.square_m / texels
+    finest = unit_m(target) / texels
     return SheetTexture(
         origin_m=np.array([left, top]) - margin * finest,
         texel_m=tuple(finest * 2.0**level for level in range(len(levels))),
@@ -81,7 +81,7 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
 
 def margin_m(target: Target) -> float:
     """How far the drawn sheet, its shadow included, reaches beyond the print [m]."""
-    return _SHADOW_MARGIN * target.square_m
+    return _SHADOW_MARGIN * unit_m(target)
 
 
 def draw_table(rng: np.random.Generator, size: int) -> Image:
@@ -118,7 +118,7 @@ def draw_wall(rng: np.random.Generator, size: int) -> Image:
 
 def _draw_label(strip: Image, target: Target, texels: int) -> None:
     """Writes what was printed under the print, small and grey, into the free strip there."""
-    square_mm = f"{1000.0 * target.square_m:g} mm"
+    square_mm = f"{1000.0 * unit_m(target):g} mm"
     words = f"{target.kind} {target.columns}x{target.rows}, {square_mm} {target.dictionary}"
     scale = texels / 160.0
     at = (int(0.1 * texels), int(0.42 * texels))
@@ -133,6 +133,8 @@ def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
         return _marker(target, target.marker_id, texels)
     if target.kind == "aprilgrid":
         return _inked(_aprilgrid(target, shape, texels))
+    if target.kind == "points":
+        return _inked(_tags(target, shape, texels))
     if target.kind == "circles":
         return _inked(_circles(target, shape, texels))
     rows, columns = (it // texels for it in shape)
@@ -169,6 +171,18 @@ def _aprilgrid(target: Target, shape: tuple[int, int], texels: int) -> FloatArra
         for y in range(target.rows + 1):
             place = (texels + gap) * np.array([x, y], dtype=float)
             _stamp(dark, np.ones((1, 1), bool), place, gap)
+    return dark
+
+
+def _tags(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
+    """Likewise of free tags that stand upright, each four points from its upper left corner on."""
+    dark = np.zeros(shape)
+    scale = texels / unit_m(target)
+    low = np.array(pattern_box(target)[:2])
+    for at in range(0, len(target.points_m), 4):
+        corner, beside = (np.array(target.points_m[at + it])[:2] for it in (0, 1))
+        cells = _modules(target, target.point_tags[at][0]) == 0
+        _stamp(dark, cells, scale * (corner - low), scale * (beside - corner)[0] / len(cells))
     return dark
 
 
