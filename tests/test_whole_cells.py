@@ -206,12 +206,18 @@ def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_pa
 
 
 def test_a_stated_camera_of_measured_poses_is_kept(cell):
-    found = package.calibrate(network_session(cell, "poses", seen="poses")).of("left", "b")
+    whole = package.calibrate(network_session(cell, "poses", seen="poses"), need_mm=0.1)
+    found = whole.of("left", "b")
     assert found.camera.camera.resolution == (2448, 2048)
     assert not found.camera.estimated
     assert "pixel_px" not in found.noise
     # Of both together: more than the robot's alone.
     assert found.noise["combined_translation_mm"] > found.noise["robot_translation_mm"]
+    # Each camera picks with each robot that parts it from what it sees; the worst pair decides.
+    pairs = {(it.camera, it.robot): it.probability for it in whole.need.pairs}
+    assert pairs.keys() == {(camera, robot) for camera in ("left", "hand") for robot in "ab"}
+    assert whole.need.probability == min(pairs.values()) < max(pairs.values())
+    assert found.need.probability == pairs["left", "b"]
 
 
 def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):

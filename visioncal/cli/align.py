@@ -1,6 +1,7 @@
 """`visioncal align`, and what `calibrate` does with a whole cell."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from visioncal.cli.console import (
     unused_words,
 )
 from visioncal.cli.needs import NeedDeg, NeedMm
+from visioncal.cli.pointing import naming, told_verdict
 from visioncal.figures import figure
 from visioncal.joining import leftover
 from visioncal.outputs import write_alignment
@@ -52,23 +54,29 @@ def align_command(
     leave a frame open.
     """
     loaded = Session.load(session).needing(need_mm, need_deg)
-    found = align_into(loaded, out, level=level, quiet=as_json)
+    found = align_into(session, loaded, out, level=level, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(found.document(), indent=2))
 
 
 def align_into(
-    session: Session, out: Path, *, level: str, quiet: bool, convention: Convention | None = None
+    path: Path,
+    session: Session,
+    out: Path,
+    *,
+    level: str,
+    quiet: bool,
+    convention: Convention | None = None,
 ) -> Alignment:
-    """Aligns a session's cell, writes the result into a folder and tells of it."""
+    """Aligns the cell of a session from some path, writes the result and tells of it."""
     left = leftover(out)
-    with shown_progress(quiet=quiet) as told:
+    with naming(path), shown_progress(quiet=quiet) as told:
         result = align(session, level=level, convention=convention, progress=told)
     if left is not None:
         left.keep()
     written = write_alignment(out, session, result)
     if not quiet:
-        _tell(result)
+        _tell(replace(result, verdict=told_verdict(result.verdict, path)))
     if left is not None:
         messages().print(escape(left.words))
     tell_written(written, quiet=quiet)

@@ -75,7 +75,7 @@ def calibrate_command(
     loaded = Session.load(session).needing(need_mm, need_deg)
     if is_whole_cell(loaded):
         check_whole(solver, dense=dense)
-        found = align_into(loaded, out, level=level, convention=convention, quiet=as_json)
+        found = align_into(session, loaded, out, level=level, convention=convention, quiet=as_json)
         document = whole_document(found)
         if as_json:
             typer.echo(json.dumps(document, indent=2))

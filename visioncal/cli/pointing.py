@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from visioncal.calibration import Calibration
+from visioncal.calibration import Calibration, Verdict
 from visioncal.errors import VisioncalError
 
 # How advice names the session in a command, where it does not know what the user calls it.
@@ -27,13 +27,17 @@ def naming(session: Path) -> Iterator[None]:
 
 def told_of(calibration: Calibration, session: Path) -> Calibration:
     """A calibration whose reasons, to be printed, name the session by its path."""
-    verdict = calibration.verdict
+    return replace(calibration, verdict=told_verdict(calibration.verdict, session))
+
+
+def told_verdict(verdict: Verdict, session: Path) -> Verdict:
+    """A verdict that, to be printed, names the session by its path."""
     reasons = tuple(_named(it, session) for it in verdict.reasons)
     causes = tuple(
         replace(it, sentence=_named(it.sentence, session), do=_named(it.do, session))
         for it in verdict.causes
     )
-    return replace(calibration, verdict=replace(verdict, reasons=reasons, causes=causes))
+    return replace(verdict, reasons=reasons, causes=causes)
 
 
 def _named(advice: str, session: Path) -> str:
