@@ -2,7 +2,9 @@
 
 The pictures come from `tests/rendered.py`, whose edges are exact by area and which shares nothing
 with the template. On checkerboards the peers are `findChessboardCornersSB` and `cornerSubPix` from
-there on, the best of three windows in each row; on ChArUco boards what `CharucoDetector` gives.
+there on, the best of three windows in each row; on ChArUco boards what `CharucoDetector` gives; on
+AprilGrids `cornerSubPix` from where OpenCV reads the tags; on circles `findCirclesGrid`, and the
+middles of blobs.
 
     PYTHONPATH=tests python tests/benchmarks/corners.py
 """
@@ -15,13 +17,11 @@ from itertools import product
 
 import cv2
 import numpy as np
-from boards import charuco, checkerboard
+from boards import aprilgrid, charuco, checkerboard, circles
 from rendered import Shot, photograph
 from results import few, write_section
 
-from visioncal.finders.board import find_board
-from visioncal.finders.charuco import find_charuco
-from visioncal.finders.checkerboard import find_checkerboard
+from visioncal.finders.board import FINDERS, find_board
 from visioncal.finders.result import Seen
 from visioncal.finders.template import refine
 from visioncal.types import FloatArray, Image, Target
@@ -29,6 +29,10 @@ from visioncal.types import FloatArray, Image, Target
 PICTURES, REPEATS = few((2, 7), (1, 1))
 # Columns and rows of corners differ by an odd number: the checkerboard has one numbering.
 CHECKERBOARD, CHARUCO = checkerboard(8, 5), charuco(8, 6)
+APRILGRID = aprilgrid(5, 4)
+CIRCLES = circles(5, 9, asymmetric=True, diameter_m=0.014)
+# What a side is in pixels: of tags and of rows of circles not all that squares are.
+SIDES = {"aprilgrid": (30, 50, 80), "circles": (12, 20, 40)}
 WINDOWS = (3, 5, 9)
 # Farther off, a corner counts as an outlier [px].
 OUTLIER_PX = 0.1
@@ -51,12 +55,13 @@ CHANGES = {
 }
 
 
-def shots() -> Iterator[tuple[str, Shot]]:
+def shots(kind: str) -> Iterator[tuple[str, Shot]]:
     """All rows: first squares, defocus and noise, then one change at a time."""
-    for side, disc, noise in product((8, 12, 20, 40, 80), (0, 2, 4, 6), (1, 4, 8)):
+    sides = SIDES.get(kind, (8, 12, 20, 40, 80))
+    for side, disc, noise in product(sides, (0, 2, 4, 6), (1, 4, 8)):
         yield "", replace(PLAIN, square_px=side, disc_px=disc, noise=noise)
     for words, change in CHANGES.items():
-        for side in (12, 20, 40):
+        for side in SIDES.get(kind, (12, 20, 40)):
             yield words, replace(PLAIN, square_px=side, **change)
 
 
@@ -125,8 +130,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
 
 def detected(image: Image, target: Target) -> Seen | None:
     """What OpenCV's detector gives."""
-    find = find_charuco if target.kind == "charuco" else find_checkerboard
-    seen = find(image, target)
+    seen = FINDERS[target.kind](image, target)
     return seen if isinstance(seen, Seen) else None
 
 
@@ -135,9 +139,17 @@ def peers(
 ) -> Iterator[tuple[str, FloatArray]]:
     """What else is made of the detected corners."""
     yield "detector", seen.px
-    for reach in WINDOWS:
-        # A window that reaches a neighbour diverges by pixels.
-        if target.kind == "checkerboard" and (reach == WINDOWS[0] or reach < 0.4 * side_px):
+    if target.kind == "circles":
+        size, flags = (target.columns, target.rows), cv2.CALIB_CB_ASYMMETRIC_GRID
+        found, centres = cv2.findCirclesGrid(image, size, flags=flags)
+        if found:
+            centres = centres.reshape(-1, 2)
+            away = np.linalg.norm(centres[:, None] - seen.px, axis=2)
+            yield "grid", centres[away.argmin(axis=0)]
+    # A window that reaches a neighbour diverges by pixels.
+    clear_px = {"checkerboard": 0.4, "aprilgrid": 0.4 * target.spacing}.get(target.kind, 0.0)
+    for reach in WINDOWS if clear_px else ():
+        if reach == WINDOWS[0] or reach < clear_px * side_px:
             start = seen.px.astype(np.float32)[:, None].copy()
             ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
             yield f"{reach}", cv2.cornerSubPix(image, start, (reach, reach), (-1, -1), ends)[:, 0]
@@ -185,7 +197,9 @@ def speed() -> str:
         "| board | OpenCV in the image | in half of it | the template | all of visioncal |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
-    for target, side in ((checkerboard(12, 7), 110.0), (charuco(12, 8), 110.0)):
+    boards = (checkerboard(12, 7), charuco(12, 8), aprilgrid(6, 4), circles(5, 9, asymmetric=True))
+    for target in boards:
+        side = 200.0 if target.kind == "aprilgrid" else 110.0
         image = np.full((2048, 2448), 200, np.uint8)
         part, _ = photograph(target, replace(PLAIN, square_px=few(side, 60.0), tilt_deg=15.0), 3)
         image[: len(part), : part.shape[1]] = part
@@ -206,8 +220,9 @@ def main() -> None:
     """Prints the tables and keeps them."""
     cv2.setNumThreads(1)
     parts = []
-    for target in (CHECKERBOARD, CHARUCO):
-        rows = [compared(target, *it) for it in few(list(shots()), list(shots())[24:26])]
+    for target in (CHECKERBOARD, CHARUCO, APRILGRID, CIRCLES):
+        every = list(shots(target.kind))
+        rows = [compared(target, *it) for it in few(every, every[24:26])]
         found = [it for it in rows if it is not None]
         missing = len(rows) - len(found)
         parts.append(
@@ -218,8 +233,10 @@ def main() -> None:
         "says otherwise. Px are rms of a coordinate, `shared` rms of what all corners of a picture "
         "have in common, outliers those more than "
         f"{OUTLIER_PX} px off: OpenCV's (the best peer's) first. The aim for checkerboards is a "
-        "ratio of 0.65 at most, for ChArUco boards of 1. NEES is the template's squared error over "
-        "the variance that it states.\n\n" + "\n\n".join(parts)
+        "ratio of 0.65 at most, for ChArUco boards of 1. Of AprilGrids `squares` are tags, and of "
+        "circles distances of rows; an AprilGrid's corners are those of the tags that are read, of "
+        f"{4 * APRILGRID.columns * APRILGRID.rows} in a picture. NEES is the template's squared "
+        "error over the variance that it states.\n\n" + "\n\n".join(parts)
     )
     text += f"\n\nImages of 2448 x 2048 px, median processor time of one thread:\n\n{speed()}\n"
     print(text)
