@@ -17,6 +17,8 @@ from visioncal.types import FloatArray, Image, IntArray, Target
 # levels. Blobs have areas [px] and fill the ellipse of their moments; a square fills 0.955 of it,
 # and a circle of few pixels somewhat less than all: in their median they are told apart.
 _SURROUNDINGS, _DARKER, _LEAST_AREA, _FILL, _ROUND = 0.12, 12, 12.0, 0.88, 0.97
+# The inner edge of a blob has so much of its width.
+_INNER = 0.5
 # Neighbours on a lattice are not wider or narrower in any direction by more.
 _ALIKE = 1.6
 # A lattice is looked for from so many blobs; its neighbours lie within so much of a step from where
@@ -187,10 +189,12 @@ def _blobs(image: Image) -> _Blobs:
         radius = np.sqrt(area / np.pi)
         moments.append(((radius + 0.5) / radius) ** 2 * spread)
     found = _Blobs(np.reshape(middles, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
-    # What is larger than its surroundings has an edge inside too.
+    # What is larger than its surroundings has an edge inside too, not far from the outer one.
     found = found.at(np.argsort(-found.diameters, kind="stable"))
-    inner = cKDTree(found.px).query_pairs(2.0) if len(found.px) else set()
-    return found.at(np.setdiff1d(np.arange(len(found.px)), [max(it) for it in inner]))
+    pairs = cKDTree(found.px).query_pairs(2.0) if len(found.px) else set()
+    wide = found.diameters
+    inner = [max(it) for it in pairs if wide[max(it)] > _INNER * wide[min(it)]]
+    return found.at(np.setdiff1d(np.arange(len(found.px)), inner))
 
 
 def _lattice(blobs: _Blobs) -> tuple[IntArray, IntArray]:

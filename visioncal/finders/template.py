@@ -58,6 +58,8 @@ _RIM_PX = 32
 # The patch of a tag's corner, in modules, and what is left out around the corner itself, in widths
 # of an edge.
 _TAG_HALF, _SLANT = 1.2, 1.5
+# What is looked at around a circle: a share of its radius, and no less [px]. Text may be near.
+_AROUND_CIRCLE, _AROUND_PX = 0.35, 4.0
 # Larger circles are looked at in half of the size.
 _MOST_RADIUS_PX = 20.0
 # Bounds memory and time where corners are many.
@@ -203,6 +205,9 @@ class _Windows:
         # Of a circle all of the edge is needed.
         most = np.inf if pattern.radius else _MOST_PX
         half = np.clip(pattern.half, _LEAST_PX / side_px, most / side_px)
+        if pattern.radius:
+            around_px = np.maximum(_AROUND_CIRCLE * pattern.radius * side_px, _AROUND_PX)
+            half = np.minimum(half, pattern.radius + around_px / side_px)
         wanted = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
         affordable = max(_LEAST_PX, (np.sqrt(_MOST_PIXELS / len(chosen)) - 1.0) / 2.0)
         reach = int(np.ceil(min(most, affordable, wanted)))
@@ -221,7 +226,8 @@ class _Windows:
             (columns >= rim) & (columns < width - rim)
         )[:, None, :]
         rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
-        within = np.maximum(np.abs(x), np.abs(y)) < half[:, None, None]
+        away = np.hypot(x, y) if pattern.radius else np.maximum(np.abs(x), np.abs(y))
+        within = away < half[:, None, None]
         return cls(
             start,
             by_board,
@@ -469,8 +475,6 @@ def _step(
         )
     draw = _circle if pattern.radius else _crossing
     product, *slopes_of = draw(pattern, x, y, sx, sy)
-    if pattern.radius:
-        used = used & (np.hypot(x, y) < np.float32(pattern.half))
     columns = [np.ones_like(x), product, *slopes_of[: None if blurs else 2]]
     unknowns = len(columns)
     columns.append(windows.grey - ox * x - oy * y - (gx * x + gy * y) * product)

@@ -10,8 +10,8 @@ from visioncal.types import FloatArray, Mask, Target
 
 # White that finders need around squares; markers need one of their own modules.
 _QUIET_M = 0.0025
-# A circle: the middles of its sides are within a ten-thousandth of its radius.
-_ANGLES = np.linspace(0.0, 2.0 * np.pi, 240, endpoint=False)
+# A circle: the middles of its sides are within a two-thousandth of its radius.
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
