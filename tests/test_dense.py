@@ -47,6 +47,7 @@ def rms(errors):
         (CHECKERBOARD, SHOT, 0.9),
         (CHECKERBOARD, replace(SHOT, disc_px=4, noise=8), 0.95),
         (CHECKERBOARD, replace(SHOT, square_px=14, motion_px=12), 0.5),
+        (CHECKERBOARD, replace(SHOT, square_px=9, disc_px=4), 0.9),
         (CHECKERBOARD, replace(SHOT, gamma=0.45), 0.9),
         (CHECKERBOARD, replace(SHOT, uneven=0.5), 0.9),
         (CHARUCO, SHOT, 0.9),
@@ -110,7 +111,8 @@ def test_what_covers_a_corner_leaves_it_out(target):
     image, truth = photograph(target, replace(SHOT, square_px=40), 1)
     u, v = np.rint(truth[7]).astype(int)
     image[v - 3 : v + 30, u - 4 : u + 30] = 120
-    found = fit_corners(image, target, np.arange(len(truth)), truth, np.full(2, 0.5))
+    start = truth + np.random.default_rng(0).normal(0.0, 0.05, truth.shape)
+    found = fit_corners(image, target, np.arange(len(truth)), start, np.full(2, 0.5))
     assert not found.fitted[7]
     assert np.isnan(found.covariance[7]).all()
     # The cover reaches into the patches of three others at most.
@@ -130,12 +132,12 @@ def explained(target, shot, shift_px=0.0):
     image, truth = photograph(target, shot, 1)
     ids = np.arange(len(truth))
     seen = refine(image, target, ids, truth)
-    fit = fit_corners(image, target, ids, seen.px, seen.blur_px)
+    found = fit_corners(image, target, ids, seen.px, seen.blur_px)
     # The lens of these pictures is no camera's; what bends them is left to the map.
     size = image.shape[::-1]
     camera = Camera("brown", size, np.array([1300.0, 1300.0, *np.array(size) / 2]), np.zeros(5))
     px = truth + np.array([shift_px, 0.0])
-    return image, truth, explain(image, target, ids, px, camera, fit.blur, fit.tone)
+    return image, truth, explain(image, target, ids, px, camera, found.blur, found.tone)
 
 
 @pytest.mark.usefixtures("torch")
@@ -158,6 +160,19 @@ def test_a_board_that_is_elsewhere_is_not_explained():
     right, wrong = (explained(CHARUCO, SHOT, it)[2] for it in (0.0, 0.3))
     assert wrong.rest_rms > 3 * right.rest_rms
     assert np.std(wrong.rest.astype(float)) > 2 * np.std(right.rest.astype(float))
+    # Predicted far outside of the image, or nowhere at all.
+    for shift in (2000.0, np.nan):
+        assert explained(CHARUCO, SHOT, shift)[2] is None
+
+
+@pytest.mark.usefixtures("torch")
+def test_corners_that_scatter_more_than_before_are_none():
+    image, truth = photograph(CHECKERBOARD, replace(SHOT, noise=8), 1)
+    ids, widths = np.arange(len(truth)), np.full(2, 0.5)
+    # Known from elsewhere, they are as exact as no image has them.
+    assert fit_corners(image, CHECKERBOARD, ids, truth, widths) is None
+    rough = truth + np.random.default_rng(0).normal(0.0, 0.05, truth.shape)
+    assert fit_corners(image, CHECKERBOARD, ids, rough, widths) is not None
 
 
 def test_derivatives_of_the_blur(torch):

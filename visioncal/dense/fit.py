@@ -45,6 +45,10 @@ _FEWEST = 6
 _PASSES, _AT_REST_PX = 2, 0.02
 # The width of a sharp edge, and of the widest that a search starts from [px].
 _SHARP_PX, _MOST_START_PX = 0.45, 5.0
+# Edges wider than this share of a square are measured as up to twice as wide as they are.
+_WIDE = 0.18
+# Corners that scatter so many times as much as they did before are none.
+_SCATTERED = 1.2
 # Tones beyond have no longer a light for each grey.
 _MOST_TONE = 0.9
 # Most that blur is modelled to carry into a patch [px].
@@ -121,7 +125,8 @@ def fit_corners(
             demosaicing, sharpening and compression leave between neighbours; 0 for none [px].
 
     Returns:
-        The corners, in the same order; None where they are too few, or lie as no board's do.
+        The corners, in the same order; None where they are too few, lie as no board's do, or
+        scatter more than before.
     """
     board = board_places(target, ids)
     flat = all(np.linalg.matrix_rank(it - it.mean(axis=0)) == 2 for it in (board, px))
@@ -159,7 +164,9 @@ def fit_corners(
             # What hardly moves leaves maps and blur as they are.
             if not is_lit and np.sqrt(np.mean(shift[good] ** 2)) < _AT_REST_PX:
                 break
-        return _fitted(patches, sums, shift, best, good, found)
+        fitted = _fitted(patches, sums, shift, best, good, found)
+        if fitted.scatter_px <= _SCATTERED * _scatter_px(board[good], px[good]):
+            return fitted
     return None
 
 
@@ -478,8 +485,11 @@ def _started(scene: _Scene, px: FloatArray, widths_px: FloatArray) -> FloatArray
     wide = np.clip(np.nan_to_num(widths_px, nan=1.0), _SHARP_PX, _MOST_START_PX)
     reach = 3.0 * float(wide.max()) + 2.0
     patches = _Patches.cut(scene, px, good, sample, reach, np.zeros((len(px), 2, 2)))
-    starts = [np.append(it, 0.0) for it in _starts(np.median(patches.normals, axis=0), wide)]
-    found = [_searched(patches, it, _START_TURNS) for it in starts]
+    normals = np.median(patches.normals, axis=0)
+    starts = [*_starts(normals, wide)]
+    if np.linalg.norm(normals, axis=1).max() * wide.max() > _WIDE:
+        starts += _starts(normals, np.maximum(wide / 2, _SHARP_PX))
+    found = [_searched(patches, np.append(it, 0.0), _START_TURNS) for it in starts]
     return min(found, key=lambda it: it[1])[0]
 
 
@@ -593,10 +603,10 @@ def _odd_variance(
 
 
 def _scatter_px(board: FloatArray, px: FloatArray) -> float:
-    """Rms distance of most corners from a homography with a cubic on top [px]."""
+    """Rms distance of most corners from a homography with a cubic on top [px]; 0 for few."""
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
     if len(px) <= len(powers):
-        return np.nan
+        return 0.0
     middle, scale = board.mean(axis=0), float(np.abs(board - board.mean(axis=0)).max())
     places = (board - middle) / scale
     homography = cv2.findHomography(places, px)[0]

@@ -24,8 +24,8 @@ MAGNIFIED, MIDDLE = 4, 128
 _RIM = 1.0
 # Polynomials through so many places a side carry a map over an image.
 _NODES = 14
-# Pixels that tell the light, at most.
-_LIT_BY = 50_000
+# Pixels that tell the light, at least and at most.
+_FEWEST_LIT, _LIT_BY = 100, 50_000
 # Beyond so many pixels, there is one sample in each.
 _MOST_FINE = 1_500_000
 _FEWEST = 6
@@ -67,9 +67,10 @@ def explain(
         tone: q of `dense.fit`.
 
     Returns:
-        What is explained and what is not; None where the corners do not determine it.
+        What is explained and what is not; None where the corners do not determine it, or lie
+        outside the image.
     """
-    if len(ids) < _FEWEST:
+    if len(ids) < _FEWEST or not np.isfinite(px).all():
         return None
     torch, printed, board = library("torch"), Print.of(target), board_places(target, ids)
     with ONE_TORCH_THREAD.held(), torch.inference_mode(), suppress(np.linalg.LinAlgError):
@@ -88,6 +89,8 @@ def explain(
         part = image[low[1] : high[1], low[0] : high[0]].astype(float)
         toned = light + tone * light * (1.0 - light)
         on = _is_on(printed, x, y)
+        if on.sum() < _FEWEST_LIT:
+            return None
         model = _lit(part, toned, on)
         drawn, rest = image.copy(), np.full_like(image, MIDDLE)
         place = (slice(low[1], high[1]), slice(low[0], high[0]))

@@ -158,7 +158,7 @@ def _smoothing_helps(plain: Sequence[_Look | None], smooth: Sequence[_Look | Non
         after[1].scatter_px / before[1].scatter_px
         for before, after in zip(plain, smooth, strict=True)
         if before is not None and before[1] is not None
-        and after is not None and after[1] is not None
+        and after is not None and after[1] is not None and before[1].scatter_px > 0.0
     ]  # fmt: skip
     return bool(shares) and float(np.median(shares)) < _HELPS
 
