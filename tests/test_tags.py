@@ -19,6 +19,7 @@ from visioncal.simulation import (
     tags_target,
     write_session,
 )
+from visioncal.stages.detect import look_for
 from visioncal.targets import (
     corner_positions,
     load_target,
@@ -26,6 +27,7 @@ from visioncal.targets import (
     target_from_document,
 )
 from visioncal.transforms import invert, log
+from visioncal.types import Corners
 
 TAGS = tags_target()
 PLATE = replace(TAGS, square_m=0.245, square_sigma_m=0.0)
@@ -83,6 +85,19 @@ def test_corners_are_found_to_hundredths_of_a_pixel(seen):
     # OpenCV's own corners are off by 0.1 px; a lens bends the sides of tags by some hundredths.
     assert np.sqrt(np.mean(error**2)) < 0.03
     assert np.abs(error.mean(axis=0)).max() < 0.02
+
+
+def test_one_tag_will_do_for_a_view(seen):
+    four = replace(
+        TAGS,
+        columns=4,
+        points_m=TAGS.points_m[:4],
+        point_numbers=TAGS.point_numbers[:4],
+        point_tags=TAGS.point_tags[:4],
+    )
+    found, _ = look_for(seen[1], four, 0)
+    assert isinstance(found, Corners), found
+    assert found.ids.tolist() == [0, 1, 2, 3]
 
 
 def test_tags_out_of_one_plane_are_found_one_by_one(seen):

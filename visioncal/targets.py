@@ -47,8 +47,8 @@ APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
 _CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 # Circles leave so much white between them that their edges are told apart.
 _WIDEST = 0.85
-# Kinds that are found where the image shows a part of them.
-FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid", "points"))
+# Kinds that are found where the image shows a part of them; so are rigs of tags.
+FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
 
 
 def _shipped() -> dict[str, Path]:

@@ -256,7 +256,7 @@ def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners
 
 
 def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
-    needed = 4 if target.kind == "marker" else options.min_corners
+    needed = 4 if target.kind in ("marker", "points") else options.min_corners
     if len(ids) < needed:
         return f"too few corners: {len(ids)} of {len(corner_positions(target))}, needs {needed}"
     if not determines_pose(corner_positions(target)[ids]):
