@@ -214,9 +214,9 @@ def speed() -> str:
 def main() -> None:
     """Prints the tables and keeps them."""
     parts = []
-    # The largest squares take half of the time and have the least to gain.
-    wanted = [it for it in shots() if it[1].square_px < LARGEST_PX]
     for target in (CHECKERBOARD, CHARUCO):
+        # The largest squares take half of the time and have the least to gain.
+        wanted = [it for it in shots(target.kind) if it[1].square_px < LARGEST_PX]
         rows = [compared(target, *it) for it in few(wanted, wanted[24:26])]
         found = [it for it in rows if it is not None]
         missing = len(rows) - len(found)
