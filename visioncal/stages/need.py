@@ -37,8 +37,8 @@ from visioncal.types import FloatArray, IntArray, Need
 
 # Of a need that is met, so many picks land within it; from the other on, most do.
 GOOD, CHECK = 0.95, 0.5
-# Left-out views of a sound cell err by more than this chance lets them in one session of twenty.
-_CHANCE = 0.05
+# Left-out views of a sound cell err by more than this chance lets them in one session of a hundred.
+_CHANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     placed = {name: _at_points(it, at_m) for name, it in parts.items()}
     # Of a whole chain before a camera that stands still, it is among the chain's already.
     goes = carries | (not whole)
-    placed["pick"] = np.where(goes[:, None, None], level, 0.0)
+    placed["pick"] = np.where(goes[:, None, None], _of_flange(problem, robot, in_base, level), 0.0)
     placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
     return Picks(
         camera,
@@ -215,6 +215,22 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
         fitted.freedom.get(robot, np.inf),
         float(np.linalg.norm(_carried(problem.measured(state), middles), axis=1).mean()),
     )
+
+
+def _of_flange(problem: Problem, robot: str, in_base: FloatArray, level: FloatArray) -> FloatArray:
+    """(n, 6, 6) the noise of a flange at its own origin.
+
+    Where the noise of robot and camera is one, it is that of targets: what the flange's rotation
+    does to them by their distance is in that of their place.
+    """
+    found = np.broadcast_to(level, (len(problem), 6, 6)).copy()
+    if problem.is_combined:
+        flange_m = problem.poses[robot][problem.observations.stops, :3, 3]
+        lever_m2 = np.sum((in_base[:, :3, 3] - flange_m) ** 2, axis=1)
+        # About three axes alike, a rotation moves a point by two of its components.
+        own = np.maximum(level[3, 3] - level[0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
+        found[:, 3:, 3:] = own[:, None, None] * np.eye(3)
+    return found
 
 
 def _is_between(problem: Problem, observer: str, base: str, robot: str) -> bool:
