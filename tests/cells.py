@@ -93,7 +93,5 @@ def calibrated_sweep(moved: Sweep) -> Known:
 
 def error_of(cell: Cell, known: Known) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
-    # The board with the most views comes first.
-    order = [0, *(1 + np.argsort(known.boards))]
     true = np.array(list(cell.transforms.values()))
-    return log(invert(true) @ known.solved.state.edges[order]).ravel()
+    return log(invert(true) @ known.solved.state.edges).ravel()

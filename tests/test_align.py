@@ -228,7 +228,7 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     assert np.linalg.norm(away[3:]) > 5e-3
     assert squared < 22.0
     budget = found.stages["uncertainty"]["budget_mm"]["cell_from_cam_left"]
-    assert budget["held values"] > 0.9 * budget["total"]
+    assert budget["held_values"] > 0.9 * budget["total"]
 
 
 def test_lenses_that_the_views_do_not_determine_are_refused():
@@ -416,8 +416,8 @@ def two_cameras(cell):
 @pytest.mark.parametrize(
     ("motion", "words", "left_open"),
     [
-        ("one_axis", r"all \d+ stops of the robot turn about base's", "offset along"),
-        ("translation", r"the \d+ stops of the robot differ in position", "offset from"),
+        ("one_axis", r"all \d+ (stops|used views) .*turn about .*'s", "offset along"),
+        ("translation", r"the \d+ (stops|used views) .*differ in position", "offset from"),
     ],
 )
 @pytest.mark.parametrize(
@@ -429,8 +429,10 @@ def test_motion_that_leaves_an_offset_from_an_only_robot_open_is_named(
 ):
     with pytest.raises(DegenerateError, match=words) as caught:
         align(seen(simulate(CellOptions(mount=mount, motion=motion))))
-    culprit, frame = caught.value.culprits[0], "flange" if mount == "eye-in-hand" else "the cell"
-    assert culprit.startswith("cam")
+    culprit, frame = caught.value.culprits[0], "the cell"
+    if seen is one_camera:
+        frame = "the tool" if mount == "eye-in-hand" else "the base"
+    assert "cam" in culprit
     assert f"'s {left_open} {frame}" in culprit
 
 
@@ -448,10 +450,12 @@ def test_a_view_of_a_whole_cell_that_allows_two_poses_is_left_out():
     assert {it.view: it.reason for it in found.sights}[4] == reasons[4]
 
 
-@pytest.mark.parametrize("seen", [one_camera, two_cameras])
-def test_two_stops_of_an_only_robot_are_too_few(seen):
+def test_two_stops_of_an_only_robot_are_too_few():
+    cell = simulate(CellOptions(mount="eye-to-hand", views=2))
+    with pytest.raises(DegenerateError, match="2 usable stops of the robot, at least 3"):
+        align(one_camera(cell))
     with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of the robot turn") as it:
-        align(seen(simulate(CellOptions(mount="eye-to-hand", views=2))))
+        align(two_cameras(cell))
     assert "see target at 5 stops or more" in it.value.next_step
 
 
@@ -645,7 +649,7 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     floor = found.stages["boards"]["floor"]
     # Four of its sigmas: one run in fifteen thousand.
     assert abs(floor["shape"]["scale"] - 0.002) < 4 * floor["sigma"]["scale"] < 4e-4
-    assert found.stages["boards"]["plate_a"]["estimated"] == ["scale"]
+    assert set(found.stages["boards"]["plate_a"]["sigma"]) == {"scale"}
     assert not found.moved
     assert {found.arms[it].stages["kinematics"]["level"] for it in "ab"} == {"offsets"}
 

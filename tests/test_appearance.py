@@ -95,9 +95,9 @@ def test_the_corners_alone_do_not_tell_the_size():
 def test_a_flat_board_of_the_stated_size_stays_so(given):
     for seed in range(4):
         known = calibrated(simulate(replace(FINE, state_intrinsics=given, seed=seed)))
-        moving = known.free.columns[~known.free.anchored]
-        assert len(moving) == (0 if given else 9)
-        assert np.all(known.free.after(known.solved.state.values).board == 0.0)
+        looks = known.fitted.looks
+        assert len(known.fitted.seen.moving) == (0 if given else 9)
+        assert np.all(looks.values[looks.boards] == 0.0)
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
@@ -177,13 +177,18 @@ def with_lens(cell, off, **table):
     )
 
 
+def lens_is_free(known):
+    """Whether the fit moves the intrinsics."""
+    return np.isin(known.fitted.looks.lens_of("cam"), known.fitted.seen.moving).any()
+
+
 def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
     cell = simulate(replace(FINE, seed=5))
     known = with_lens(cell, np.array([0.0, 0.0, 3.0, 0.0]), intrinsics="hold")
     (sentence,) = [it for it in known.verdict.reasons if "do not fit these images" in it]
     assert 'intrinsics = "hold" keeps them' in sentence
     assert known.verdict.status != "good"
-    assert not known.free.lens_is_free
+    assert not lens_is_free(known)
     assert surprise(cell, known) < UNLIKELY
 
 
@@ -191,7 +196,7 @@ def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
 def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt(options):
     cell = simulate(options)
     known = with_lens(cell, np.zeros(4), intrinsics="refine")
-    assert known.free.lens_is_free
+    assert lens_is_free(known)
     assert known.verdict.status == "good"
     assert surprise(cell, known) < UNLIKELY
 
@@ -211,8 +216,8 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     told = replace(cell, stated_camera=wrong)
     known = calibrated(told)
     assert any("given intrinsics do not fit" in it for it in known.warnings)
-    refined = known.free.after(known.solved.state.values).camera
-    lens = 12 + np.flatnonzero(known.free.columns < known.free.lens_count)
+    refined = known.fitted.looks.camera("cam")
+    lens = known.fitted.columns_of(known.fitted.looks.lens_of("cam"))
     sigma = np.sqrt(np.diag(known.solved.covariance))[lens[:4]]
     assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.0 * sigma)
     table = {"intrinsics": "hold"}
@@ -221,7 +226,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
         known_of(told).session, document=document | {"camera": document["camera"] | table}
     )
     held = calibrated(told, session=session)
-    assert held.free.after(held.solved.state.values).camera.matrix == pytest.approx(wrong.matrix)
+    assert held.fitted.looks.camera("cam").matrix == pytest.approx(wrong.matrix)
 
 
 def test_too_few_corners_leave_the_lens_alone():
@@ -231,5 +236,5 @@ def test_too_few_corners_leave_the_lens_alone():
     camera = document["camera"] | {"intrinsics": "refine"}
     session = replace(known_of(cell).session, document=document | {"camera": camera})
     known = calibrated(cell, session=session)
-    assert not known.free.lens_is_free
+    assert not lens_is_free(known)
     assert any('"refine" was not done: 60 corners in 15 views' in it for it in known.warnings)

@@ -12,7 +12,7 @@ from visioncal.errors import DataError
 from visioncal.finders import NotFound, Seen, find_target
 from visioncal.finders.identify import identify
 from visioncal.formats.boards import described_target
-from visioncal.pipeline.result import run
+from visioncal.pipeline import run
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, aprilgrid_target, simulate, write_session
 from visioncal.targets import corner_positions, target_document, target_from_document

@@ -45,7 +45,7 @@ def test_an_arm_that_is_right_but_for_its_play():
     told = [it.deadband_rad for it in known.arm_found.plays]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
-    q = known.arm_at(known.used).joints_rad
+    q = known.robot_arm.joints_rad
     away = known.robot_arm.model.base_from_flange(q) - known.robot.base_from_flange(q)
     assert np.abs(away).max() < 1e-9
     result = result_of(known)

@@ -469,7 +469,7 @@ def test_progress_tells_of_every_stage_and_image(rendered):
     told = []
     run(rendered, progress=lambda stage, done, total: told.append((stage, done, total)))
     assert ("detect", 12, 12) in told
-    assert {"pnp", "hand-eye", "validate", "judge"} <= {stage for stage, *_ in told}
+    assert {"pnp", "solve", "examine", "judge"} <= {stage for stage, *_ in told}
 
 
 def test_options_that_do_not_exist_are_refused(rendered):

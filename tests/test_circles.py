@@ -10,7 +10,7 @@ from rendered import Shot, photograph
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, Seen, find_target
 from visioncal.finders.identify import identify
-from visioncal.pipeline.result import run
+from visioncal.pipeline import run
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,

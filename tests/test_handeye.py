@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cells import calibrated, error_of
+from edges import solved
 from scipy.spatial.transform import Rotation
 
 from visioncal.errors import DegenerateError
-from visioncal.estimation.chain import FLANGE, chain, robot_part
+from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.linalg import covariance, damped_step, spectrum
 from visioncal.estimation.parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
@@ -17,7 +18,7 @@ from visioncal.estimation.variance import Knowledge
 from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, exact, measured_poses, simulate
 from visioncal.solvers import SOLVERS
-from visioncal.stages.handeye import compare_solvers, solve_hand_eye
+from visioncal.stages.handeye import compare_solvers
 from visioncal.transforms import adjoint, compose, exp, invert, log
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -31,15 +32,6 @@ def problem_of(cell, camera=None):
 
 def state_of(*edges):
     return State(np.array(edges), np.zeros(0))
-
-
-def solved(problem, solver="joint"):
-    return solve_hand_eye(problem, mount_of(problem), solver)
-
-
-def mount_of(problem):
-    carried = problem.tree.branches["cam"].parent == FLANGE
-    return "eye-in-hand" if carried else "eye-to-hand"
 
 
 def made_up(robot, x, z, noise=NOISE, seed=0, mount="eye-in-hand"):
@@ -96,11 +88,12 @@ def test_every_solver_is_shown_beside_the_answer(mount):
     cell = simulate(CellOptions(mount=mount, seed=2))
     problem = problem_of(cell, measured_poses(cell))
     result = solved(problem)
-    found = compare_solvers(result, mount, "joint")
+    found = compare_solvers(problem, result.state, mount, "joint")
     closed_forms = ["tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"]
     assert list(found) == ["joint", *closed_forms]
     np.testing.assert_array_equal(found["joint"].edges, result.state.edges)
-    assert list(compare_solvers(solved(problem, "tsai"), mount, "tsai")) == closed_forms
+    by_tsai = compare_solvers(problem, solved(problem, "tsai").state, mount, "tsai")
+    assert list(by_tsai) == closed_forms
 
 
 def test_rounds_of_a_calibration_solve_each_closed_form_once(monkeypatch):
@@ -193,7 +186,7 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
 
 def test_a_stop_counts_once_however_often_it_is_looked_at():
     cell = simulate(CellOptions(seed=4, views=12, pixel_sigma_px=0.1))
-    problem = calibrated(cell).problem(range(12)).with_effects([])
+    problem = calibrated(cell).solved.problem.with_effects([])
     once = solved(problem)
     again = np.repeat(np.arange(12), 3)
     looks = problem.observations.take(again)

@@ -144,8 +144,8 @@ def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     known = calibrated(cell)
     # As if nothing but errors of one size could be, this arm makes the board 0.16 % smaller, at
     # three sigma; what was measured to a millionth is kept.
-    assert known.free.columns.tolist() == [9]
-    assert known.free.anchored.all()
+    assert known.fitted.seen.free.tolist() == [9]
+    assert known.fitted.seen.held.all()
     sigma = float(np.sqrt(np.mean(known.arm_found.telling.sigmas_m**2)))
     assert error_m(cell, known, known.robot_arm.model.robot) < 2.0 * sigma
 
@@ -167,7 +167,7 @@ def test_without_joints_no_level_can_be_asked_for():
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_predictions_move_as_their_derivatives_say(mount):
     known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
-    arm, edges = known.arm_at(known.used[:3]), known.solved.state.edges
+    arm, edges = known.robot_arm.at(np.arange(3)), known.solved.state.edges
     model, q = arm.model, arm.joints_rad
     size, step = 12 + len(model.values), 1e-6
     middle = target_in_camera(mount, *edges, model.robot.base_from_flange(q))

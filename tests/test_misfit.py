@@ -14,6 +14,7 @@ from visioncal.estimation.misfit import drift, neighbours
 from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.solve import covariance_of
 from visioncal.estimation.variance import profile_interval
+from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.transforms import exp
 
@@ -80,8 +81,9 @@ def test_a_turning_base_moves_the_target_by_its_distance(mount):
 def test_a_closed_form_is_not_taken_for_a_misfit(changes):
     for seed in range(4):
         known = calibrated(simulate(replace(FINE, seed=seed, **changes)), solver="park")
-        assert known.diagnosis.inflation == 1.0
-        assert known.diagnosis.warnings == ()
+        (found,) = known.solved.misfits.values()
+        assert not found.alike.is_significant
+        assert found.moved is None
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -104,8 +106,8 @@ def test_stops_that_err_in_groups_are_noticed():
     result, known = answered(together)
     found = of_fit(neighbours, result)
     assert found.is_significant
-    # The diagnosis comes to rest anew, which the fit does to 1e-4.
-    assert known.diagnosis.inflation == pytest.approx(found.factor, rel=1e-3)
+    stated = result_of(known).stages["uncertainty"]["inflation"]
+    assert stated == pytest.approx(found.factor, rel=1e-9)
     assert found.factor > 1.5
     assert any("Neighbouring stops err alike" in it for it in known.warnings)
 
@@ -161,8 +163,8 @@ def test_the_budget_adds_up(given):
     whole = covariance_of(result.problem, result.fit)[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
-    budget, spread = known.diagnosis.budget_mm, result.covariance[:6, :6]
-    at_work = point_covariance(result.state.edges[0], spread, known.diagnosis.point_cam)
+    budget, spread = known.work.budget_mm, result.covariance[:6, :6]
+    at_work = point_covariance(result.state.edges[0], spread, known.work.point_cam)
     assert budget["total"] == pytest.approx(1e3 * np.sqrt(np.trace(at_work)), rel=1e-4)
     assert ("intrinsics" in budget) == (not given)
 
@@ -170,7 +172,7 @@ def test_the_budget_adds_up(given):
 def test_sources_that_are_known_together_add_up_as_well():
     bent = replace(FINE, state_intrinsics=False, board_bow_m=5e-4, seed=2)
     result, known = answered(simulate(bent))
-    is_lens = known.free.columns < known.free.lens_count
+    is_lens = known.fitted.seen.free < known.fitted.looks.boards.start
     owners = {"intrinsics": np.flatnonzero(is_lens), "board": np.flatnonzero(~is_lens)}
     parts = covariance_by_source(*told(result), sources(**owners))
     whole = covariance_of(result.problem, result.fit)[:12, :12]

@@ -64,8 +64,8 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     result = known.solved
     spread = np.linalg.cholesky(result.covariance[:6, :6])
     views = rng.integers(len(known.used), size=count)
-    flange = known.flange_poses(known.used)[views]
-    problem = known.problem(known.used)
+    problem = known.solved.problem
+    flange = known.robot_arm.poses[problem.observations.stops][views]
     middle = np.array([0.135, 0.09, 0.0, 1.0])
     seen = (problem.measured(result.state)[views] @ middle)[:, :, None]
     sigmas = np.repeat(result.noise.robots[0], 3)

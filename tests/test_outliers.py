@@ -12,8 +12,7 @@ from visioncal.estimation.outliers import distances, inliers
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
-from visioncal.stages.agree import agree, whole_units
-from visioncal.transforms import exp, invert
+from visioncal.transforms import exp
 
 WORLDS = {
     "fine, given": CellOptions(camera=fine_camera(), pixel_sigma_px=0.1),
@@ -63,19 +62,19 @@ def test_two_exchanged_rows_are_found():
 
 def test_where_nothing_agrees_nothing_is_left_out():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
-    problem = known.problem(known.used).with_effects([])
+    problem = known.solved.problem.with_effects([])
     mixed = replace(problem, poses={ROBOT: np.roll(problem.poses[ROBOT], 1, axis=0)})
-    assert agree(mixed, range(20), "eye-in-hand").mask.all()
+    assert inliers(mixed).used.all()
 
 
 def test_a_stop_is_right_or_wrong_as_a_whole():
     cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
     known = calibrated(cell)
     (wrong,) = cell.wrong_views
-    problem = known.problem(known.candidates).with_effects([])
+    problem = known.fitted.agreed.problem.with_effects([])
     doubled = problem.observations.take(np.repeat(np.arange(20), 2))
-    found = agree(replace(problem, observations=doubled), list(range(40)), "eye-in-hand")
-    assert [it.view for it in found.rejections] == [2 * wrong, 2 * wrong + 1]
+    found = inliers(replace(problem, observations=doubled))
+    assert np.flatnonzero(~found.used).tolist() == [2 * wrong, 2 * wrong + 1]
 
 
 def looked_at_again(problem, times=2, seed=5):
@@ -94,34 +93,16 @@ def with_measured(problem, measured):
 @pytest.mark.parametrize("measured", [True, False], ids=["covariance unknown", "covariance known"])
 def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    problem = looked_at_again(known.problem(known.used).with_effects([]), times)
+    problem = looked_at_again(known.solved.problem.with_effects([]), times)
     if measured:
         unknown = np.zeros_like(problem.observations.covariance)
         seen = replace(problem.observations, covariance=unknown)
         problem = replace(problem, observations=seen, is_combined=True)
-    assert agree(problem, range(20 * times), "eye-in-hand").rejections == ()
+    assert inliers(problem).used.all()
     wrong = problem.observations.measured.copy()
     wrong[4 * times + 1] = problem.observations.measured[11 * times]
-    found = agree(with_measured(problem, wrong), range(20 * times), "eye-in-hand")
-    (rejected,) = found.rejections
-    assert rejected.view == 4 * times + 1
-    away = (
-        invert(problem.predicted(problem.start(found.frames))[4 * times + 1])
-        @ (wrong[4 * times + 1])
-    )
-    assert f"places the target {1e3 * np.linalg.norm(away[:3, 3]):.0f} mm" in rejected.reason
-    assert f"view {4 * times} of the same stop agrees" in rejected.reason
-
-
-def test_units_are_numbered_as_stops_are():
-    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    problem = looked_at_again(known.problem(known.used).with_effects([]))
-    stops = problem.observations.stops
-    np.testing.assert_array_equal(whole_units(problem), stops)
-    mixed = problem.observations.measured.copy()
-    mixed[9] = mixed[30]
-    units = whole_units(with_measured(problem, mixed))
-    np.testing.assert_array_equal(units, [*stops[:9], 5, *(stops[10:] + 1)])
+    found = inliers(with_measured(problem, wrong))
+    assert np.flatnonzero(~found.used).tolist() == [4 * times + 1]
 
 
 def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
@@ -134,7 +115,7 @@ def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
 
 def test_a_square_is_the_distance_from_what_the_others_predict():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
-    problem = known.problem(known.used).with_effects([])
+    problem = known.solved.problem.with_effects([])
     state = State(known.solved.state.edges, np.zeros(0))
     everything = np.ones(12, dtype=bool)
     fit = fit_problem(problem, state)
@@ -160,5 +141,5 @@ def test_rows_that_are_exchanged_and_an_image_of_another_row_are_named(mount):
     (words,) = [it for it in verdict.reasons if "exchanged" in it]
     assert words.startswith("Views 4 and 9 are exchanged: the image of each fits the pose in the")
     (words,) = [it for it in verdict.reasons if it.startswith("View 7 was left out")]
-    assert "it fits the pose of view 2: its pose or its image is wrong" in words
+    assert "its image is of stop 2; its pose or its image is wrong" in words
     assert set(known.reasons) == {4, 7, 9}

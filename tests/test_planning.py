@@ -50,7 +50,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
     q = simulate(options).joints
     factors = stop_factors(cell, HAND_EYE, q)
-    problem = seen.problem(seen.used)
+    problem = seen.fitted.part
     # The same corners at the plan's noise; exact ones count as seen to a millionth of a pixel.
     scale = (0.05 / max(seen.pixel_px, 1e-6)) ** 2
     views = replace(problem.observations, covariance=scale * problem.observations.covariance)
@@ -287,7 +287,7 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     world = worlds_of([begun.cell], HAND_EYE, cell.joints[:3], recorded=begun.recorded)[0]
     solved = found.known.solved
     # Values that are held cost by how far the data pull at them: that is told of data alone.
-    spread = solved.covariance - np.outer(solved.held, solved.held)
+    spread = solved.covariance - solved.beside.get("held_values", 0.0)
     sigmas = np.sqrt(np.diag(spread)[:6])
     # The plan's weak prior of 0.2 m and rad is all that differs.
     assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
@@ -312,11 +312,15 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     errors = known.robot_arm.errors
     assert (errors is None) == (case == "neighbours alike")
     assert errors is None or errors.is_estimated == (case == "estimated")
-    assert (known.diagnosis.inflation > 1.5) == (case == "neighbours alike")
+    alike = known.solved.misfits["robot"].alike
+    assert alike.is_significant == (case == "neighbours alike")
     begun, q = begin(found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q, 3).design
-    held = known.diagnosis.inflation * np.outer(known.solved.held, known.solved.held)
-    spread = known.solved.covariance - held
+    # Neither how far data pull at what is held nor how well the size of the arm's errors is known
+    # can be told beforehand.
+    beside = ("held_values", "size of arm errors")
+    untold = sum((known.solved.beside.get(it, 0.0) for it in beside), 0.0)
+    spread = known.solved.covariance - untold
     obtained = 1e3 * np.sqrt(np.trace(spread[3:6, 3:6]))
     world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
     # A result holds the board's size; in the plan it is open, and takes up errors of the arm.

@@ -26,7 +26,7 @@ from visioncal import align, calibrate
 from visioncal.calibration import Calibration, to_document
 from visioncal.chance import chi2_limit
 from visioncal.errors import DataError
-from visioncal.pipeline.result import run
+from visioncal.pipeline import run
 from visioncal.recording import board, write_recording
 from visioncal.report import write_report
 from visioncal.session import Session, corners

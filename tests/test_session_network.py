@@ -6,9 +6,9 @@ import pytest
 
 from visioncal.errors import DataError
 from visioncal.frames.touches import touches_of
-from visioncal.pipeline import run
 from visioncal.recording import write_recording
 from visioncal.session import Session
+from visioncal.session.single import check_one_of_each
 
 TOML = """schema = 1
 name = "two arms"
@@ -251,7 +251,7 @@ def test_what_takes_one_camera_and_robot_says_how_one_is_chosen(folder):
     with pytest.raises(
         DataError, match=r"several cameras \(left, right\) and several robots"
     ) as caught:
-        run(session)
+        check_one_of_each(session)
     assert "--robot" in caught.value.next_step
 
 
@@ -269,7 +269,7 @@ def test_boards_on_either_side_of_one_camera_are_for_align(tmp_path):
     with pytest.raises(
         DataError, match="and target_floor on cell; this takes boards on the flange"
     ):
-        run(session)
+        check_one_of_each(session)
 
 
 def test_one_camera_may_have_any_name_but_two_need_tables(tmp_path):

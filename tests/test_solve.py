@@ -26,7 +26,7 @@ LENS = pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens 
 
 def answered(given, **changes):
     known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
-    problem = known.problem(known.used)
+    problem = known.solved.problem
     return problem, fit_problem(problem, known.solved.state)
 
 

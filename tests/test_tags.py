@@ -9,7 +9,7 @@ from boards import any_page, printed
 
 from visioncal.errors import DataError
 from visioncal.finders import NotFound, find_target
-from visioncal.pipeline.result import run
+from visioncal.pipeline import run
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from arms import ERROR_RAD, NOISE, TOOL, arm_data, erring, problem_of
 from cells import calibrated
+from edges import solved
 from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
@@ -25,7 +26,6 @@ from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot
 from visioncal.robot.slopes import number_slopes, table_moves
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate
-from visioncal.stages.handeye import solve_hand_eye
 from visioncal.stages.tell import tell
 from visioncal.transforms import exp, invert, log
 
@@ -291,9 +291,7 @@ def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
         true = model.moved(ERROR_RAD * rng.normal(size=len(model.values)))
         noise = exp(rng.normal(size=(2, 25, 6)) * np.repeat(NOISE.robots[0], 3))
         flange = true.robot.base_from_flange(q) @ noise[0]
-        result = solve_hand_eye(
-            problem_of(model, "eye-in-hand", q, flange, noise[1]), "eye-in-hand"
-        )
+        result = solved(problem_of(model, "eye-in-hand", q, flange, noise[1]))
         found = model.moved(result.state.values)
         arm = replace(
             arm_data(robot, q),
@@ -335,8 +333,8 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     cell, known = calibrated_cell
     assert known.arm_found.telling.convention == "hayati"
     asked = replace(known, convention=convention)
-    (tell_again,) = (it for it in STAGES if it.name == "tell")
-    known = tell_again.run(asked)
+    (examine_again,) = (it for it in STAGES if it.name == "examine")
+    known = examine_again.run(asked)
     found = json.loads(json.dumps(result_of(known).stages["kinematics"], allow_nan=False))
     assert found["convention"] == convention
     changes = {(it["joint"], it["name"]): it for it in found["parameters"]}

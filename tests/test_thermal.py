@@ -17,8 +17,6 @@ from visioncal.calibration import Calibration
 from visioncal.errors import DataError, DegenerateError
 from visioncal.exports import document
 from visioncal.pipeline import calibrate
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
 from visioncal.recording import paths, write_recording
 from visioncal.report.page import render
 from visioncal.robot import load_robot
@@ -396,14 +394,7 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
 
 def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
     found = learnt["temperatures"]
-    known = replace(Known(found.session), used=tuple(range(len(found.session.views))))
-    for stage in STAGES[:5]:
-        known = stage.run(known)
     # 24 views and then six again, every five minutes; the poses that are told are the same ones.
     assert len(np.unique(found.truth.cell.base_from_flange, axis=0)) == 24
-    assert len(np.unique(known.stops_of(known.used))) == len(found.session.views)
-    at_once = tuple(
-        replace(it, numbers={**it.numbers, "stamp_s": 4.0}) for it in found.session.views
-    )
-    together = replace(known, session=replace(found.session, views=at_once))
-    assert len(np.unique(together.stops_of(known.used))) == 24
+    stations = {it.station for it in found.session.observations}
+    assert len(stations) == len(found.session.views)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from cells import known_of
 
+from visioncal.pipeline.evident import view_evidence
 from visioncal.pipeline.known import Known
 from visioncal.pipeline.result import result_of
 from visioncal.pipeline.steps import STAGES
-from visioncal.pipeline.views import view_evidence, view_results
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
 
 HELD = (3, 8, 21, 30)
@@ -63,7 +63,7 @@ def test_views_left_out_add_up_to_the_levels_figures(known):
 def test_views_held_back_are_predicted_by_both_arms(known):
     rows = result_of(known).stages["kinematics"]["holdout"]
     assert tuple(it["view"] for it in rows) == HELD
-    shown = {it.view: it for it in view_results(known)}
+    shown = {it.view: it for it in known.solved.sights}
     for it in rows:
         # Against the target's estimated place here, against the views' mean there: some 0.01 mm.
         assert it["mm"] == pytest.approx(shown[it["view"]].residual_mm, abs=0.03)

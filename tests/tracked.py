@@ -27,7 +27,7 @@ def known_of(session: Session, **changes) -> Known:
 def errors_of(shop: Shop, known: Known) -> FloatArray:
     """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
     true = np.array([shop.base_from_instrument, shop.flange_from_probe])
-    return log(invert(true) @ known.solved.state.edges).ravel()
+    return log(invert(true) @ known.solved.state.edges[:2]).ravel()
 
 
 def solved_of(session: Session, **changes) -> Known:
@@ -35,8 +35,6 @@ def solved_of(session: Session, **changes) -> Known:
     known = replace(Known(session), **({"level": "hand-eye"} | changes))
     for stage in STAGES:
         known = stage.run(known)
-        if stage.name == "hand-eye":
-            break
     return known
 
 

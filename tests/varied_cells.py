@@ -469,8 +469,13 @@ def _square_px(lens: Lens, kind: str, size: tuple[int, int], fill: float) -> flo
     return float(np.min(fill * np.sort(lens.resolution) / sides))
 
 
+def _is_drawn(path: Path) -> bool:
+    """Whether this walk draws boards of its kind; grids of tags and of circles are none of them."""
+    return tomllib.loads(path.read_text(encoding="utf-8"))["kind"] in LEAST_SQUARE_PX
+
+
 def _shipped(rng: np.random.Generator, lens: Lens) -> tuple[Print, float] | None:
-    path = rng.choice(sorted(SHIPPED.glob("*.toml")))
+    path = rng.choice(sorted(it for it in SHIPPED.glob("*.toml") if _is_drawn(it)))
     document = tomllib.loads(path.read_text(encoding="utf-8")) | {"file": path.stem}
     kind = document["kind"]
     size = (1, 1) if kind == "marker" else (document["columns"], document["rows"])

@@ -31,7 +31,7 @@ STOPS = 200
 PLAIN = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 WRONG_ARM = replace(PLAIN, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)
 # Stages whose time is named by itself.
-NAMED = ("agree", "refine", "hand-eye", "kinematics", "diagnose")
+NAMED = ("solve", "examine")
 
 
 def seconds_of(options: CellOptions, *, joints: bool) -> dict[str, float]:

@@ -317,24 +317,29 @@ def healthy(seed: int) -> float:
 
 def real_folds(path: Path, repeats: int) -> tuple[float, float]:
     """Held-out position [mm] and rotation [deg] of the board, rms over repeated 5-fold."""
+    from visioncal.estimation.parts import State
     from visioncal.pipeline.known import Known
+    from visioncal.pipeline.solving import solve
     from visioncal.pipeline.steps import STAGES
+    from visioncal.stages.cell import read_cell
 
     session = Session.load(path)
     seen = Known(session)
     for stage in STAGES:
-        if stage.name in ("robot", "detect", "intrinsics", "pnp", "choose"):
+        if stage.name in ("robot", "detect", "intrinsics", "pnp"):
             seen = stage.run(seen)
-    views, away = np.array(seen.used), []
+    cell, away = read_cell(seen), []
+    whole = solve(cell, seen, "hand-eye")
+    views = np.array([it.view for it in whole.cell.rows])[whole.agreed.used]
+    problem = whole.part.with_effects([])
     rng = np.random.default_rng(0)
     for _ in range(repeats):
         for fold in np.array_split(rng.permutation(len(views)), 5):
-            fitted = replace(seen, used=tuple(np.delete(views, fold).tolist()))
-            for stage in STAGES:
-                if stage.name in ("look", "agree", "refine", "hand-eye"):
-                    fitted = stage.run(fitted)
-            left = fitted.problem(views[fold].tolist())
-            away.append(log(left.change_of(left.observations.observed[0], fitted.solved.state)))
+            part = cell.without(dict.fromkeys(views[fold].tolist(), "left out"))
+            edges = solve(part, seen, "hand-eye").agreed.fit.state.edges
+            left = problem.subset(np.isin(np.arange(len(views)), fold))
+            state = State(edges, np.zeros(0))
+            away.append(log(left.change_of(left.observations.observed[0], state)))
     error = np.concatenate(away)
     return (
         1e3 * float(np.sqrt(np.mean(np.sum(error[:, 3:] ** 2, axis=1)))),

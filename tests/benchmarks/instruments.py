@@ -186,7 +186,7 @@ def example(size: float, seed: int) -> Tracked:
 def before_mm(size: float, seed: int) -> float:
     """How far the nominal arm is off at its stops, frames fitted [mm]."""
     known = solved_of(session_of(tracked(example(size, seed))), level="hand-eye")
-    nominal = known.problem(known.used).with_effects([])
+    nominal = known.solved.problem.with_effects([])
     fit = fit_problem(nominal, State(known.solved.state.edges, np.zeros(0)))
     place = nominal.change_of(nominal.observations.observed[0], fit.state)[:, :3, 3]
     return 1e3 * rms(np.linalg.norm(place, axis=1))
@@ -269,7 +269,8 @@ def nominal_fit(known: Known) -> FloatArray:
     """(4, 4) the instrument's frame as the nominal arm has it."""
     readings = known.readings
     flange = {view: known.base_from_flange[view] for view in known.used}
-    seen = readings.places(known.used, flange, known.stops)
+    stops = np.unique(known.solved.problem.observations.stops, return_inverse=True)[1]
+    seen = readings.places(known.used, flange, stops)
     return fit_mounting(seen, None, len(readings.names)).base_from_instrument
 
 

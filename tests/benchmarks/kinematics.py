@@ -26,7 +26,6 @@ from visioncal.pipeline.known import Known
 from visioncal.pipeline.steps import STAGES
 from visioncal.simulation import Cell, CellOptions, simulate
 from visioncal.stages import kinematics as levels
-from visioncal.stages.refine import held
 
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -83,12 +82,13 @@ def dirty(options: CellOptions) -> tuple[float, ...]:
 
 def without_blocks(cell: Cell, **changes: object) -> Known:
     """The same way with a flat board, the lens as stated and no eccentricity."""
-    known, all_levels = known_of(cell, **changes), levels.LEVELS
+    told = known_of(cell).session
+    camera = told.document["camera"] | {"intrinsics": "hold"}
+    session = replace(told, document=told.document | {"camera": camera})
+    known, all_levels = known_of(cell, session=session, **changes), levels.LEVELS
     levels.LEVELS = {it: all_levels[it] for it in ("offsets", "geometry")}
     for stage in STAGES:
-        if stage.name == "look":
-            known = replace(known, free=held(known.scene))
-        elif stage.name not in ("robot", "detect"):
+        if stage.name not in ("robot", "detect"):
             known = stage.run(known)
     levels.LEVELS = all_levels
     return known
@@ -97,14 +97,18 @@ def without_blocks(cell: Cell, **changes: object) -> Known:
 def corners_alone(known: Known) -> Known:
     """The same unknowns with the robot's stops taken for exact: a fit of reprojection alone."""
     exact = Noise.of_robot(1e-6, 1e-6)
+    arm, problem, state = known.robot_arm, known.solved.problem, known.solved.state
     for _ in range(6):
-        problem, fit = known.problem(known.used), known.solved.fit
-        problem = problem.merged(problem.of_one_stop)
-        state = State(fit.state.edges, problem.start_values)
-        state = solve_problem(problem, state, exact)[0]
-        solved = replace(known.solved, problem=problem, fit=replace(fit, state=state))
-        known = replace(known, calibrated=known.robot_arm.moved(problem, state)[0], hand_eye=solved)
-    return known
+        state = solve_problem(problem, State(state.edges, problem.start_values), exact)[0]
+        arm = arm.moved(problem, state)[0]
+        problem = arm.put_into(problem)
+    agreed = known.fitted.agreed
+    fitted = replace(
+        known.fitted,
+        arms={arm.robot: arm},
+        agreed=replace(agreed, fit=replace(agreed.fit, state=state)),
+    )
+    return replace(known, fit=fitted, answer=replace(known.answer, solved=fitted))
 
 
 def ideal_row(words: str, options: CellOptions, found: np.ndarray) -> str:

@@ -90,8 +90,8 @@ def _calibrated(folder: Path) -> Accuracy | None:
     except VisioncalError:
         # Too little as yet; why is told when the session is calibrated.
         return None
-    if known.hand_eye is None:
+    if known.answer is None:
         return None
-    spread = known.hand_eye.covariance[:6, :6]
+    spread = known.answer.covariance[:6, :6]
     place, turn = float(np.trace(spread[3:, 3:])), float(np.trace(spread[:3, :3]))
     return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))

@@ -16,7 +16,9 @@ from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_of
 from visioncal.joining import leftover
 from visioncal.outputs import write_outputs
-from visioncal.pipeline import check_whole, run, run_dense
+from visioncal.pipeline import run, run_dense
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.running import check_dense, check_solver
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell
@@ -74,7 +76,9 @@ def calibrate_command(
     """
     loaded = Session.load(session).needing(need_mm, need_deg)
     if is_whole_cell(loaded):
-        check_whole(solver, dense=dense)
+        check_solver(Known(loaded, solver=solver))
+        if dense:
+            check_dense(Known(loaded))
         found = align_into(session, loaded, out, level=level, convention=convention, quiet=as_json)
         document = whole_document(found)
         if as_json:

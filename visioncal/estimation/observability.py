@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.errors import DegenerateError
 from visioncal.estimation.chain import edge_names, robot_part
 from visioncal.estimation.linalg import covariance_among, spectrum
-from visioncal.estimation.parts import ROBOT, Noise, State
+from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.figures import figure
@@ -196,7 +196,7 @@ def frame_directions(
 def _scene(problem: Problem, mount: Mount) -> Scene:
     """How messages speak of one camera and one robot."""
     stops = np.unique(problem.observations.stops)
-    flange = problem.poses[ROBOT][stops]
+    flange = problem.poses[problem.robots[0]][stops]
     views, names = f"{len(stops)} used views", _names(problem, mount)
     further = tuple(names)[2:]
 
@@ -270,7 +270,8 @@ def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
     culprit = f"the {_sensor(mount)}'s offset from the {_frame(mount)}"
     cause = "it takes two different axes of rotation between views to determine it"
     if len(stops) == 2:
-        axis = _main_axis(_turns(robot_part(problem.poses[ROBOT][stops], mount)))
+        flange = problem.poses[problem.robots[0]][stops]
+        axis = _main_axis(_turns(robot_part(flange, mount)))
         culprit += f" along the {_frame(mount)}'s {axis_words(axis)}"
         cause = f"two views share that axis of rotation, and {cause}"
     found = f"{len(stops)} usable stops of the robot"

@@ -139,11 +139,9 @@ def agree(problem: Problem, state: State | None = None, movable: Sequence[str] =
         state: A start; None where a closed form gives one (see `closed_form`).
         movable: Unknown frames that may have moved.
     """
-    used, fit = _core(
-        problem, state, _early(problem) if movable else np.ones(len(problem), dtype=bool)
-    )
     if not movable:
-        return _agreed(problem, used, fit, ())
+        return inliers(problem, state)
+    used, fit = _core(problem, state, _early(problem))
     moves: list[Move] = []
     used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
@@ -185,6 +183,8 @@ def _without_needless(found: Agreed) -> Agreed:
 def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     """Settles what agrees one by one, and what moved by less than single observations tell."""
     problem, moves = agreed.problem, list(agreed.moves)
+    if not movable:
+        return inliers(problem, agreed.fit.state, agreed.used)
     used, fit = _settled(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
         slight = slight_move(problem.subset(used), fit, movable)
@@ -230,13 +230,14 @@ def closed_form(problem: Problem, rows: IntArray) -> State | None:
     if len(paths) != 1 or not problem.observations.has_rotation.all() or problem.points:
         return None
     steps = paths[0]
-    if [it.frame in problem.unknown for it in steps] != [True, False, True]:
+    ends, between = (steps[0], steps[-1]), steps[1:-1]
+    are_all = problem.unknown.keys() == {it.frame for it in ends}
+    if not are_all or sum(bool(it.robot) for it in between) != 1:
         return None
-    poses = problem.poses[steps[1].robot][problem.observations.stops[rows]]
-    found = SOLVERS["park"](
-        poses if steps[1].is_up else invert(poses), problem.observations.measured[rows]
-    )
-    edges = {steps[0].frame: found.x, steps[2].frame: found.z}
+    nowhere = State(np.zeros((0, 4, 4)), problem.start_values)
+    robot = invert(problem.product(between, nowhere, rows))
+    found = SOLVERS["park"](robot, problem.observations.measured[rows])
+    edges = {ends[0].frame: found.x, ends[1].frame: found.z}
     return State(np.array([edges[it] for it in problem.unknown]), problem.start_values)
 
 

@@ -414,7 +414,8 @@ class Problem:
         known = self.tree.branches[step.frame].known
         return state.edges[self.unknown[step.frame]] if known is None else known
 
-    def _product(self, path: tuple[Step, ...], state: State, rows: IntArray) -> FloatArray:
+    def product(self, path: tuple[Step, ...], state: State, rows: IntArray) -> FloatArray:
+        """(m, 4, 4) the product of some steps' edges at some observations."""
         product = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
         for step in path:
             edge = self._edge(step, state, rows)
@@ -423,13 +424,13 @@ class Problem:
 
     def between(self, first: str, second: str, state: State, rows: IntArray) -> FloatArray:
         """The (m, 4, 4) `first_from_second` of two frames at some observations."""
-        return self._product(self.tree.path(first, second), state, rows)
+        return self.product(self.tree.path(first, second), state, rows)
 
     def predicted(self, state: State) -> FloatArray:
         """The (n, 4, 4) `observer_from_observed` that the unknowns and the robots predict."""
         found = np.zeros((len(self), 4, 4))
         for group in self.groups:
-            found[group.rows] = self._product(group.path, state, group.rows)
+            found[group.rows] = self.product(group.path, state, group.rows)
         return found
 
     def measured(self, state: State) -> FloatArray:
@@ -549,7 +550,7 @@ class Problem:
             if frame not in frames:
                 continue
             at = frames.index(frame)
-            step, rest = group.path[at], self._product(group.path[at + 1 :], state, group.rows)
+            step, rest = group.path[at], self.product(group.path[at + 1 :], state, group.rows)
             if step.is_up:
                 carry = invert(self._edge(step, state, group.rows)) @ rest
                 asked[group.rows] = carry @ invert(error[group.rows]) @ invert(carry)

@@ -1,16 +1,17 @@
 """Calibrating a session of any cell: of one camera and one robot, or of many."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError
+from visioncal.calibration import Alignment, Calibration
 from visioncal.pipeline.denser import run_dense
-from visioncal.pipeline.result import run
-from visioncal.pipeline.whole import align
+from visioncal.pipeline.result import result_of
+from visioncal.pipeline.running import check_dense, known_at_first, run_steps
+from visioncal.pipeline.whole import alignment_of
 from visioncal.robot import Convention
 from visioncal.session import Session
-from visioncal.session.single import is_whole_cell
-from visioncal.types import Progress, SolverName
+from visioncal.types import Corners, Progress, SolverName
 
 
 def calibrate(
@@ -55,41 +56,49 @@ def calibrate(
         DegenerateError: The motion leaves a direction of the answer open.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    loaded = session if isinstance(session, Session) else Session.load(session)
-    loaded = loaded.needing(need_mm, need_deg)
-    if is_whole_cell(loaded):
-        check_whole(solver, dense=dense)
-        found = align(loaded, level=level, convention=convention, progress=progress)
-        return Calibration.whole(found)
+    known = known_at_first(session, progress, solver=solver, level=level, convention=convention)
+    needing = replace(known, session=known.session.needing(need_mm, need_deg))
     if dense:
+        check_dense(needing)
         return run_dense(
-            loaded,
+            needing.session,
             device=device,
             solver=solver,
             level=level,
             convention=convention,
             progress=progress,
         ).calibration
-    return run(
-        loaded, solver=solver, level=level, convention=convention, progress=progress
-    ).calibration
+    return result_of(run_steps(needing))
 
 
-def check_whole(solver: SolverName, *, dense: bool = False) -> None:
-    """Refuses what is not asked of a whole cell.
+def align(
+    session: Session | Path | str,
+    *,
+    level: str = "auto",
+    convention: Convention | None = None,
+    need_mm: float | None = None,
+    need_deg: float | None = None,
+    corners: Mapping[int, Corners] | None = None,
+    progress: Progress | None = None,
+) -> Alignment:
+    """Calibrates a whole cell, and gives its result in the older form; see `calibrate`.
+
+    Args:
+        session: A session, or the path of its folder or recording.
+        level: How far each arm is calibrated; beyond `hand-eye` it takes joint angles and a model.
+        convention: Of the joint table in which calibrated arms' numbers are told.
+        need_mm: How near picks have to come [mm], in the place of what `[need]` declares.
+        need_deg: The same in rotation [deg].
+        corners: What was found in its images before, by view; None to look.
+        progress: Told of long work.
+
+    Returns:
+        All frames with their joint covariance, and the verdict.
 
     Raises:
-        DataError: A whole cell is not calibrated that way.
+        DataError: The input is wrong or shows no target.
+        DegenerateError: A robot is tied to nothing, or the observations leave a frame open.
     """
-    if solver != "joint":
-        raise DataError(
-            f"solver {solver} cannot be asked of a whole cell: it has the joint solver.",
-            culprits=["--solver"],
-            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
-        )
-    if dense:
-        raise DataError(
-            "dense corners cannot be asked of a whole cell.",
-            culprits=["--dense"],
-            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
-        )
+    known = known_at_first(session, progress, level=level, convention=convention)
+    needing = known.session.needing(need_mm, need_deg)
+    return alignment_of(run_steps(replace(known, session=needing, found_before=corners)))

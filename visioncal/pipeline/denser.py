@@ -10,7 +10,7 @@ from visioncal.calibration import Calibration, Rms
 from visioncal.dense.library import chosen_device
 from visioncal.errors import DataError, VisioncalError
 from visioncal.figures import figure
-from visioncal.pipeline.result import Run, run
+from visioncal.pipeline.running import Run, run
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.stages.dense import Dense, explained

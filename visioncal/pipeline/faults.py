@@ -22,8 +22,8 @@ _FEWEST_STOPS, _ALIKE = 3, 0.5
 _FEWEST = 2
 
 
-# So many views of a fault are named.
-_LISTED = 8
+# So many views of a fault are named, and so many stops that an observation fits.
+_LISTED, _NAMED = 8, 3
 
 
 @dataclass(frozen=True)
@@ -136,10 +136,26 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     out = np.flatnonzero(~solved.agreed.used)
     if not len(out):
         return ()
+    mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
+    if solved.cell.mount is not None:
+        return tuple(_exchanged_views(solved, mutual))
     found = _pushed_bases(solved)
-    found += _exchanged(solved, exchanged(solved.agreed.problem, _fitting(solved, out)))
+    found += _exchanged(solved, mutual)
     explained = {row for it in found for row in it.rows}
     return (*found, *_wrong_poses(solved, explained))
+
+
+def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+    """Pairs of views of one camera, each of which fits the pose of the other."""
+    rows = solved.cell.rows
+    for first, second in sorted(mutual.items()):
+        if first < second:
+            words = (
+                f"Views {rows[first].view} and {rows[second].view} are exchanged: the image of "
+                "each fits the pose in the other's row. They were left out: exchange them in "
+                "views.csv, and calibrate again."
+            )
+            yield PoseFault(words, (first, second))
 
 
 def by_way_of(problem: Problem, robot: str) -> Mask:
@@ -220,36 +236,68 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
 
 def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
     """Why observations that disagree are left out, by view, with what they fit instead."""
-    agreed, rows = solved.agreed, solved.cell.rows
+    agreed, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
     out = np.flatnonzero(~agreed.used)
     if not len(out):
         return {}
     away = residuals(solved)[out]
+    counted = np.maximum(agreed.distances.directions, 1)
+    times, limit = (
+        np.sqrt(it / counted) for it in (agreed.distances.squares, agreed.distances.limit)
+    )
     fitting = _fitting(solved, out)
-    mutual = exchanged(solved.agreed.problem, fitting)
+    mutual = exchanged(problem, fitting)
     robots = {row: it.short for it in faults if it.short for row in it.rows}
+    rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
     found = {}
     for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
-        words = f"disagrees with the rest of the cell by {figure(mm)} mm"
-        if solved.agreed.problem.observations.has_rotation[at]:
-            words += f" and {figure(deg)} deg"
+        turned = f" and {figure(deg)} deg" if problem.observations.has_rotation[at] else ""
+        cause = _cause(solved, at)
         if at in robots:
-            words += f": {robots[at]}"
+            cause = robots[at]
         elif at in mutual:
             other = rows[mutual[at]]
-            words += (
-                f": it fits stop {_stop(solved, mutual[at])}, and view {other.view} fits stop "
+            cause = (
+                f"it fits stop {_stop(solved, mutual[at])}, and view {other.view} fits stop "
                 f"{_stop(solved, at)}: these two rows are exchanged"
             )
         elif at in fitting:
-            stops = [solved.cell.stops[it] for it in fitting[at]]
-            words += (
-                f": its image is of stop {stops[0]}"
-                if len(stops) == 1
-                else (f": its image is of another stop, as {', '.join(map(str, stops[:3]))}")
-            )
-        found[rows[at].view] = words
+            stops = [str(solved.cell.stops[it]) for it in fitting[at][:_NAMED]]
+            one = "stop" if len(stops) == 1 else "another stop, as"
+            cause = f"its image is of {one} {', '.join(stops)}; {cause}"
+        found[rows[at].view] = (
+            f"disagrees with {rest}: it places {_called(solved, rows[at].seen)} {figure(mm)} mm"
+            f"{turned} away, {figure(times[at])} times the noise (limit {figure(limit[at])}); "
+            f"{cause}"
+        )
     return found
+
+
+def _called(solved: Solved, frame: str) -> str:
+    """A target or point in words."""
+    if solved.cell.mount is None:
+        return frame.partition("@")[0]
+    is_probe = frame.startswith("point") and frame not in solved.agreed.problem.points
+    return "the probe" if is_probe else f"the {frame.partition('_')[0]}"
+
+
+def _cause(solved: Solved, at: int) -> str:
+    """What is wrong with an observation, by those of its stop and its target that agree."""
+    rows, used, problem = solved.cell.rows, solved.agreed.used, solved.agreed.problem
+    seen = np.array(problem.observations.observed)
+    of_its_target = np.flatnonzero((seen == seen[at]) & used)
+    reading = "reading" if rows[at].seer.startswith("instrument") else "image"
+    if len(of_its_target) == 1 and len(set(seen.tolist())) > 1:
+        other = rows[of_its_target[0]].view
+        return f"it and view {other} alone show this target, and either may be wrong"
+    stops = problem.observations.stops
+    mates = np.flatnonzero((stops == stops[at]) & used)
+    if len(mates):
+        return (
+            f"view {rows[mates[0]].view} of the same stop agrees: the {reading} is wrong, or "
+            "something moved in between"
+        )
+    return f"its pose or its {reading} is wrong, or something had moved"
 
 
 def _stop(solved: Solved, row: int) -> int:

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.estimation.appearance import LENS_AND_BOARD
 from visioncal.estimation.arm import misfit_slopes
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.parts import ROBOT
+from visioncal.estimation.effects.lenses import LENSES
 from visioncal.pipeline.known import Known
+from visioncal.session import frame_name
 from visioncal.targets import target_document
 from visioncal.transforms import adjoint, invert
 from visioncal.types import FloatArray
@@ -24,14 +24,16 @@ def fit_document(known: Known) -> dict[str, Any] | None:
     open about them, where further boards lie from the first, and the arm's errors. What is open
     about clocks and about drift with temperature counts in their covariance.
     """
-    if known.readings is not None:
+    if known.mount == "instrument":
         return None
-    names, looks = tuple(known.session.boards), known.free
+    boards, seen = known.session.boards, known.fitted.seen
+    placed = known.solved.problem.unknown
+    names = [it for it in boards if len(boards) < 2 or frame_name("target", it) in placed]
     arm = _arm(known)
     return {
-        "targets": {name: target_document(it) for name, it in known.session.boards.items()},
-        "boards": [names[it] for it in known.boards] if names else [""],
-        "looks": [] if looks is None else looks.columns.tolist(),
+        "targets": {name: target_document(it) for name, it in boards.items()},
+        "boards": names or [""],
+        "looks": [] if seen is None else seen.free.tolist(),
         **({} if arm is None else {"arm": arm}),
         "covariance": _covariance(known).tolist(),
     }
@@ -55,7 +57,10 @@ def _arm(known: Known) -> dict[str, Any] | None:
         return None
     count = errors.basis.shape[2]
     # Errors that only count are where they were stated; those of a model are in its arm already.
-    values = known.solved.state.values[-count:] if errors.is_estimated else np.zeros(count)
+    problem, name = known.solved.problem, f"arm of {arm.robot}"
+    linearised = problem.start({it: np.eye(4) for it in problem.unknown})
+    values = problem.values_of(name, known.solved.state) - problem.values_of(name, linearised)
+    values = values if errors.is_estimated else np.zeros(count)
     if model is None:
         of = "links" if arm.is_modelled else "poses"
         return {"of": of, "values": values.tolist()}
@@ -85,13 +90,14 @@ def _by_stop(model: ArmModel) -> dict[str, Any]:
 
 def _covariance(known: Known) -> FloatArray:
     """The fit's own, and beside it what it has in common with errors that only count in it."""
-    result, errors, diagnosis = known.solved, known.arm_at_stops.errors, known.diagnosis
-    written = _written(known)
-    own = written @ result.covariance @ written.T
-    if errors is None or errors.is_estimated or diagnosis is None:
+    answer, arm, written = known.solved, known.robot_arm, _written(known)
+    own = written @ answer.covariance @ written.T
+    if arm.errors is None or arm.errors.is_estimated:
         return own
-    slopes = written @ misfit_slopes(result.problem, result.state, result.noise, ROBOT, errors)
-    size, variance = slopes.shape[1], diagnosis.inflation * errors.sigma**2
+    slopes = written @ misfit_slopes(
+        answer.problem, answer.state, answer.noise, arm.robot, arm.errors
+    )
+    size, variance = slopes.shape[1], arm.errors.sigma**2
     # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
     between = -variance * slopes
     return np.block([[own, between], [between.T, variance * np.eye(size)]])
@@ -109,6 +115,6 @@ def _written(known: Known) -> FloatArray:
         rows[6:12] - adjoint(invert(placed[0]) @ placed[at]) @ rows[6 * at + 6 : 6 * at + 12]
         for at in range(1, len(placed))
     ]
-    nothing, arm = slice(0, 0), f"arm of {ROBOT}"
-    looks, errors = (problem.effect_columns.get(it, nothing) for it in (LENS_AND_BOARD, arm))
+    nothing, arm = slice(0, 0), f"arm of {known.robot_arm.robot}"
+    looks, errors = (problem.effect_columns.get(it, nothing) for it in (LENSES, arm))
     return np.concatenate([rows[:12], rows[looks], *further, rows[errors]])

@@ -67,7 +67,7 @@ def guess_seen(seen: Known, robot: PoseNumbers | None = None) -> Guess:
     )
     if robot is None:
         told = numbers_in(seen.session, POSE)
-        robot = told_or_chained(told if seen.clock is None else _told_in_time(seen), chain)
+        robot = told_or_chained(_told_in_time(seen) if seen.clocks else told, chain)
     is_measured, mount = bool(seen.corners), seen.session.mount
     for camera in _seen_ways(seen, robot):
         guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
@@ -147,7 +147,7 @@ def is_suspect(known: Known) -> bool:
     verdict, findings = known.verdict, known.findings
     if verdict is None or findings is None or verdict.status == "good":
         return False
-    out = known.agreed is not None and not known.agreed.mask.all()
+    out = not known.fitted.agreed.used.all()
     return out or is_scattered(findings) or known.robot is not None
 
 

@@ -1,6 +1,7 @@
-"""What a whole cell is judged by: its cameras, robots and targets, and its weakest link."""
+"""What a session is judged by: its cameras, robots and targets, and its weakest link."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -8,81 +9,143 @@ from visioncal.calibration import HELD_BACK, Edge, Sight
 from visioncal.calibration.whole import holdout_rms, left_out_rms, rms_of, view_results
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
+from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
     Direction,
     Scene,
     check_determined,
+    check_observability,
+    directions,
     edge_directions,
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.figures import figure
 from visioncal.files import some_of
-from visioncal.pipeline.faults import PoseFault, by_way_of
-from visioncal.pipeline.solving import Solved
-from visioncal.pipeline.ties import robot_motion
+from visioncal.pipeline.answer import Answer
+from visioncal.pipeline.budget import columns_of_boards, middles_of
+from visioncal.pipeline.faults import by_way_of, moved_words
+from visioncal.pipeline.known import Known
+from visioncal.pipeline.robots import doubts_of_arms, notes_on_arms
+from visioncal.pipeline.ties import robot_motion, untied_words
 from visioncal.stages.cell import Cell
 from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor
-from visioncal.stages.need import Picks
-from visioncal.types import Mask, Rejection
+from visioncal.stages.need import Fitted, picks_of
+from visioncal.stages.priors import prior_words
+from visioncal.types import Mask, Mount, Rejection
 
 
-def findings_of(
-    solved: Solved,
-    sights: Sequence[Sight],
-    faults: Sequence[PoseFault],
-    edges: Mapping[str, Edge],
-    budget_mm: Mapping[str, Mapping[str, float]],
-    noise: Mapping[str, Mapping[str, float]],
-    *,
-    workspace_mm: Mapping[str, float],
-    spared: Collection[int],
-    warnings: Sequence[str],
-    notes: Sequence[str],
-    picks: Sequence[Picks] = (),
-) -> Findings:
-    """Puts together what a whole cell is judged by.
-
-    Args:
-        solved: The fit.
-        sights: What became of each observation.
-        faults: What of them wrong poses of robots explain.
-        edges: The transforms by the frames that they place.
-        budget_mm: What these are uncertain by, by source.
-        noise: Estimated standard deviations, by frame or robot.
-        workspace_mm: Of each calibrated arm, the predicted sigma of a tool's place, in the median.
-        spared: Views that are not needed, and those that are held back.
-        warnings: Reasons for doubt that were found before.
-        notes: What is good to know.
-        picks: What picks err by.
-    """
+def findings_of(known: Known) -> Findings:
+    """Puts together what a session is judged by."""
+    answer, solved = known.solved, known.fitted
     tree = solved.cell.tree
-    tied = [it for it in sights if {it.seer, it.seen} <= tree.branches.keys()]
-    explained = {solved.cell.rows[row].view for it in faults for row in it.rows}
-    directions = [
-        it for frame, edge in edges.items() for it in _directions(solved.cell, frame, edge)
+    tied = [it for it in answer.sights if {it.seer, it.seen} <= tree.branches.keys()]
+    explained = {solved.cell.rows[row].view for it in answer.faults for row in it.rows}
+    worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
+    of_rest = [
+        *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
+        *solved.found_of_looks(),
     ]
     return Findings(
-        _pairs(tied, explained),
-        _sensors(tied, noise, spared),
-        _arms(solved, noise, workspace_mm),
-        sorted(directions, key=lambda it: (it.is_rotation, -it.sigma)),
-        [
-            Place(frame, budget_mm[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
-            for frame, edge in edges.items()
-        ],
-        (*(it.words for it in faults), *warnings),
-        notes,
-        "instrument" if all(it.seer.startswith("instrument") for it in tied) else "eye-to-hand",
-        solved.cell.session.need,
-        picks,
+        _pairs(tied, explained, alone=known.mount is not None),
+        _sensors(tied, answer.sigmas, known.spared.keys() | known.held_back),
+        _arms(answer),
+        worst,
+        places,
+        (
+            *(it.words for it in answer.faults),
+            *doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked),
+            *known.warnings,
+            *(words for words, is_doubt in of_rest if is_doubt),
+            *warnings,
+            *_untied(known),
+        ),
+        (
+            *known.notes,
+            *_clock_words(known),
+            *notes_on_arms(solved.arms, answer.arms),
+            *(words for words, is_doubt in of_rest if not is_doubt),
+        ),
+        known.mount or _mount(tied),
+        known.session.need,
+        picks_of(_pickable(known), known.session.need),
     )
 
 
-def _pairs(sights: Sequence[Sight], explained: Collection[int]) -> list[Pair]:
+def _pickable(known: Known) -> Fitted:
+    """What picks are predicted from."""
+    answer, solved = known.solved, known.fitted
+    freedom = [freedom_of(it.tolist()) for it in answer.intervals]
+    return Fitted(
+        answer.problem,
+        answer.state,
+        answer.noise,
+        answer.covariance,
+        answer.held_out,
+        middles_of(solved.cell),
+        dict(zip(answer.problem.robots, freedom, strict=True)),
+        solved.arms,
+        columns_of_boards(solved),
+        answer.problem,
+    )
+
+
+def _untied(known: Known) -> Iterator[str]:
+    for frame in known.fitted.untied:
+        if known.mount is not None and frame.startswith("target"):
+            yield f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
+        else:
+            yield f"{frame} is tied to nothing. {untied_words(known.cell, frame)}"
+
+
+_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[Place], Sequence[str]]
+
+
+def _of_pair(known: Known) -> _Parts:
+    """The worst directions and the place of work of one camera and one robot."""
+    answer, work = known.solved, known.work
+    budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
+    place = Place("Where the views look, a point", budget, work.radius95_mm)
+    mount = known.session.mount
+    return directions(answer.problem, answer.state, answer.covariance, mount), [place], ()
+
+
+def _of_cell(known: Known) -> _Parts:
+    """The worst directions and the frames of a whole cell, and what moved in it."""
+    answer, solved = known.solved, known.fitted
+    edges, budget = answer.last_edges, answer.budget_mm
+    worst = [it for frame, edge in edges.items() for it in _directions(solved.cell, frame, edge)]
+    return (
+        sorted(worst, key=lambda it: (it.is_rotation, -it.sigma)),
+        [
+            Place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
+            for frame, edge in edges.items()
+        ],
+        [moved_words(it) for it in answer.moved],
+    )
+
+
+def _mount(sights: Sequence[Sight]) -> Mount:
+    is_read = all(it.seer.startswith("instrument") for it in sights)
+    return "instrument" if is_read else "eye-to-hand"
+
+
+def _clock_words(known: Known) -> Iterator[str]:
+    """Says what the fit makes of clocks that the motion told."""
+    for pair, clock in known.solved.clocks(known).items():
+        if known.mount is None and clock is not known.clocks[pair].clock:
+            yield (
+                f"{pair.words}: the fit of the whole cell has the camera's clock "
+                f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
+                f"{1e3 * clock.sigma_s:.2g} ms)."
+            )
+
+
+def _pairs(sights: Sequence[Sight], explained: Collection[int], *, alone: bool) -> list[Pair]:
+    """What each camera saw of each target; of one camera and one robot, all that there is."""
     rows: dict[tuple[str, str], list[Sight]] = {}
     for it in sights:
-        rows.setdefault((it.seer, it.seen), []).append(it)
+        rows.setdefault(("", "") if alone else (it.seer, it.seen), []).append(it)
     return [
         Pair(
             view_results(mine),
@@ -129,40 +192,40 @@ def _sensors(
     return found
 
 
-def _arms(
-    solved: Solved,
-    noise: Mapping[str, Mapping[str, float]],
-    workspace_mm: Mapping[str, float],
-) -> list[Arm]:
-    part = solved.agreed.problem.subset(solved.agreed.used)
+def _arms(answer: Answer) -> list[Arm]:
+    problem, solved = answer.problem, answer.solved
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
-    return [
-        Arm(
-            len(stops_of(part, robot)),
-            noise[robot]["translation_mm"],
-            noise[robot]["rotation_deg"],
-            errs=robot in solved.arms and solved.arms[robot].errors is not None,
-            workspace_mm=workspace_mm.get(robot),
-            modelled=robot in modelled,
-            name=robot if len(part.robots) > 1 else "",
+    found = []
+    for robot in problem.robots:
+        noise, telling = answer.sigmas[robot], answer.arms[robot].telling
+        known = not problem.is_combined
+        found.append(
+            Arm(
+                len(stops_of(problem, robot)),
+                noise["translation_mm"] if known else None,
+                noise["rotation_deg"] if known else None,
+                errs=solved.arms[robot].errors is not None,
+                workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
+                modelled=robot in modelled,
+                name=robot if len(problem.robots) > 1 else "",
+            )
         )
-        for robot in part.robots
-    ]
+    return found
 
 
-def check_cell(solved: Solved, *, looks: bool = False) -> None:
-    """Refuses a cell in which the motion does not determine a frame well enough for anybody.
-
-    Args:
-        solved: The fit.
-        looks: Whether its views have to tell lens and board.
+def check_answer(known: Known) -> None:
+    """Refuses motion that does not determine a frame well enough for anybody.
 
     Raises:
         DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
             over the limit.
     """
-    agreed, cell = solved.agreed, solved.cell
-    part = agreed.problem.subset(agreed.used)
+    agreed, cell = known.fitted.agreed, known.fitted.cell
+    part, fit = known.fitted.part, agreed.fit
+    looks = known.fitted.seen is not None and any(it.estimated for it in known.scenes.values())
+    if known.mount is not None:
+        check_observability(part, fit.state, fit.noise, known.mount, looks=looks)
+        return
     names = {it: _names(part.tree, it) for it in part.unknown}
     lost = agreed.problem.subset(~agreed.used)
 
@@ -180,7 +243,7 @@ def check_cell(solved: Solved, *, looks: bool = False) -> None:
         )
 
     scene = Scene("align", names, motion, advice)
-    check_determined(part, agreed.fit.state, agreed.fit.noise, scene, looks=looks)
+    check_determined(part, fit.state, fit.noise, scene, looks=looks)
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:

@@ -37,6 +37,8 @@ def covariance_beside_noise(
     fit: Solution,
     arms: Mapping[str, RobotArm],
     found: Mapping[str, Misfit],
+    *,
+    is_fit: bool = True,
 ) -> dict[str, FloatArray]:
     """Covariances (p, p) that a fit has of what is no noise, by their source.
 
@@ -45,33 +47,42 @@ def covariance_beside_noise(
         fit: Their fit.
         arms: The arms; errors that are no unknowns count, and how well the size of others is known.
         found: What their residuals show.
+        is_fit: Whether it is at rest: a closed form is pulled by more than what is held.
     """
-    parts, shift = {}, held_shift(problem, fit)
+    parts, shift = {}, held_shift(problem, fit) * float(is_fit)
     if shift.any():
-        parts["held values"] = np.outer(shift, shift)
+        parts["held_values"] = np.outer(shift, shift)
     for robot, arm in arms.items():
         if arm.errors is not None and not arm.errors.is_estimated:
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
-            parts[f"arm {robot}"] = errors
+            parts[f"arm{_of(arms, robot)}"] = errors
         elif arm.errors is not None:
             spread = covariance_of(problem, fit)
-            parts[f"size of errors of arm {robot}"] = covariance_of_size(
+            parts[f"size of arm errors{_of(arms, robot)}"] = covariance_of_size(
                 problem, spread, robot, arm.errors
             )
     for robot, it in found.items():
         if it.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
-            parts[f"misfit of robot {robot}"] = more
+            parts[f"misfit{_of(arms, robot)}"] = more
     return parts
 
 
+def _of(arms: Mapping[str, RobotArm], robot: str) -> str:
+    """Names, of several robots, the one that a source is of."""
+    return "" if len(arms) == 1 else f" of robot {robot}"
+
+
 def doubts_of_arms(
-    arms: Mapping[str, RobotArm], found: Mapping[str, Misfit], asked: str
+    arms: Mapping[str, RobotArm],
+    found: Mapping[str, Misfit],
+    told: Mapping[str, ArmFound],
+    asked: str,
 ) -> Iterator[str]:
     """Words what speaks against the robots."""
     for robot, arm in arms.items():
-        for words in _doubts(arm, found.get(robot), asked):
-            yield _of_robot(robot, words)
+        for words in (*_doubts(arm, found.get(robot), asked), *told[robot].doubts()):
+            yield _of_robot(arms, robot, words)
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
@@ -80,7 +91,7 @@ def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) ->
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         chosen = () if arm.kinematics is None else findings(arm.kinematics)
         for words in (*drifts, *chosen, *told[robot].notes()):
-            yield _of_robot(robot, words)
+            yield _of_robot(arms, robot, words)
 
 
 def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
@@ -95,8 +106,9 @@ def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
         yield from misfit_words(found, arm.errors, calibrated=calibrated)
 
 
-def _of_robot(robot: str, words: str) -> str:
-    return f"Robot {robot}: {words[0].lower()}{words[1:]}"
+def _of_robot(arms: Mapping[str, RobotArm], robot: str, words: str) -> str:
+    """Names, of several robots, the one that a sentence is of."""
+    return words if len(arms) == 1 else f"Robot {robot}: {words[0].lower()}{words[1:]}"
 
 
 def with_drifts(

@@ -3,12 +3,15 @@
 from collections.abc import Iterator
 
 from visioncal.pipeline.known import Known
+from visioncal.stages.cell import pair_edges
 
 
 def not_used(known: Known) -> Iterator[str]:
     """Says what the session declares and this version leaves aside."""
     session = known.session
-    names = known.edge_names(range(max(len(session.boards), 1)))
+    if known.mount is None:
+        return
+    names = pair_edges(session)
     for edge in session.declaration.prior:
         if edge in names and known.solver == "joint":
             continue

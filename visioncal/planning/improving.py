@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.estimation.armmodel import block_size
-from visioncal.estimation.parts import ROBOT
 from visioncal.figures import figure
 from visioncal.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.planning.cell import Box, PlanCell
@@ -123,7 +122,7 @@ def helps(
     """
     there, known = np.zeros((0, 4, 4)), []
     if begun is not None:
-        there = begun.recorded.problem.poses[ROBOT]
+        there = next(iter(begun.recorded.problem.poses.values()))
         known = [f"view {it}" for it in begun.views]
     poses = cell.robot.base_from_flange(q[design.rows])
     before = world.covariance([])

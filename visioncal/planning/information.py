@@ -26,7 +26,7 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance, gram
-from visioncal.estimation.parts import ROBOT, Effect, Noise, State
+from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
@@ -318,7 +318,7 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) 
             culprits=["q1_rad"],
             next_step="Record q1_rad ..., or plan without the recorded session.",
         )
-    stops = len(recorded.problem.poses[ROBOT])
+    stops = len(next(iter(recorded.problem.poses.values())))
     at = np.zeros((stops, cell.robot.joint_count)) if q is None else q
     problem = _erring(cell, purpose, recorded.problem, at, recorded.arm)
     state = State(recorded.edges_in(cell), problem.start_values)
@@ -341,7 +341,9 @@ def _erring(
         arm = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True)
     elif arm is not None:
         arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
-    return problem if arm is None else problem.with_effects([*problem.effects, arm.effect(ROBOT)])
+    if arm is None:
+        return problem
+    return problem.with_effects([*problem.effects, arm.effect(problem.robots[0])])
 
 
 def _of_effects(problem: Problem) -> FloatArray:
@@ -443,7 +445,7 @@ def _arm_slopes(
     """The camera and the board, and their (w, 4, 4) poses with slopes (w, 6, 12 + a)."""
     model, flange = _model(cell.robot, purpose), cell.robot.base_from_flange(at)
     problem = chain(cell.mount, flange[:1], cell.cam_from_target(at[:1]))
-    pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), ROBOT)
+    pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), problem.robots[0])
     return pair, *pair.slopes(flange, model.basis(at))
 
 

@@ -5,17 +5,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
+from visioncal.estimation.appearance import Free
 from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.chain import robot_part
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import fisher_information, fit_problem, normal_equations
+from visioncal.estimation.solve import fisher_information, normal_equations
 from visioncal.pipeline.known import Known
+from visioncal.pipeline.looked import Looked
+from visioncal.pipeline.solving import Solved
 from visioncal.pipeline.steps import STAGES
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.information import Recorded
 from visioncal.robot import Robot
-from visioncal.session import Session
+from visioncal.session import Session, frame_name
+from visioncal.stages.arms import RobotArm
+from visioncal.stages.choose import choose_by
+from visioncal.stages.refine import free_of
+from visioncal.stages.side import FramesSide
 from visioncal.targets import first_corners
 from visioncal.threads import one_blas_thread
 from visioncal.transforms import invert, log
@@ -121,71 +129,140 @@ def begin(
             begin without a guess.
     """
     known = found.known
-    robot, free, targets = known.robot, known.free, tuple(known.session.boards.values())
-    if robot is None or free is None or not targets or known.pixel_px is None:
+    robot, targets = known.robot, tuple(known.session.boards.values())
+    if robot is None or not targets or known.pixel_px is None or not known.scenes:
         raise _lacking(known)
-    first, arm = known.first_of_stops(known.used), known.arm_at_stops
-    # The arm's own errors are the purpose's business: they are put in again with its priors.
-    bare = replace(known, calibrated=replace(known.robot_arm, errors=None))
-    problem = bare.problem(known.used).merged()
     with one_blas_thread():
-        state, noise = _start(known, problem, guess)
-        edges, spread = _nearest(problem, state, noise, known.session.mount, guess)
+        told = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
+        edges, spread = _nearest(told.problem, told.state, told.noise, known.session.mount, guess)
     sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
-        raise _too_vague(known)
+        raise _too_vague(known, len(told.views))
+    arm = told.arm
     cell = PlanCell(
         known.session.mount,
-        _arm(known, robot),
-        free.appearance.camera,
-        targets[known.boards[0]],
+        _arm(arm, robot),
+        told.free.appearance.camera,
+        targets[told.board],
         edges[0],
         edges[1],
         float(sigmas[0]),
         float(sigmas[1]),
-        noise,
+        told.noise,
         known.pixel_px,
         limits or Limits(),
         boxes,
         spread,
     )
-    corner = int(first_corners(targets)[known.boards[0]])
+    alike = () if known.answer is None else (it.alike for it in known.answer.misfits.values())
     recorded = Recorded(
-        problem,
+        told.problem,
         edges,
-        free,
+        told.free,
         arm.joints_rad,
-        noise,
-        corner,
+        told.noise,
+        int(first_corners(targets)[told.board]),
         arm.errors,
-        1.0 if known.diagnosis is None else known.diagnosis.inflation,
+        max((it.factor for it in alike if it.is_significant), default=1.0),
     )
-    return Begun(cell, recorded, found.refusal, tuple(first))
+    return Begun(cell, recorded, found.refusal, told.views)
 
 
-def _arm(known: Known, robot: Robot) -> Robot:
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What a session tells.
+
+    Attributes:
+        problem: Its s stops, without errors of the arm; the board that is planned for comes first.
+        state: Where to begin.
+        noise: Of the robot at the stops.
+        free: Lens and boards as the views see them.
+        arm: The robot's arm at the stops.
+        board: Which of the session's boards is planned for: the one in the most views.
+        views: (s,) the first view of each stop.
+    """
+
+    problem: Problem
+    state: State
+    noise: Noise
+    free: Free
+    arm: RobotArm
+    board: int
+    views: tuple[int, ...]
+
+
+def _fitted(known: Known, solved: Solved) -> _Told:
+    """What the fit of a session tells, even where that leaves a direction open."""
+    if solved.seen is None:
+        raise _lacking(known)
+    part, arm = solved.part, known.robot_arm
+    observed = part.observations.observed
+    most = max(dict.fromkeys(observed), key=observed.count)
+    stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
+    frames = dict(zip(part.unknown, solved.agreed.fit.state.edges, strict=True))
+    # The arm's own errors are the purpose's business: they are put in again with its priors.
+    bare = part.with_effects([it for it in part.effects if it.name != f"arm of {arm.robot}"])
+    seen_at = np.isin(np.arange(len(arm.stood)), stops)
+    camera, *boards = part.unknown
+    order = [it for it in part.tree.branches if it not in part.unknown]
+    order += [camera, most, *(it for it in boards if it != most)]
+    problem = replace(
+        bare,
+        tree=replace(part.tree, branches={it: part.tree.branches[it] for it in order}),
+        poses={name: it[stops] for name, it in part.poses.items()},
+        observations=replace(part.observations, stops=of),
+        effects=tuple(it.of_stops(seen_at) for it in bare.effects),
+    ).merged()
+    noise = solved.agreed.fit.noise
+    return _Told(
+        problem,
+        problem.start(frames),
+        replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
+        free_of(solved.seen),
+        arm.at(stops),
+        tuple(frame_name("target", it) for it in known.session.boards).index(most),
+        tuple(known.used[it] for it in first.tolist()),
+    )
+
+
+def _guessed(known: Known, guess: Guess | None) -> _Told:
+    """What stops tell that are too few for a fit, beside a guess."""
+    looked = Looked.of(known)
+    views = [it for it in known.poses if it in known.base_from_flange and it not in known.held_back]
+    if guess is None or not views:
+        raise _too_vague(known, len(views))
+    shown = [known.poses[it].board for it in views]
+    board = max(dict.fromkeys(shown), key=shown.count)
+    mine = [it for it in sorted(views) if known.poses[it].board == board]
+    looked = replace(looked, boards=(board,), used=tuple(mine))
+    looked = replace(looked, frames=looked.framed(np.stack([guess.x, guess.z])))
+    robot = robot_part(looked.arm_at(mine).poses, known.session.mount)
+    target = tuple(known.session.boards.values())[board]
+    poses = [
+        choose_by(known.poses[it], pose, target)
+        for it, pose in zip(mine, invert(robot @ guess.x) @ guess.z, strict=True)
+    ]
+    ((frame, scene),) = known.scenes.items()
+    problem, alone = looked.posed(poses).problem(mine), np.ones(len(mine), dtype=bool)
+    looks = FramesSide(problem, alone, mine, {}).looks({frame: scene}, {frame: poses})
+    looked = replace(looked, free=free_of(looks.seen(looks.first))).posed(poses)
+    problem = looked.problem(mine).merged()
+    return _Told(
+        problem,
+        problem.start(looked.frames),
+        _TYPICAL,
+        looked.free or free_of(looks.seen(looks.first)),
+        looked.arm_at_stops,
+        board,
+        tuple(looked.first_of_stops(mine)),
+    )
+
+
+def _arm(arm: RobotArm, robot: Robot) -> Robot:
     """The arm up to the frame of the reported poses, as far as it is calibrated."""
-    arm = known.arm_at(known.used)
     if arm.model is not None:
         return arm.model.robot
     return robot if arm.joints_rad is None else ArmModel.of(robot, arm.joints_rad, arm.poses).robot
-
-
-def _start(known: Known, problem: Problem, guess: Guess | None) -> tuple[State, Noise]:
-    if known.agreed is None and guess is None:
-        raise _too_vague(known)
-    frames = known.frames
-    if guess is not None and not frames:
-        frames = known.framed(np.stack([guess.x, guess.z]))
-    state = problem.start(frames)
-    if known.agreed is None:
-        return state, _TYPICAL
-    if known.hand_eye is not None:
-        noise = known.hand_eye.noise
-    else:
-        fit = fit_problem(problem, state)
-        state, noise = State(fit.state.edges, state.values), fit.noise
-    return state, replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots))
 
 
 def _nearest(
@@ -233,7 +310,7 @@ def _lacking(known: Known) -> DataError:
         missing.append("a model of its robot ([robot] model)")
     if not session.boards:
         missing.append("a board (target)")
-    if known.free is None or known.pixel_px is None:
+    if known.pixel_px is None or not known.scenes:
         missing.append("images of the board")
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
@@ -244,8 +321,7 @@ def _lacking(known: Known) -> DataError:
     )
 
 
-def _too_vague(known: Known) -> DataError:
-    stops = len(known.first_of_stops(known.used))
+def _too_vague(known: Known, stops: int) -> DataError:
     return DataError(
         f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
         "of the robot do not tell where camera and board are, not even roughly.",

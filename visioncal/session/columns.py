@@ -20,13 +20,17 @@ INSTRUMENT_QUATERNION = tuple(f"meas_{name}" for name in QUATERNION)
 WHOLE_GROUPS = (POSE, MEASURED_CAM_POSE, INSTRUMENT_POSITION, INSTRUMENT_QUATERNION)
 QUATERNION_GROUPS = (QUATERNION, MEASURED_CAM_POSE[3:], INSTRUMENT_QUATERNION)
 
+# What the flange carries, and what pushes at it.
+LOAD = (
+    "payload_kg",
+    *(f"payload_{axis}_m" for axis in "xyz"),
+    *(f"force_{axis}_n" for axis in "xyz"),
+)
 _PLAIN_NUMBERS = frozenset(
     {
         "stamp_s",
         "ambient_c",
-        "payload_kg",
-        *(f"payload_{axis}_m" for axis in "xyz"),
-        *(f"force_{axis}_n" for axis in "xyz"),
+        *LOAD,
         *POSE,
         *MEASURED_CAM_POSE,
         *INSTRUMENT_POSITION,

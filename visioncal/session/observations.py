@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.session.columns import POSE, joint_columns
+from visioncal.session.columns import LOAD, POSE, joint_columns
 from visioncal.session.document import Declaration
 from visioncal.session.frames import observed, robots_between
 from visioncal.session.kinds import name_of, tells_robot
@@ -116,7 +116,9 @@ def still_since(views: Iterable[View]) -> dict[int, int]:
 
 
 def _moved(first: View, second: View) -> bool:
-    """Whether two rows tell poses that differ by more than readings of one pose do."""
+    """Whether two rows tell poses that differ by more than readings of one pose do, or loads."""
+    if any(first.numbers.get(it) != second.numbers.get(it) for it in LOAD):
+        return True
     before, after = ([it.numbers.get(name, math.nan) for name in POSE] for it in (first, second))
     if not math.isnan(before[0] + after[0]):
         units = [[it / math.hypot(*pose[3:]) for it in pose[3:]] for pose in (before, after)]

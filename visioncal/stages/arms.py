@@ -288,6 +288,10 @@ class RobotArm:
         pair = ArmPair.of(problem, fit.state, self.robot)
         # Readings of one point show its place and no rotation; several points make a frame.
         shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
+        # The rotation of what is only a point beside it is no value of its frame.
+        edges = problem.counted.copy()
+        edges[problem.edge_columns(pair.observed)] = True
+        edges[6 * len(problem.unknown) :] = False
         return ArmData(
             problem,
             fit.state,
@@ -301,7 +305,7 @@ class RobotArm:
             self.joints_rad[rows],
             self.loads.chosen(rows),
             middles.get(pair.observed, np.zeros(3)),
-            every[: 6 * len(problem.unknown)],
+            every[edges],
             measured=np.repeat([shows_pose, True], 3),
         )
 

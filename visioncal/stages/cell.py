@@ -9,14 +9,16 @@ from scipy.sparse.csgraph import connected_components
 
 from visioncal.calibration import HELD_BACK
 from visioncal.errors import DataError
+from visioncal.estimation.chain import edge_names
 from visioncal.estimation.parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen
+from visioncal.session.single import is_whole_cell
 from visioncal.stages.observed import Observed
 from visioncal.stages.priors import priors_of
 from visioncal.stages.reported import Reported
-from visioncal.types import FloatArray
+from visioncal.types import FloatArray, Mount
 
 _CELL = "cell"
 
@@ -57,6 +59,11 @@ class Cell:
     stops: tuple[int, ...] = ()
     priors: tuple[FramePrior, ...] = ()
     held: tuple[Row, ...] = ()
+
+    @property
+    def mount(self) -> Mount | None:
+        """Where the camera of one camera and one robot is; None of a whole cell."""
+        return None if is_whole_cell(self.session) else self.session.mount
 
     def without(self, reasons: Mapping[int, str]) -> "Cell":
         """Returns the cell without some views."""
@@ -124,17 +131,30 @@ def read_cell(seen: Observed) -> Cell:
     ]
     held = tuple(it for it in rows if it.view in seen.held_back)
     rows = [it for it in rows if it.view not in seen.held_back]
-    reasons = {**seen.reasons, **dict.fromkeys(seen.held_back, HELD_BACK), **seen.spared}
+    reasons = {**dict.fromkeys(seen.held_back, HELD_BACK), **seen.reasons, **seen.spared}
     stations: dict[int, int] = {}
     for it in observations:
         number = it.view.number if it.view.stop is None else it.view.stop
         stations.setdefault(it.station, number)
     tree = Tree(_CELL, branches)
-    priors = priors_of(session.declaration.prior, tree)
+    tables = session.declaration.prior
+    if not is_whole_cell(session):
+        tables = {name: it for name, it in tables.items() if name in pair_edges(session)}
+    priors = priors_of(tables, tree)
     poses = _poses(seen, observations)
     cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
     cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
     return cell.held_to(_reference(cell))
+
+
+def pair_edges(session: Session) -> tuple[str, ...]:
+    """The names of the unknown edges of one camera and one robot, the camera's first."""
+    camera, target = edge_names(session.mount)
+    if session.mount == "instrument":
+        return camera, target
+    boards = tuple(session.targets) or ("",)
+    parent = target.partition("_from_")[0]
+    return (camera, *(f"{parent}_from_{frame_name('target', it)}" for it in boards))
 
 
 def _robot_of(session: Session, frame: str) -> str:

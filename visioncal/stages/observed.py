@@ -10,13 +10,14 @@ from visioncal.calibration import HELD_BACK, CameraResult
 from visioncal.errors import DataError
 from visioncal.estimation.scene import Scene
 from visioncal.files import some_of
+from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.tables import CameraTable
 from visioncal.stages.clock import Clocked, Pair
 from visioncal.stages.dense import Dense
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.reported import Reported
-from visioncal.types import Corners, Progress, Rejection
+from visioncal.types import Corners, FloatArray, Progress, Rejection
 
 # So many views of one reason are named.
 _LISTED = 40
@@ -123,6 +124,44 @@ class Observed:
             for frame, lens in self.lenses.items()
             if boards and self.cameras[frame].pixel_px is not None
         }
+
+    @property
+    def reported(self) -> Reported:
+        """What rows report of the only robot."""
+        return next(iter(self.robots.values()), Reported({}))
+
+    @property
+    def base_from_flange(self) -> Mapping[int, FloatArray]:
+        """(4, 4) by view, as the only robot reported it."""
+        return self.reported.base_from_flange
+
+    @property
+    def robot(self) -> Robot | None:
+        """The nominal model of the only robot, where the session names a known one."""
+        matched = self.reported.matched
+        return None if matched is None else matched.robot
+
+    @property
+    def camera(self) -> CameraResult | None:
+        """The intrinsics of the only camera, where there are images."""
+        return next(iter(self.lenses.values()), None)
+
+    @property
+    def pixel_px(self) -> float | None:
+        """Noise of a coordinate of the only camera's corners [px]."""
+        return next((it.pixel_px for it in self.cameras.values()), None)
+
+    def with_noise(self, pixel_px: float) -> Self:
+        """Takes over the noise of the corners."""
+        cameras = {it: replace(look, pixel_px=pixel_px) for it, look in self.cameras.items()}
+        return replace(self, cameras=cameras)
+
+    @property
+    def poses_of_one_board(self) -> Mapping[int, ViewPoses]:
+        """The poses of the board that most views show: those of different ones do not compare."""
+        shown = [it.board for it in self.poses.values()]
+        most = max(sorted(set(shown)), key=shown.count, default=0)
+        return {view: it for view, it in self.poses.items() if it.board == most}
 
     @cached_property
     def held_back(self) -> frozenset[int]:

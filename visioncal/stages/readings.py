@@ -2,27 +2,24 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.positions import (
     Mounting,
     Places,
     find_mounting,
-    point_columns,
     residuals,
-    supplied_poses,
 )
-from visioncal.estimation.variance import Knowledge
 from visioncal.figures import figure
 from visioncal.files import did_you_mean, some_of
 from visioncal.instruments import Instrument, instrument_names, stated_instrument
 from visioncal.session import Session, View
 from visioncal.session.kinds import is_read, is_seen, name_of
+from visioncal.stages.observed import Observed, nothing_seen
 from visioncal.stages.pnp import ViewPoses
 from visioncal.threads import one_blas_thread
 from visioncal.types import FloatArray, IntArray, Rejection
@@ -46,7 +43,6 @@ class Readings:
         read_m: (3,) by view, in the instrument's frame [m].
         points: Which of the points, by view.
         probes: (4, 4) `instrument_from_probe` by view, where poses were read; else None.
-        mounting: Where instrument and points are, where places were read; else None.
         rejections: Rows that are of no use.
     """
 
@@ -55,7 +51,6 @@ class Readings:
     read_m: Mapping[int, FloatArray]
     points: Mapping[int, int]
     probes: Mapping[int, FloatArray] | None
-    mounting: Mounting | None
     rejections: tuple[Rejection, ...]
 
     @property
@@ -67,25 +62,6 @@ class Readings:
     def sigma_m(self) -> float:
         """Noise of a coordinate that was read, typically [m]."""
         return float(np.median(self.instrument.sigmas_m(np.array(list(self.read_m.values())))))
-
-    def poses(self, base_from_flange: Mapping[int, FloatArray]) -> dict[int, ViewPoses]:
-        """The probe's pose by view, with its covariance.
-
-        Where places were read, its rotation is the one that the chain predicts.
-
-        Args:
-            base_from_flange: (4, 4) by view; views without are left out.
-        """
-        views = [view for view in self.read_m if view in base_from_flange]
-        if self.probes is not None:
-            return {view: _sighting(view, self.probes[view], self.instrument) for view in views}
-        places = self.places(views, base_from_flange, np.arange(len(views)))
-        poses, spread = supplied_poses(places, self._mounted)
-        columns = point_columns(places.points, len(self.names))
-        return {
-            view: ViewPoses(view, None, poses[[at]], (0,), spread[[at]], columns[[at]])
-            for at, view in enumerate(views)
-        }
 
     def places(
         self, views: Sequence[int], base_from_flange: Mapping[int, FloatArray], stops: IntArray
@@ -99,25 +75,6 @@ class Readings:
             stops,
             self.instrument.sigmas_m(read),
         )
-
-    def effects(self, poses: Sequence[ViewPoses]) -> list[Effect]:
-        """What of the mounting is unknown beside the frames, with the poses that it moves."""
-        if self.mounting is None:
-            return []
-        columns = np.array([it.by_shared[0] for it in poses])
-        size = columns.shape[2]
-        nothing = Knowledge(np.zeros((size, size)), np.zeros(size))
-        return [Effect.free("points", nothing, columns)]
-
-    def moved(self, state: State) -> "Readings":
-        """Returns the readings with what a fit found of the mounting."""
-        return self if self.mounting is None else replace(self, mounting=self._mounted.moved(state))
-
-    @property
-    def _mounted(self) -> Mounting:
-        if self.mounting is None:
-            raise RuntimeError("readings of places need a mounting")
-        return self.mounting
 
 
 def read_instrument(session: Session) -> Readings:
@@ -143,7 +100,6 @@ def read_instrument(session: Session) -> Readings:
         {view.number: _read(view) for view in kept},
         {view.number: names.index(_name(view)) for view in kept},
         {view.number: _probe(view) for view in kept} if are_poses else None,
-        None,
         (*missing, *rejections),
     )
 
@@ -175,38 +131,28 @@ def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses
     return ViewPoses(view, None, probe[None], (0,), spread[None], np.zeros((1, 6, 0)))
 
 
-def mounted(
-    readings: Readings,
-    views: Sequence[int],
-    base_from_flange: Mapping[int, FloatArray],
-    stops: IntArray,
-) -> Readings:
-    """Finds where the instrument stands and the points sit, as a start.
+def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...]:
+    """Readings of one robot's points whose names are exchanged.
 
     Args:
+        seen: What is known, with where the robot stood.
         readings: Of places.
-        views: Those that the fit may use.
-        base_from_flange: (4, 4) by view.
-        stops: (m,) at which stop of the robot each was taken, numbered from 0.
-
-    Returns:
-        The readings with their mounting, without those whose points are exchanged.
 
     Raises:
+        DataError: No view can be used.
         DegenerateError: There are too few stops.
     """
+    station = {it.view.number: it.station for it in seen.session.observations}
+    poses = seen.base_from_flange
+    views = [it for it in readings.read_m if it in poses and it not in seen.held_back]
+    if not views:
+        raise nothing_seen(seen)
+    stops = np.unique([station[it] for it in views], return_inverse=True)[1]
     _check_stops(readings, stops)
-    places = readings.places(views, base_from_flange, stops)
+    places = readings.places(views, poses, stops)
     with one_blas_thread():
         mounting, _ = find_mounting(places)
-    exchanged = list(_exchanged(readings, views, places, mounting))
-    lost = {it.view for it in exchanged}
-    return replace(
-        readings,
-        mounting=mounting,
-        read_m={view: it for view, it in readings.read_m.items() if view not in lost},
-        rejections=(*readings.rejections, *exchanged),
-    )
+    return tuple(_exchanged(readings, views, places, mounting))
 
 
 def _read(view: View) -> FloatArray:

@@ -1,7 +1,7 @@
 """Stage 6: what all views share besides the edges: the lens, and the board as it really is."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,10 +9,8 @@ from visioncal.estimation.appearance import (
     Appearance,
     Compressed,
     Free,
-    boards_basis,
     compress,
 )
-from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import Looks, Seen
 from visioncal.estimation.joint import (
@@ -29,81 +27,26 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.parts import ROBOT, State
-from visioncal.estimation.scene import ONLY_CAMERA, Scene
+from visioncal.estimation.parts import State
 from visioncal.estimation.solve import covariance_of, left_out_residuals
-from visioncal.stages.found import found_of_looks
 from visioncal.stages.pnp import ViewPoses
 from visioncal.stages.side import FramesSide
-from visioncal.targets import numbered_positions
 from visioncal.threads import one_blas_thread
 from visioncal.types import Corners, FloatArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """The views under the lens and the board that fit all of them.
-
-    Attributes:
-        free: The appearance, and what is open about it.
-        views: The views with their one pose each, made anew.
-        sigma_px: Standard deviation of a corner's coordinate [px].
-        arm: Errors that follow the arm's posture, at the same views; None where there are none.
-        warnings: What was found and is a reason for doubt, in sentences.
-        notes: What was found and is none.
-    """
-
-    free: Free
-    views: tuple[ViewPoses, ...]
-    sigma_px: float
-    arm: ArmErrors | None
-    warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-def look(
-    scene: Scene, views: Sequence[ViewPoses], side: FramesSide, *, closed_form: bool = False
-) -> Refined:
-    """Lens and board as they are given or were estimated, with what is open about them.
-
-    Args:
-        scene: What is looked at, and with what.
-        views: The views, each with its one pose and its corners.
-        side: The frames' side.
-        closed_form: Whether nothing will move, because the edges will come from a closed form.
-
-    Returns:
-        The views with how they move when lens and board do.
-    """
-    with one_blas_thread():
-        looks = side.looks({ONLY_CAMERA: scene}, {ONLY_CAMERA: views})
-        moving = looks.first[:0] if closed_form else looks.first
-        seen = looks.weighed(looks.seen(moving)).seen(moving)
-    return _told(seen, views, None)
-
-
-def refine(
-    scene: Scene,
-    views: Sequence[ViewPoses],
-    side: FramesSide,
-    frames: Mapping[str, FloatArray],
-) -> Refined:
-    """Fits lens, board and edges to all corners together; see `refined`.
-
-    Args:
-        scene: What is looked at, and with what.
-        views: The views in the fit, each with its one pose and its corners.
-        side: The frames' side.
-        frames: Where the unknown frames are thought to be.
-    """
-    with one_blas_thread():
-        looks = side.looks({ONLY_CAMERA: scene}, {ONLY_CAMERA: views})
-        answer, side = refined(side, looks, frames)
-        found = [*found_of_looks(side, answer)]
-    return replace(
-        _told(answer.seen, views, side.arms[ROBOT].errors),
-        warnings=tuple(words for words, is_doubt in found if is_doubt),
-        notes=tuple(words for words, is_doubt in found if not is_doubt),
+def free_of(seen: Seen) -> Free:
+    """Lens and boards of the only camera, and what is open about them."""
+    looks, known = seen.looks, seen.known
+    ((name, problem),) = looks.problems.items()
+    return Free(
+        Appearance(looks.camera(name), looks.values[looks.boards]),
+        problem.basis,
+        problem.positions,
+        seen.free,
+        seen.held,
+        known.information,
+        known.pull,
     )
 
 
@@ -201,43 +144,6 @@ def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitt
         held = wide.looks.with_values(place, looks.stated[place])
         wide = again(wide, erring, np.setdiff1d(wide.moving, place), held)
     return [looks.scale_of(it) for it in free], wide
-
-
-def _told(seen: Seen, views: Sequence[ViewPoses], errors: ArmErrors | None) -> Refined:
-    (compressed,), (sigma_px,) = seen.compressed, seen.sigmas_px
-    (problem,) = seen.looks.problems.values()
-    views = [_weighing(view, problem.stack) for view in views]
-    return Refined(
-        _free(seen),
-        tuple(_remade(view, compressed, seen.free, sigma_px, at) for at, view in enumerate(views)),
-        sigma_px,
-        errors,
-    )
-
-
-def _weighing(view: ViewPoses, stack: CornerStack) -> ViewPoses:
-    """A view whose corners weigh as they do in a fit."""
-    if view.corners is None:
-        return view
-    rows = stack.view_of == stack.views.index(view.view)
-    mine = None if stack.weights is None else stack.weights[rows]
-    return replace(view, corners=replace(view.corners, weights=mine))
-
-
-def _free(seen: Seen) -> Free:
-    """Lens and board of the only camera, and what is open about them."""
-    looks, known = seen.looks, seen.known
-    ((name, problem),) = looks.problems.items()
-    appearance = Appearance(looks.camera(name), looks.values[looks.boards])
-    return Free(
-        appearance,
-        problem.basis,
-        problem.positions,
-        seen.free,
-        seen.held,
-        known.information,
-        known.pull,
-    )
 
 
 def chosen(side: Side, fitted: Fitted) -> Fitted:
@@ -341,20 +247,6 @@ def _contested(side: Side, answer: Fitted) -> list[str]:
         for name, lens in lenses.items()
         if scores.gain(np.union1d(bent, lens)) - least > chance_limit(len(lens))
     ]
-
-
-def held(scene: Scene) -> Free:
-    """Lens and board as they are stated, with nothing free."""
-    nothing, basis = np.zeros(0), boards_basis(scene.targets)
-    return Free(
-        Appearance(scene.camera, np.zeros(basis.shape[2])),
-        basis,
-        numbered_positions(scene.targets),
-        nothing.astype(np.int64),
-        nothing.astype(bool),
-        np.zeros((0, 0)),
-        nothing,
-    )
 
 
 def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[ViewPoses, ...]:

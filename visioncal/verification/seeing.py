@@ -16,6 +16,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.frames.sighting import check_mount, check_resolution
 from visioncal.pipeline import STAGES
 from visioncal.pipeline.known import Known
+from visioncal.pipeline.looked import Looked
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.boards import COLUMN
@@ -44,7 +45,7 @@ class Seen:
         warnings: What is odd, in sentences.
     """
 
-    known: Known
+    known: Looked
     problem: Problem
     views: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...]
@@ -133,15 +134,16 @@ def seen_by(known: Known, footing: Footing) -> Seen:
         known = known.with_camera(frame, replace(look, lens=lens))
     # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
     known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clocks={})
-    known = _with_arm(known, footing)
-    known = _posed(known, footing)
-    problem = known.problem(known.used)
+    looked = _posed(_with_arm(Looked.of(known), footing), footing)
+    problem = looked.problem(looked.used)
     sights = problem.of_one_stop
     return Seen(
-        known,
+        looked,
         problem.merged(),
-        tuple(tuple(np.array(known.used)[sights == at].tolist()) for at in range(sights.max() + 1)),
-        tuple(_warnings(known, footing)),
+        tuple(
+            tuple(np.array(looked.used)[sights == at].tolist()) for at in range(sights.max() + 1)
+        ),
+        tuple(_warnings(looked, footing)),
     )
 
 
@@ -154,7 +156,7 @@ def asked_of_boards(problem: Problem, state: State) -> FloatArray:
     return asked
 
 
-def _with_arm(known: Known, footing: Footing) -> Known:
+def _with_arm(known: Looked, footing: Footing) -> Looked:
     """Takes the arm for what the calibration has it for."""
     known = replace(known, calibrated=replace(known.robot_arm, model=footing.model))
     if footing.arm in ("none", "poses"):
@@ -170,7 +172,7 @@ def _with_arm(known: Known, footing: Footing) -> Known:
     return known
 
 
-def _posed(known: Known, footing: Footing) -> Known:
+def _posed(known: Looked, footing: Footing) -> Looked:
     """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
     mount, targets = known.session.mount, tuple(footing.targets.values())
     x, *placed = footing.state.edges
@@ -182,7 +184,7 @@ def _posed(known: Known, footing: Footing) -> Known:
             continue
         if poses.board not in order:
             continue
-        robot = robot_part(known.flange_poses([view]), mount)[0]
+        robot = robot_part(known.arm_at([view]).poses, mount)[0]
         predicted = invert(robot @ x) @ placed[order[poses.board]]
         views.append(view)
         chosen.append(choose_by(poses, predicted, targets[poses.board] if targets else None))
@@ -199,7 +201,7 @@ def _posed(known: Known, footing: Footing) -> Known:
     return _with_errors(known, footing)
 
 
-def _with_errors(known: Known, footing: Footing) -> Known:
+def _with_errors(known: Looked, footing: Footing) -> Looked:
     """Adds the arm's errors as unknowns, as the calibration's covariance has them."""
     if footing.arm == "none":
         return known
@@ -210,7 +212,7 @@ def _with_errors(known: Known, footing: Footing) -> Known:
     return replace(known, calibrated=replace(arm, errors=errors))
 
 
-def _noise_px(known: Known) -> float:
+def _noise_px(known: Looked) -> float:
     """Noise of a corner's coordinate around the poses, by lens and boards as calibrated [px]."""
     corners = {view: it for view, it in zip(known.used, known.seen(known.used), strict=True) if it}
     free = known.free
@@ -322,7 +324,7 @@ def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
         )
 
 
-def _warnings(known: Known, footing: Footing) -> Iterator[str]:
+def _warnings(known: Looked, footing: Footing) -> Iterator[str]:
     """What is odd about the session."""
     yield from dict.fromkeys(known.warnings)
     if "thermal" in footing.calibration.stages:
