@@ -157,11 +157,6 @@ class Free:
         """How many of the appearance's values are the lens's: they come first."""
         return len(self.appearance.values) - len(self.appearance.board)
 
-    @property
-    def lens_is_free(self) -> bool:
-        """Whether the fit moves the intrinsics: all of them or none."""
-        return bool((~self.anchored & (self.columns < self.lens_count)).any())
-
     def after(self, change: FloatArray) -> "Appearance":
         """The appearance after a (k + p,) change of the free unknowns and of p others."""
         step = np.zeros(len(self.appearance.values))

@@ -69,7 +69,6 @@ def chain(
     order: Sequence[str] = (),
     effects: Sequence[Effect] = (),
     priors: Sequence[FramePrior] = (),
-    turned_by_choice: bool = False,
 ) -> Problem:
     """Puts the problem of one robot and one camera.
 
@@ -83,7 +82,6 @@ def chain(
         order: The targets in the order of the unknowns; empty for that of their first views.
         effects: What moves views together.
         priors: What was measured of frames by hand.
-        turned_by_choice: Whether the targets' rotation is a matter of choice, as of points.
     """
     count = len(cam_from_target)
     (camera, observer), (target, only) = (it.split("_from_") for it in edge_names(mount))
@@ -104,6 +102,5 @@ def chain(
         ),
         tuple(it for it in effects if len(it)),
         tuple(priors),
-        frozenset(observed) if turned_by_choice else frozenset(),
         is_combined=covariance is None,
     )

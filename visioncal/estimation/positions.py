@@ -13,10 +13,9 @@ import numpy as np
 
 from visioncal.estimation.descend import Linearised, descend
 from visioncal.estimation.linalg import damped_step
-from visioncal.estimation.parts import State
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
-from visioncal.transforms import adjoint, compose, exp, invert, skew
+from visioncal.transforms import exp, invert, skew
 from visioncal.types import FloatArray, IntArray, Mask
 
 # Variance about each axis of a rotation that is not told [rad^2].
@@ -68,65 +67,6 @@ class Mounting:
 
     base_from_instrument: FloatArray
     on_flange: FloatArray
-
-    @property
-    def edges(self) -> FloatArray:
-        """(2, 4, 4) the same as edges: the first point's frame is parallel to the flange."""
-        return np.stack([self.base_from_instrument, compose(np.eye(3), self.on_flange[0])])
-
-    @property
-    def from_first(self) -> FloatArray:
-        """(p, 3) the points in the first one's frame [m]."""
-        return np.asarray(self.on_flange - self.on_flange[0])
-
-    def moved(self, state: State) -> "Mounting":
-        """Returns the mounting that a fit of the chain found, starting from this one.
-
-        Args:
-            state: Its edges; the values begin with the changes of the further points.
-        """
-        changes = np.zeros_like(self.on_flange)
-        changes[1:] = state.values[: 3 * len(changes) - 3].reshape(-1, 3)
-        x, z = state.edges
-        return Mounting(x, z[:3, 3] + (self.from_first + changes) @ z[:3, :3].T)
-
-
-def supplied_poses(places: Places, mounting: Mounting) -> tuple[FloatArray, FloatArray]:
-    """Supplies the rotation that places do not tell.
-
-    Args:
-        places: The readings.
-        mounting: What predicts the rotation.
-
-    Returns:
-        (m, 4, 4) `instrument_from_probe`, the probe being the first point with the flange's axes,
-        and the (m, 6, 6) covariances of their right perturbations.
-    """
-    x = mounting.base_from_instrument
-    turns = x[:3, :3].T @ places.base_from_flange[:, :3, :3]
-    away = mounting.from_first[places.points]
-    poses = compose(turns, places.read - (turns @ away[:, :, None])[:, :, 0])
-    spread = np.zeros((len(poses), 6, 6))
-    spread[:, range(3), range(3)] = UNTOLD
-    spread[:, range(3, 6), range(3, 6)] = places.sigmas[:, None] ** 2
-    carried = adjoint(compose(np.eye(3), away))
-    return poses, carried @ spread @ np.swapaxes(carried, 1, 2)
-
-
-def point_columns(points: IntArray, count: int) -> FloatArray:
-    """How the poses of `supplied_poses` move with the places of all points but the first.
-
-    Args:
-        points: (m,) which point each reading is of.
-        count: How many points there are.
-
-    Returns:
-        (m, 6, 3 (count - 1)) right perturbations.
-    """
-    columns = np.zeros((len(points), 6, 3 * (count - 1)))
-    for point in range(1, count):
-        columns[np.ix_(points == point, range(3, 6), range(3 * point - 3, 3 * point))] = -np.eye(3)
-    return columns
 
 
 def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:

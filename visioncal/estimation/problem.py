@@ -125,18 +125,6 @@ class Problem:
             effects=tuple(it.take(rows) for it in self.effects),
         )
 
-    def pruned(self) -> "Problem":
-        """Returns the problem without unknown frames that no observation has on its way."""
-        needed = {step.frame for group in self.groups for step in group.path}
-        lost = [it for it in self.tree.unknown if it not in needed]
-        priors = (it for it in self.priors if not {it.first, it.second} & set(lost))
-        return replace(
-            self,
-            tree=self.tree.without(lost),
-            priors=tuple(priors),
-            points=self.points.difference(lost),
-        )
-
     @cached_property
     def of_one_stop(self) -> IntArray:
         """(n,) what is of the same frames at one stop, numbered in the order of appearance.

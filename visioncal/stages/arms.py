@@ -173,11 +173,6 @@ class RobotArm:
         arm = replace(self, errors=errors, kinematics=None, model=None)
         return arm if errors is None else replace(arm, errors=replace(errors, basis=arm.basis))
 
-    def calibrated_as(self, other: Self) -> Self:
-        """The arm with what was found of it at some of its stops."""
-        arm = replace(self, kinematics=other.kinematics)
-        return arm if other.model is None else arm._bending(other.model)
-
     @property
     def poses(self) -> FloatArray:
         """(s, 4, 4) where the flange stood, by the calibrated arm where there is one."""

@@ -67,6 +67,6 @@ def misfit_words(found: Misfit, arm: ArmErrors | None, *, calibrated: bool) -> I
     if alike.is_significant:
         yield (
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
-            f"{np.sqrt(alike.factor):.2g} times farther than independent noise would. The sigmas "
-            "were multiplied by as much."
+            f"{np.sqrt(alike.factor):.2g} times farther than independent noise would. The robot's "
+            "share of the sigmas was multiplied by as much."
         )

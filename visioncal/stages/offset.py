@@ -8,8 +8,6 @@ import numpy as np
 
 from visioncal.errors import DataError, DegenerateError
 from visioncal.estimation.clock import ClockFit
-from visioncal.estimation.effects.clock import clock_effect
-from visioncal.estimation.parts import Effect
 from visioncal.estimation.turned import Match
 from visioncal.figures import figure
 from visioncal.session import View
@@ -66,18 +64,6 @@ class Clock:
             return self.sigma_s
         share = 0.0 if erring else max(0.0, 1.0 - len(self.speeds) / self.frames)
         return 1.0 / max(1.0 / LARGEST_SIGMA_S, float(np.sqrt(share)) / self.sigma_s)
-
-    def effects(self, views: Sequence[int], *, erring: bool = False) -> tuple[Effect, ...]:
-        """The errors of offset and times within images as unknowns of the chain of some views.
-
-        Args:
-            views: The views.
-            erring: As `known_s` has it.
-        """
-        still = np.zeros(6)
-        speeds = np.array([self.speeds.get(view, still) for view in views]).reshape(-1, 6)
-        delays = (it.effect(views) for it in self.delays if it.is_clear)
-        return clock_effect(speeds, self.known_s(erring=erring)), *delays
 
     def document(self) -> dict[str, object]:
         """What calibration.json says of it."""
