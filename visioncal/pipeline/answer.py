@@ -133,13 +133,13 @@ class Answer:
         (late_s,) = self.problem.values_of(effect, self.state)
         return float(late_s), float(np.sqrt(self.covariance[columns.start, columns.start]))
 
-    @property
+    @cached_property
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Sigmas of each frame's place in its parent, by the frame and by source [mm]."""
         found = budget_mm(self.solved, self.beside)
         return {self.versions[key].name: it for key, it in found.items()}
 
-    @property
+    @cached_property
     def intervals(self) -> FloatArray:
         """(r, 2, 2) 95 % intervals of the robots' noise; see `noise_intervals`."""
         return noise_intervals(self.problem, self.state, self.noise)
