@@ -1,0 +1,27 @@
+"""Every recipe of the cookbook is run, and prints what its page shows."""
+
+import pytest
+from recipes import FOLDER, match, run
+
+PAGES = sorted(set(FOLDER.glob("*.md")) - {FOLDER / "README.md"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda it: it.stem)
+def test_a_recipe_prints_what_it_shows(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(page)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda it: it.stem)
+def test_a_recipe_is_a_page(page):
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= 60
+
+
+@pytest.mark.parametrize(
+    "expected", ["good b", "view 5 is wrong", "sigma 0.051 mm", "sigma 0.048 mm ... view 4"]
+)
+def test_what_was_not_said_is_noticed(expected):
+    said = "bad b\nview 4 is wrong, sigma 0.048 mm"
+    with pytest.raises(AssertionError, match="is not in what was said"):
+        match(expected, said, "a page")
+    match("view 4 is wrong, ... 0.049 mm", said, "a page")
