@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from visioncal.calibration import Alignment, CameraResult, Edge, Sight, Verdict
+from visioncal.core.transforms import exp
+from visioncal.results import Alignment, CameraResult, Edge, Sight, Verdict
 from visioncal.simulation import wide_camera
-from visioncal.transforms import exp
 
 FRAMES = {
     "base_a": "cell",

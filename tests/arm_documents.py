@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.robot import load_robot
-from visioncal.types import FloatArray
 
 # What the parameters' changes are, with their sigmas: one sure, one chance, one held.
 SURE, CHANCE = (1.2e-3, 1e-4), (-2e-4, 1.5e-4)

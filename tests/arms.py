@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.core.transforms import exp, invert
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData
@@ -11,7 +12,6 @@ from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.robot import Loads
-from visioncal.transforms import exp, invert
 
 ERROR_RAD = 1e-3
 # What a camera of 5 MP makes of a board at half a metre, and an arm that repeats well.

@@ -5,9 +5,9 @@ from functools import lru_cache
 import numpy as np
 import pypdfium2
 
-from visioncal.printing import Sheet, arrange, pages_named
-from visioncal.printing.drawing import to_pdf
-from visioncal.types import Image, Target
+from visioncal.core.types import Image, Target
+from visioncal.vision.printing import Sheet, arrange, pages_named
+from visioncal.vision.printing.drawing import to_pdf
 
 MM_PER_INCH = 25.4
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.simulation import Cell, forward
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import project
 from visioncal.simulation.sag import giving_of, load_torques, sagging
-from visioncal.transforms import adjoint, exp, invert, log
-from visioncal.types import Camera, FloatArray, IntArray
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
 _STEP = 1e-5

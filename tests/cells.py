@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.cameras import detect_targets
+from visioncal.calibration.stages.joints import Matched
+from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.core.transforms import invert, log
 from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import Cell, Sweep
 from visioncal.simulation.records import approach_text, load_row, pose_row
 from visioncal.simulation.second import BOARDS
-from visioncal.stages.cameras import detect_targets
-from visioncal.stages.joints import Matched
-from visioncal.stages.reported import Reported
-from visioncal.transforms import invert, log
 
 
 def session_of(cell: Cell) -> Session:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.cli.app import main
-from visioncal.types import FloatArray
+from visioncal.core.types import FloatArray
 
 QUATERNIONS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 

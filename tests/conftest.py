@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from visioncal.drivers import ur, ur_net, ur_primary, ur_watch
+from visioncal.live.drivers import ur, ur_net, ur_primary, ur_watch
 from visioncal.simulation import CellOptions, simulate, write_session
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

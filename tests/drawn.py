@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from rerun.chunk import RrdReader
 
-from visioncal.recording import paths
+from visioncal.present.recording import paths
 
 
 def column(

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.estimation.chain import FLANGE
 from visioncal.estimation.observability import (
     Direction,
@@ -21,7 +22,6 @@ from visioncal.estimation.solve import (
     fit_problem,
     starting_noise,
 )
-from visioncal.stages.handeye import closed_form_state
 
 
 @dataclass(frozen=True, eq=False)

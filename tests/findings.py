@@ -5,8 +5,8 @@ from typing import Any
 
 from samples import Sample
 
-from visioncal.calibration import Calibration
 from visioncal.estimation.appearance import BOARD_NAMES
+from visioncal.results import Calibration
 
 # So begins the reason of a view that contradicts the others; test_report checks it on a real one.
 CONTRADICTS = "disagrees with the other views: it places the target 36 mm and 1.5 deg away"

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from foreign_samples import MORE_RECORDINGS, RECORDINGS, Recording
 
-from visioncal.errors import DataError
-from visioncal.formats import convert
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import convert
 
 # Over what the libraries themselves take: a few copies of a file of the largest size read.
 ROOM_BYTES = 700_000_000

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.formats import PoseWishes, Wishes
-from visioncal.transforms import exp, invert
+from visioncal.core.transforms import exp, invert
+from visioncal.interchange.formats import PoseWishes, Wishes
 
 COUNT = 9
 CHARUCO = "charuco_5x7_36.195mm_18.256mm_DICT_6X6_250"

@@ -8,12 +8,12 @@ import numpy as np
 from picks import calibration_of
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Calibration
+from visioncal.core.types import FloatArray, Mount
+from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import Cell, CellOptions, prepare_scene, render, simulate
 from visioncal.simulation.render import encode
-from visioncal.targets import target_document
-from visioncal.types import FloatArray, Mount
+from visioncal.vision.targets import target_document
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 

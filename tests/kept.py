@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration import (
+from visioncal.core.types import Corners
+from visioncal.results import (
     Calibration,
     Edge,
     Rms,
@@ -16,9 +17,8 @@ from visioncal.calibration import (
     Verdict,
     ViewResult,
 )
-from visioncal.evidence import ViewEvidence
+from visioncal.results.evidence import ViewEvidence
 from visioncal.session import MemoryImages, Session, Stream, View
-from visioncal.types import Corners
 
 KEPT = Path(__file__).with_name("data")
 

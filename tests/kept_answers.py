@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from cells import calibrated
 
-from visioncal.errors import VisioncalError
-from visioncal.pipeline import align, calibrate
-from visioncal.pipeline.result import result_of
+from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import invert, log
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -39,7 +40,6 @@ from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.options import Second, checkerboard_target
 from visioncal.simulation.sag import Payload
-from visioncal.transforms import invert, log
 
 KEPT = Path(__file__).with_name("data") / "answers.json"
 

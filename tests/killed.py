@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.session import Session
 
 _PROGRAM = Path(__file__).with_name("recorded.py")

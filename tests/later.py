@@ -8,13 +8,13 @@ import numpy as np
 from cells import calibrated, known_of
 from test_kinematics import WRONG_LINKS, target_in_camera
 
-from visioncal.calibration import Calibration
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.core.transforms import exp
+from visioncal.core.types import Corners, FloatArray, Mount
+from visioncal.results import Calibration
 from visioncal.simulation import Cell, CellOptions, project, simulate
 from visioncal.simulation.boards import corners_m
-from visioncal.transforms import exp
-from visioncal.types import Corners, FloatArray, Mount
 
 # Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
 ANYHOW = replace(WRONG_LINKS, roll_rad=np.pi, branches=True)

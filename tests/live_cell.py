@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 from planned import true_cell
 
-from visioncal.camera import matrix_3x3
-from visioncal.drivers.protocols import ArmState, Frame, Safety
-from visioncal.errors import DriverError
-from visioncal.planning.cell import Limits, PlanCell
-from visioncal.planning.purposes import purpose_of
-from visioncal.planning.read_back import PlanFile, Stop
+from visioncal.core.errors import DriverError
+from visioncal.core.types import Camera, CameraMount, FloatArray
+from visioncal.live.drivers.protocols import ArmState, Frame, Safety
+from visioncal.live.planning.cell import Limits, PlanCell
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
-from visioncal.targets import charuco_board
-from visioncal.types import Camera, CameraMount, FloatArray
+from visioncal.vision.camera import matrix_3x3
+from visioncal.vision.targets import charuco_board
 
 # Of the fakes: a controller's cycle, a camera's frame period and exposure [s].
 CYCLE_S, PERIOD_S, EXPOSURE_S = 0.002, 1.0 / 30.0, 0.01

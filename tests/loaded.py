@@ -3,11 +3,11 @@
 import numpy as np
 from tracked import known_of
 
-from visioncal.pipeline.known import Known
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.core.types import FloatArray
 from visioncal.simulation import Payload, arm_named, forward
 from visioncal.simulation.sag import giving_of, sagging
 from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
-from visioncal.types import FloatArray
 
 # Shoulder and elbow yield, the rest does not [N m/rad].
 STIFFNESS = (np.inf, 1.4e6, 9e5, np.inf, np.inf, np.inf)

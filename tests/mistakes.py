@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from cells import known_of
 
-from visioncal.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
-from visioncal.guess import Guess, guess_reading
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, Mount
 from visioncal.simulation import Cell
-from visioncal.transforms import invert
-from visioncal.types import FloatArray, Mount
 
 OTHER: Mapping[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
 HALF_TURNS = [np.diag([*it, 1.0]) for it in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]

@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 
-from visioncal.types import Image
+from visioncal.core.types import Image
 
 # Bits of a number, dark or light in blocks along the picture's upper edge, a tenth of it high.
 _BITS, _HIGH = 16, 10

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.reading import read_recorded
@@ -11,7 +12,6 @@ from visioncal.robot import Robot, load_robot
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import DynamicArm
 from visioncal.simulation.exercise import Exercise, Senses, record
-from visioncal.types import FloatArray
 
 _ROWS, _COLUMNS = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 

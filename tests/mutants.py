@@ -29,9 +29,9 @@ import typer
 from mutators import mutate
 from sound_inputs import MAKERS, Inputs, typed
 
-from visioncal import viewer
 from visioncal.cli import app as application
-from visioncal.errors import VisioncalError
+from visioncal.core.errors import VisioncalError
+from visioncal.present import viewer
 
 LONGEST_S = 60.0
 MOST_BYTES = 2 * 1024**3

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.transforms import exp, invert
+from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.network import Network, Sight, camera_named, sheet_named
 from visioncal.simulation.optics import project
-from visioncal.transforms import exp, invert
-from visioncal.types import FloatArray
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
 _STEP = 1e-5

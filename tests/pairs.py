@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from cells import calibrated
 
-from visioncal.calibration import Calibration, Edge, Rms, Validation, Verdict, ViewResult
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.core.transforms import exp, invert
 from visioncal.estimation.chain import edge_names
-from visioncal.pipeline.known import Known
+from visioncal.results import Calibration, Edge, Rms, Validation, Verdict, ViewResult
 from visioncal.simulation import Cell
-from visioncal.transforms import exp, invert
 
 
 def halves(cell: Cell) -> tuple[Cell, Cell]:

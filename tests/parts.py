@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import expm
 
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray
 from visioncal.estimation.features import FeatureTouches
 from visioncal.estimation.pointpairs import PointPairs
-from visioncal.transforms import skew
-from visioncal.types import FloatArray
 
 # Derivatives by central differences are exact to 1e-8 at this step, of lengths near a metre.
 _STEP = 1e-6

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from cells import calibrated
 
-from visioncal.calibration import Calibration
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
-from visioncal.pipeline.result import result_of
+from visioncal.results import Calibration
 from visioncal.simulation import Cell, project, rays
 from visioncal.simulation.boards import Sheet, corners_m
-from visioncal.targets import corner_positions
-from visioncal.transforms import compose, exp, invert
-from visioncal.types import Corners, FloatArray, Target
+from visioncal.vision.targets import corner_positions
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from visioncal.calibration import Edge, Frame, FrameFile, Observation, Verdict
-from visioncal.transforms import exp
+from visioncal.core.transforms import exp
+from visioncal.results import Edge, Frame, FrameFile, Observation, Verdict
 
 TOOL, FIXTURE = "flange_from_tool", "base_from_fixture"
 CREATED = "2026-11-20T12:13:14+00:00"

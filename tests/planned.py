@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 from cells import known_of
 
-from visioncal.errors import DegenerateError
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import exp
+from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise
-from visioncal.pipeline.steps import STAGES
-from visioncal.planning.cell import PlanCell
-from visioncal.planning.recorded import SoFar
+from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.recorded import SoFar
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, simulate
-from visioncal.transforms import exp
-from visioncal.types import FloatArray
 
 
 def plan_cell(options: CellOptions, sigma_rad: float = 0.0, sigma_m: float = 0.0) -> PlanCell:

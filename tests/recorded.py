@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
-from visioncal.capture.core import Step, Watcher
-from visioncal.capture.facts import Facts
-from visioncal.capture.journal import Journal
-from visioncal.capture.live import LiveCell
-from visioncal.capture.options import CaptureOptions, Stillness
-from visioncal.capture.record import record
-from visioncal.capture.take import Taken
-from visioncal.planning.read_back import PlanFile
+from visioncal.live.capture.core import Step, Watcher
+from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.record import record
+from visioncal.live.capture.take import Taken
+from visioncal.live.planning.read_back import PlanFile
 from visioncal.session import Session
 
 # A UR repeats to 0.03 to 0.05 mm; what stands within is where it was told to be.

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from visioncal.targets import corner_positions, marked_squares, marker_cells
-from visioncal.types import Target
+from visioncal.core.types import Target
+from visioncal.vision.targets import corner_positions, marked_squares, marker_cells
 
 SAMPLES = 4
 FOCAL_PX = 1300.0

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration import (
+from visioncal.core.transforms import exp, invert
+from visioncal.core.types import Camera, Corners, FloatArray, Target
+from visioncal.results import (
     Calibration,
     CameraResult,
     Edge,
@@ -18,14 +20,12 @@ from visioncal.calibration import (
     Verdict,
     ViewResult,
 )
-from visioncal.camera import project
-from visioncal.evidence import ViewEvidence
+from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.targets import charuco_board, corner_positions, load_target
-from visioncal.transforms import exp, invert
-from visioncal.types import Camera, Corners, FloatArray, Target
+from visioncal.vision.camera import project
+from visioncal.vision.targets import charuco_board, corner_positions, load_target
 
 TARGET = "charuco_9x6_30mm"
 RESOLUTION = (640, 400)

@@ -8,17 +8,17 @@ import numpy as np
 from cells import session_of
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import VisioncalError
-from visioncal.pipeline.guessing import reading_hint
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.guess_inputs import reading_hint
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.cameras import detect_targets
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import compose
+from visioncal.core.types import FloatArray
 from visioncal.robot import load_robot, read_robot_document
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 from visioncal.simulation import Cell
-from visioncal.stages.cameras import detect_targets
-from visioncal.transforms import compose
-from visioncal.types import FloatArray
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # The generation before each arm.

@@ -21,6 +21,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from touched import TIP, Job, touched
 
+from visioncal.core.types import FloatArray
 from visioncal.robot import load_robot
 from visioncal.simulation import (
     BoardAt,
@@ -39,7 +40,6 @@ from visioncal.simulation import (
 from visioncal.simulation.dynamics import Body, real_dynamics
 from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record
 from visioncal.simulation.tracked import Tracked, session_of, tracked
-from visioncal.types import FloatArray
 
 CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
 VIEWS = 7
@@ -306,8 +306,8 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "drawing.csv": _drawing,
     "targets.csv": _targets,
     "frames.json": _frames,
-    "policy.toml": _packaged("verification/policy.toml"),
-    "arm.toml": _packaged("robots/ur10e.toml"),
+    "policy.toml": _packaged("calibration/verification/policy.toml"),
+    "arm.toml": _packaged("robot/models/ur10e.toml"),
     "arm.json": _command("export", "[arm_out]", "--to", "robot-json", "-o"),
     "arm.urdf": _command("export", "[arm_out]", "--to", "robot-urdf", "-o"),
     "target.toml": _target,

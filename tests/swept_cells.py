@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from visioncal.core.types import Corners
 from visioncal.session import Session
 from visioncal.simulation import (
     CameraAt,
@@ -11,7 +12,6 @@ from visioncal.simulation import (
     network_session,
     simulate_network,
 )
-from visioncal.types import Corners
 
 AHEAD_S = 0.037
 # At its stops it takes no image.

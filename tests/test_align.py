@@ -8,10 +8,12 @@ import pytest
 from cells import calibrated, session_of
 from commands import visioncal
 
-from visioncal.calibration import Alignment, Calibration, to_document
-from visioncal.errors import DataError, DegenerateError
-from visioncal.exports import Selection, document
-from visioncal.pipeline import align, calibrate
+from visioncal.calibration.pipeline import align, calibrate
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Target
+from visioncal.interchange.exports import Selection, document
+from visioncal.results import Alignment, Calibration, to_document
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE
@@ -30,8 +32,6 @@ from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.records import pairs_session, pose_row
 from visioncal.simulation.sag import Payload
-from visioncal.transforms import exp, invert, log
-from visioncal.types import Target
 
 STOPS = 20
 # Looks the same after half a turn: both counts are even.

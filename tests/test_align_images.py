@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from commands import visioncal
 
-from visioncal.calibration import Alignment
+from visioncal.core.transforms import log
+from visioncal.results import Alignment
 from visioncal.session import Session
 from visioncal.simulation import (
     BoardAt,
@@ -21,7 +22,6 @@ from visioncal.simulation import (
     wide_camera,
     write_network,
 )
-from visioncal.transforms import log
 
 SMALL = replace(wide_camera(), resolution=(640, 480), matrix=np.array([560.0, 559.0, 321.0, 238.0]))
 LARGE = replace(wide_camera(), resolution=(800, 600), matrix=np.array([760.0, 761.0, 398.0, 301.0]))

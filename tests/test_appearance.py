@@ -7,14 +7,14 @@ import pytest
 from cells import calibrated, error_of, known_of
 from scipy.stats import chi2
 
-from visioncal.camera import intrinsics
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import Target
 from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.poses import reproject
 from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.targets import corner_positions
-from visioncal.transforms import invert, log
-from visioncal.types import Target
+from visioncal.vision.camera import intrinsics
+from visioncal.vision.targets import corner_positions
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 MOUNTS = ("eye-in-hand", "eye-to-hand")

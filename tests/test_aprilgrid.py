@@ -8,15 +8,15 @@ import pytest
 from boards import any_page, aprilgrid, printed
 from rendered import Shot, photograph
 
-from visioncal.errors import DataError
-from visioncal.finders import NotFound, Seen, find_target
-from visioncal.finders.identify import identify
-from visioncal.formats.boards import described_target
-from visioncal.pipeline import run
+from visioncal.calibration.pipeline import run
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.interchange.formats.boards import described_target
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, aprilgrid_target, simulate, write_session
-from visioncal.targets import corner_positions, target_document, target_from_document
-from visioncal.transforms import invert, log
+from visioncal.vision.finders import NotFound, Seen, find_target
+from visioncal.vision.finders.identify import identify
+from visioncal.vision.targets import corner_positions, target_document, target_from_document
 
 GRID = aprilgrid(5, 3)
 SHOT = Shot(square_px=50, noise=2)

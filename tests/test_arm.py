@@ -7,10 +7,10 @@ import pytest
 from cells import calibrated, error_of
 
 import visioncal
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.estimation.arm import LEVER_M, link_basis, pose_basis
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
-from visioncal.transforms import compose, exp, invert, log
 
 WRONG = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
 MOUNTS = ("eye-in-hand", "eye-to-hand")

@@ -16,13 +16,13 @@ from readers import ARM_FORMATS, rx, ry, rz, transform
 from samples import made_up
 from test_robot_models import URDF, of_urdf, some_changes, some_joints
 
-from visioncal.errors import DataError
-from visioncal.exports import Selection, document, export
-from visioncal.exports.arm import omission_mm
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
+from visioncal.interchange.exports import Selection, document, export
+from visioncal.interchange.exports.arm import omission_mm
+from visioncal.interchange.result_files import load_placed
 from visioncal.robot import CONVENTIONS, Robot, load_robot
 from visioncal.session import Session
-from visioncal.stored import load_placed
-from visioncal.transforms import exp
 
 SAMPLE = made_up(5).calibration
 SIGMA = {"median": 0.123, "p95": 0.345}

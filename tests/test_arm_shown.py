@@ -12,14 +12,14 @@ from pages import Page, section
 from rerun.chunk import RrdReader
 from samples import Sample, made_up
 
-from visioncal.calibration import Calibration, to_document
-from visioncal.errors import DataError
-from visioncal.recording import armtext, notes, paths, read_calibration, write_recording
-from visioncal.recording.kinematics import Kinematics
-from visioncal.recording.workspace import ArmPicture
-from visioncal.report.arm import arm_card
-from visioncal.report.page import render
-from visioncal.viewer import blueprint
+from visioncal.core.errors import DataError
+from visioncal.present.recording import armtext, notes, paths, read_calibration, write_recording
+from visioncal.present.recording.kinematics import Kinematics
+from visioncal.present.recording.workspace import ArmPicture
+from visioncal.present.report.arm import arm_card
+from visioncal.present.report.page import render
+from visioncal.present.viewer import blueprint
+from visioncal.results import Calibration, to_document
 
 
 @pytest.fixture(scope="module")

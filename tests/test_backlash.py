@@ -8,7 +8,7 @@ from cells import calibrated
 from test_elastic import COBOT, SAGGING
 from test_kinematics import GOOD
 
-from visioncal.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of
 from visioncal.simulation import simulate
 
 PLAY = (3e-4, 5e-4, 4e-4, 6e-4, 3e-4, 4e-4)

@@ -8,14 +8,17 @@ from cells import calibrated, error_of, known_of
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
-from visioncal.errors import DataError, DegenerateError
+from visioncal.calibration.pipeline import run
+from visioncal.calibration.pipeline.guess_inputs import guess_session
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.workspace import postures
-from visioncal.frames.sighting import sighting
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import run
-from visioncal.pipeline.guessing import guess_session
-from visioncal.pipeline.result import result_of
-from visioncal.pipeline.steps import STAGES
+from visioncal.frames.session_observations import sighting
+from visioncal.interchange.outputs import write_outputs
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -30,9 +33,6 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.optics import project
-from visioncal.stages.detect import detect
-from visioncal.transforms import exp, invert, log
-from visioncal.verification.footing import Footing
 
 # The second board is out of sight from where the first is looked at, unless it is turned less.
 NEAR = Second(turn_rad=0.6, tilt_rad=0.2)

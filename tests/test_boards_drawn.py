@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from boards import charuco, checkerboard
 
-from visioncal.finders.charuco import find_charuco
-from visioncal.printing import draw_pattern
-from visioncal.recording.board import picture
+from visioncal.core.types import Target
+from visioncal.present.recording.board import picture
 from visioncal.simulation.textures import draw_sheet
-from visioncal.targets import corner_positions, marker_cells, target_from_document
-from visioncal.types import Target
+from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.printing import draw_pattern
+from visioncal.vision.targets import corner_positions, marker_cells, target_from_document
 
 DICTIONARIES = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
 

@@ -10,9 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import visioncal
-from visioncal.calibration import Calibration, to_document
-from visioncal.errors import DataError, DegenerateError
-from visioncal.pipeline import run
+from visioncal.calibration.pipeline import run
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -22,7 +23,6 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
-from visioncal.transforms import invert, rotation_angle
 
 CONTRACT_KEYS = {
     "joint_fit",

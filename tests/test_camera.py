@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from visioncal.camera import (
+from visioncal.core.types import Camera
+from visioncal.vision.camera import (
     intrinsics,
     matrix_3x3,
     normalise,
@@ -12,7 +13,6 @@ from visioncal.camera import (
     project_with_jacobian,
     with_intrinsics,
 )
-from visioncal.types import Camera
 
 MATRIX = np.array([900.0, 905.0, 640.5, 399.0])
 CAMERAS = {

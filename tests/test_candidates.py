@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from apart import UR5E_RADIUS_M, clearances, corners, lines, lines_apart, tubes
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise
-from visioncal.planning.candidates import candidates
-from visioncal.planning.cell import Box, Limits, PlanCell
-from visioncal.planning.design import chosen
-from visioncal.planning.information import worlds_of
-from visioncal.planning.path import ordered
-from visioncal.planning.purposes import PURPOSES
+from visioncal.live.planning.candidates import candidates
+from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.design import chosen
+from visioncal.live.planning.information import worlds_of
+from visioncal.live.planning.path import ordered
+from visioncal.live.planning.purposes import PURPOSES
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.arms import forward, ur_arm
 from visioncal.simulation.boards import Sheet, centre_m, outline_m
 from visioncal.simulation.optics import sees
-from visioncal.transforms import compose, exp, invert, log
-from visioncal.types import FloatArray
 
 POSES = [compose(np.eye(3), np.array([0.1, 0.45, 0.2])), exp(np.array([0, 0, 0.5, 0.5, -0.4, 0.1]))]
 BOXES = (

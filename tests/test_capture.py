@@ -8,20 +8,20 @@ import pytest
 from live_cell import FakeArm, fake_devices, fake_plan
 from recorded import QUICK, REPEATABILITY_M, errors_m, recorded
 
-from visioncal.capture.agree import Agreement
-from visioncal.capture.approach import Ways
-from visioncal.capture.core import missed
-from visioncal.capture.drive import travel_s
-from visioncal.capture.live import LiveCell
-from visioncal.capture.options import CaptureOptions, Stillness
-from visioncal.capture.record import departure
-from visioncal.capture.still import image_motion_px
-from visioncal.errors import DataError, DriverError
-from visioncal.pipeline import run
-from visioncal.planning.cell import Box
-from visioncal.planning.read_back import PlanFile
+from visioncal.calibration.pipeline import run
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.transforms import compose
+from visioncal.live.capture.approach import Ways
+from visioncal.live.capture.core import missed
+from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.record import departure
+from visioncal.live.capture.still import image_motion_px
+from visioncal.live.planning.cell import Box
+from visioncal.live.planning.read_back import PlanFile
 from visioncal.session import Session
-from visioncal.transforms import compose
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from killed import kill_and_resume
 from live_cell import fake_devices, fake_plan
 from recorded import recorded
 
-from visioncal.capture import journal as journal_module
-from visioncal.errors import DataError, DriverError
-from visioncal.planning.read_back import PlanFile
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.capture import journal as journal_module
+from visioncal.live.planning.read_back import PlanFile
 from visioncal.session import Session
 
 

@@ -5,17 +5,17 @@ import pytest
 from live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 from recorded import QUICK, REPEATABILITY_M, errors_m, facts_of
 
-from visioncal.capture.agree import Agreement
-from visioncal.capture.coach import Coach
-from visioncal.capture.core import Capture, Step
-from visioncal.capture.follow import ask_and_take, follow
-from visioncal.capture.journal import Journal
-from visioncal.capture.live import LiveCell
-from visioncal.capture.take import Taken
-from visioncal.planning.read_back import PlanFile
+from visioncal.calibration.stages.detect import look_for
+from visioncal.core.types import Corners
+from visioncal.live.capture.coach import Coach
+from visioncal.live.capture.core import Capture, Step
+from visioncal.live.capture.follow import ask_and_take, follow
+from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.take import Taken
+from visioncal.live.planning.read_back import PlanFile
 from visioncal.session import Session
-from visioncal.stages.detect import look_for
-from visioncal.types import Corners
 
 
 @pytest.fixture(scope="module")

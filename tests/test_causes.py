@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.estimation.causes import Belief, Cause, _at, explain, undone
+from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation.chain import chain
+from visioncal.estimation.model_evidence import Belief, Cause, _at, explain, undone
 from visioncal.estimation.parts import ROBOT, Noise, State
-from visioncal.transforms import adjoint, exp, invert, log
 
 NOISE = Noise.of_robot(1e-4, 1e-4)
 MOUNTS = ("eye-in-hand", "eye-to-hand")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from swept_cells import AHEAD_S, cell_of, swept_session
 
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError
-from visioncal.pipeline import align
+from visioncal.calibration.pipeline import align
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.results import Calibration
 from visioncal.simulation.layout import NetworkOptions
-from visioncal.transforms import invert, log
 
 CLOCK = "cam_side and robot b"
 

@@ -8,13 +8,13 @@ import pytest
 from commands import turned_poses, visioncal, write_poses
 from whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
-from visioncal.calibration import Calibration, RobotResult
 from visioncal.cli.console import unused_words
-from visioncal.compare import compare
-from visioncal.compensation import correct
+from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.locate import locate
 from visioncal.frames.plane import Plane
-from visioncal.frames.seen_frame import seen_frame
+from visioncal.results import Calibration, RobotResult
+from visioncal.results.compare import compare
+from visioncal.results.compensation import correct
 from visioncal.session import Session
 from visioncal.simulation import Moved, simulate_network
 

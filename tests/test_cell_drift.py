@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError
-from visioncal.pipeline import align
+from visioncal.calibration.pipeline import align
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.results import Calibration
 from visioncal.simulation.layout import CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.network import Network, simulate_network
 from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.warmup import Heat
-from visioncal.transforms import invert, log
 
 # Chi-square of six and of twelve degrees of freedom is below these but for one in a thousand.
 OF_SIX, OF_TWELVE = 22.5, 32.9

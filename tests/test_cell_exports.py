@@ -9,13 +9,13 @@ import pytest
 import yaml
 from aligned_cells import made_up_cell
 
-from visioncal.calibration import CameraResult
-from visioncal.errors import DataError
-from visioncal.exports import Selection, document, export
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.interchange.exports import Selection, document, export
+from visioncal.interchange.result_files import load_calibration, load_exportable
+from visioncal.results import CameraResult
 from visioncal.session.choosing import Choice
 from visioncal.simulation import fisheye_camera, wide_camera
-from visioncal.stored import load_calibration, load_exportable
-from visioncal.transforms import invert
 
 CELL = made_up_cell(4)
 POSE = {"rotation": ("x", "y", "z", "w"), "translation": ("x", "y", "z")}

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
-from visioncal.pipeline import align
+from visioncal.calibration.pipeline import align
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
 from visioncal.simulation.layout import CameraAt, NetworkOptions
 from visioncal.simulation.network import simulate_network
 from visioncal.simulation.network_records import network_session
-from visioncal.transforms import invert, log
 
 STOPS = 14
 

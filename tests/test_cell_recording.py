@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from visioncal.calibration import Alignment, Edge, Sight, Verdict
-from visioncal.errors import DataError
-from visioncal.exports import Selection, export
-from visioncal.outputs import write_alignment
-from visioncal.recording import paths, read_alignment, read_session
-from visioncal.recording.cells import CellScene
-from visioncal.recording.frames import scan
-from visioncal.recording.reader import chunks
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, pose_difference
+from visioncal.interchange.exports import Selection, export
+from visioncal.interchange.outputs import write_alignment
+from visioncal.interchange.result_files import load_exportable
+from visioncal.present.recording import paths, read_alignment, read_session
+from visioncal.present.recording.cells import CellScene
+from visioncal.present.recording.frames import scan
+from visioncal.present.recording.reader import chunks
+from visioncal.results import Alignment, Edge, Sight, Verdict
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
     BoardAt,
@@ -20,8 +22,6 @@ from visioncal.simulation import (
     network_session,
     simulate_network,
 )
-from visioncal.stored import load_exportable
-from visioncal.transforms import invert, pose_difference
 
 OPTIONS = NetworkOptions(
     cameras=(CameraAt("top"), CameraAt("hand", "a")),

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from aligned_cells import made_up_cell
 
-from visioncal.calibration import Moved, RobotResult, Sight, Untied
-from visioncal.figures import significant
-from visioncal.recording.cellmap import pairs, weakest_frame
-from visioncal.report.cells import pair_table, render_cell, write_cell_report
+from visioncal.core.number_format import significant
+from visioncal.present.recording.cellmap import pairs, weakest_frame
+from visioncal.present.report.cells import pair_table, render_cell, write_cell_report
+from visioncal.results import Moved, RobotResult, Sight, Untied
 
 CELL = made_up_cell(5)
 

@@ -8,8 +8,8 @@ import pytest
 from problems import observed, pose, world
 from whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
-from visioncal.errors import DegenerateError
-from visioncal.pipeline import align
+from visioncal.calibration.pipeline import align
+from visioncal.core.errors import DegenerateError
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
     BoardAt,

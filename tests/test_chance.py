@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f, t
 
-from visioncal.chance import chi2_limit, f_limit, t_chance
+from visioncal.core.quantiles import chi2_limit, f_limit, t_chance
 
 CHANCES = (0.5, 0.05, 1e-4, 1e-9)
 
@@ -28,6 +28,7 @@ def test_chance_counts_both_sides(value):
 
 
 def test_nothing_loads_the_slow_way_to_them():
-    code = "import sys, visioncal.pipeline, visioncal.frames; print('scipy.stats' in sys.modules)"
+    code = "import sys, visioncal.calibration.pipeline, visioncal.frames;"
+    code += "print('scipy.stats' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "False"

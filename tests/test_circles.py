@@ -7,10 +7,9 @@ import pytest
 from boards import circles
 from rendered import Shot, photograph
 
-from visioncal.errors import DataError
-from visioncal.finders import NotFound, Seen, find_target
-from visioncal.finders.identify import identify
-from visioncal.pipeline import run
+from visioncal.calibration.pipeline import run
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -19,8 +18,14 @@ from visioncal.simulation import (
     symmetric_circles_target,
     write_session,
 )
-from visioncal.targets import corner_positions, rotations, target_document, target_from_document
-from visioncal.transforms import invert, log
+from visioncal.vision.finders import NotFound, Seen, find_target
+from visioncal.vision.finders.identify import identify
+from visioncal.vision.targets import (
+    corner_positions,
+    rotations,
+    target_document,
+    target_from_document,
+)
 
 SHIFTED, EVEN = circles(4, 7, asymmetric=True, diameter_m=0.014), circles(6, 5)
 SHOT = Shot(square_px=24, noise=2)

@@ -11,7 +11,7 @@ from rich.text import Text
 from typer.main import get_command
 
 from visioncal.cli.app import app
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
 
@@ -187,7 +187,8 @@ def test_help_loses_no_unit_to_markup():
 
 
 def test_boards_and_robots_are_found_from_any_folder(tmp_path):
-    code = "from visioncal.targets import target_names; from visioncal.robot import robot_names;"
+    code = "from visioncal.vision.targets import target_names;"
+    code += "from visioncal.robot import robot_names;"
     code += "print(*target_names(), *robot_names())"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True

@@ -8,12 +8,18 @@ import pytest
 from cells import calibrated_sweep
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError, DegenerateError
-from visioncal.pipeline import STAGES, calibrate
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.result import result_of
-from visioncal.recording import write_recording
-from visioncal.report.content import method_facts
+from visioncal.calibration.pipeline import STAGES, calibrate
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.stages.clocks import set_clocks
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.offset import LARGEST_SIGMA_S, Clock
+from visioncal.calibration.stages.pnp import given_poses
+from visioncal.calibration.verification import verify
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.present.recording import write_recording
+from visioncal.present.report.content import method_facts
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, Stream, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
@@ -29,12 +35,6 @@ from visioncal.simulation import (
     truth_path,
     write_sweep,
 )
-from visioncal.stages.clocks import set_clocks
-from visioncal.stages.observed import Observed
-from visioncal.stages.offset import LARGEST_SIGMA_S, Clock
-from visioncal.stages.pnp import given_poses
-from visioncal.transforms import exp, invert, log
-from visioncal.verification import verify
 
 AHEAD_S = 0.0372
 # 7 s at 30 Hz; a PnP's noise of some tenths of a millimetre.

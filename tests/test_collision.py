@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from apart import UR5E_PAIRS, UR5E_RADIUS_M, clearances, corners, line_to_box, lines, tubes
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp
 from visioncal.robot import Robot, load_robot, read_robot_document
 from visioncal.robot.bodies import Body, arm_bodies, capsule
 from visioncal.robot.collision import Collisions
 from visioncal.simulation.arms import ur_arm
-from visioncal.transforms import compose, exp
 
 POST = compose(np.eye(3), np.array([0.45, 0.1, 0.3]))
 POST_SIZE = np.array([0.1, 0.15, 0.6])

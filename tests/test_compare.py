@@ -18,11 +18,11 @@ from pairs import (
 )
 from samples import made_up
 
-from visioncal.calibration import Calibration, CameraResult, Edge, ViewResult
-from visioncal.compare import FALSE_ALARMS, compare, to_document
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Camera, Mount
+from visioncal.results import Calibration, CameraResult, Edge, ViewResult
+from visioncal.results.compare import FALSE_ALARMS, compare, to_document
 from visioncal.simulation import Cell, CellOptions, simulate
-from visioncal.transforms import exp, invert, log
-from visioncal.types import Camera, Mount
 
 PAIRS = 8
 SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])

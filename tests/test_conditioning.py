@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from moved_arms import changed
 
+from visioncal.core.errors import DataError
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.reading import read_recorded
-from visioncal.errors import DataError
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import real_dynamics
 from visioncal.simulation.exercise import Senses, multi_sine, record

@@ -7,15 +7,15 @@ import time
 import numpy as np
 import pytest
 
-from visioncal.errors import DriverError
-from visioncal.rehearsal.controller import main, spawn
-from visioncal.rehearsal.kinematics import matrix_of, pose_of, tool_pose
-from visioncal.rehearsal.machine import Machine
-from visioncal.rehearsal.motion import Brake, Profile, joint_way
-from visioncal.rehearsal.options import ControllerOptions, believed_arm
-from visioncal.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
-from visioncal.rehearsal.script import DONE, READY, ControlScript
-from visioncal.rehearsal.truth import TruthClient
+from visioncal.core.errors import DriverError
+from visioncal.live.rehearsal.controller import main, spawn
+from visioncal.live.rehearsal.kinematics import matrix_of, pose_of, tool_pose
+from visioncal.live.rehearsal.machine import Machine
+from visioncal.live.rehearsal.motion import Brake, Profile, joint_way
+from visioncal.live.rehearsal.options import ControllerOptions, believed_arm
+from visioncal.live.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
+from visioncal.live.rehearsal.script import DONE, READY, ControlScript
+from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.simulation.arms import forward
 
 OPTIONS = ControllerOptions(seed=3)
@@ -244,7 +244,7 @@ def test_a_taken_address_is_told(controller, capfd):
 def test_a_controller_ends_with_the_process_that_started_it():
     code = (
         "import os\n"
-        "from visioncal.rehearsal.controller import spawn\n"
+        "from visioncal.live.rehearsal.controller import spawn\n"
         "running = spawn()\n"
         "print(running.host, flush=True)\n"
         "os.kill(os.getpid(), 9)\n"

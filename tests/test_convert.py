@@ -10,11 +10,11 @@ import pytest
 from samples import made_up
 from typer.testing import CliRunner
 
+from visioncal.calibration.pipeline import calibrate
 from visioncal.cli.app import app
-from visioncal.errors import DataError
-from visioncal.formats import convert
-from visioncal.pipeline import calibrate
-from visioncal.recording import RecordingWriter
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import convert
+from visioncal.present.recording import RecordingWriter
 from visioncal.session import Session
 
 

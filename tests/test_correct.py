@@ -12,14 +12,14 @@ from commands import write_poses
 from test_kinematics import WRONG_LINKS
 
 import visioncal
-from visioncal.calibration import Calibration
-from visioncal.compensation.arms import predicted_sigma_mm
-from visioncal.errors import DataError
-from visioncal.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.results import Calibration
+from visioncal.results.compensation.arms import predicted_sigma_mm
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.simulation import forward, simulate
-from visioncal.transforms import invert
 
 HOME = np.array([0.4, -1.3, 1.5, -1.75, -1.57, 0.3])
 SEED = "0.4,-1.3,1.5,-1.75,-1.57,0.3"

@@ -8,14 +8,14 @@ import pytest
 from boards import charuco, checkerboard
 from rendered import Shot, photograph
 
-from visioncal.dense import library
-from visioncal.dense.blur import Blur, transfer
-from visioncal.dense.fit import fit_corners
-from visioncal.dense.prints import Print
-from visioncal.dense.shown import MIDDLE, explain
-from visioncal.errors import DataError
-from visioncal.finders.template import refine
-from visioncal.types import Camera
+from visioncal.core.errors import DataError
+from visioncal.core.types import Camera
+from visioncal.vision.dense import library
+from visioncal.vision.dense.blur import Blur, transfer
+from visioncal.vision.dense.fit import fit_corners
+from visioncal.vision.dense.prints import Print
+from visioncal.vision.dense.shown import MIDDLE, explain
+from visioncal.vision.finders.template import refine
 
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
 SHOT = Shot(square_px=32, noise=2)

@@ -11,8 +11,10 @@ from commands import visioncal
 from smeared import smeared
 
 import visioncal as package
-from visioncal.errors import DataError
-from visioncal.pipeline import run, run_dense
+from visioncal.calibration.pipeline import run, run_dense
+from visioncal.calibration.stages import dense as stage
+from visioncal.calibration.stages.detect import detect
+from visioncal.core.errors import DataError
 from visioncal.session.single import is_whole_cell
 from visioncal.simulation import (
     CellOptions,
@@ -24,8 +26,6 @@ from visioncal.simulation import (
 from visioncal.simulation.optics import wide_camera
 from visioncal.simulation.options import checkerboard_target
 from visioncal.simulation.records import pairs_session
-from visioncal.stages import dense as stage
-from visioncal.stages.detect import detect
 
 CAMERA = wide_camera()
 # A quarter of the pixels, a robot without noise.

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from varied_arms import placed
 from varied_images import Lens, Light, Print, draw
 
-from visioncal.errors import DataError
-from visioncal.finders import NotFound, Seen, find_target
-from visioncal.finders.headers import claimed_size
-from visioncal.finders.imaging import blur_at_corners, decode_image
+from visioncal.calibration.stages.detect import DetectOptions, detect
+from visioncal.core.errors import DataError
+from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import (
     CellOptions,
@@ -24,9 +23,10 @@ from visioncal.simulation import (
     render,
     simulate,
 )
-from visioncal.stages.detect import DetectOptions, detect
-from visioncal.targets import charuco_board, corner_positions
-from visioncal.types import Target
+from visioncal.vision.finders import NotFound, Seen, find_target
+from visioncal.vision.finders.headers import claimed_size
+from visioncal.vision.finders.imaging import blur_at_corners, decode_image
+from visioncal.vision.targets import charuco_board, corner_positions
 
 
 def encoded(image, ending=".png"):

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
 from visioncal.robot import (
     CONVENTIONS,
     DHTable,
@@ -23,7 +24,6 @@ from visioncal.robot import (
     table_from_document,
     table_of,
 )
-from visioncal.transforms import exp
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 NUMBERS = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad", "parallel", "base", "flange")

@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from visioncal.calibration.document import KINDS
-from visioncal.documents import (
+from visioncal.core.documents import (
     as_numbers,
     parse_stored,
     read_json,
@@ -25,10 +24,11 @@ from visioncal.documents import (
     read_xml,
     read_yaml,
 )
-from visioncal.documents.jsons import parse_json
-from visioncal.documents.yamls import parse_yaml
-from visioncal.errors import DataError
-from visioncal.files import read_bytes
+from visioncal.core.documents.jsons import parse_json
+from visioncal.core.documents.yamls import parse_yaml
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes
+from visioncal.results.document import KINDS
 
 
 @pytest.fixture

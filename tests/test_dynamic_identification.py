@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from moved_arms import changed, recorded, robot_with_bodies, true_base
 
+from visioncal.core.errors import DegenerateError
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.friction import FrictionTerms
@@ -16,11 +17,10 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
+from visioncal.dynamics.null_space import untold
 from visioncal.dynamics.reading import Recorded, read_recorded
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
-from visioncal.dynamics.untold import untold
 from visioncal.dynamics.validate import friction_of_known, predict, validate
-from visioncal.errors import DegenerateError
 from visioncal.robot import load_robot
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import Exercise, Senses, multi_sine, record, slow_sweep

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from kept import kept_session
 
+from visioncal.core.errors import DataError
 from visioncal.dynamics import (
     ArmDynamics,
     BaseModel,
@@ -19,7 +20,6 @@ from visioncal.dynamics import (
     external_torques,
     sign,
 )
-from visioncal.errors import DataError
 from visioncal.robot import (
     Inertias,
     Loads,

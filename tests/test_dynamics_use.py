@@ -8,6 +8,7 @@ import pytest
 from commands import visioncal
 from drawn import column
 
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.dynamics import (
     ArmDynamics,
     BaseModel,
@@ -25,9 +26,8 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identify import Options
 from visioncal.dynamics.reading import read_recorded
 from visioncal.dynamics.run import Request, conditioned_streams, identify_session
-from visioncal.errors import DataError, DegenerateError
-from visioncal.outputs import write_dynamics
-from visioncal.recording.paths import MOTION_TIMELINE
+from visioncal.interchange.outputs import write_dynamics
+from visioncal.present.recording.paths import MOTION_TIMELINE
 from visioncal.robot import Inertias, Loads, Robot, load_robot, small_urdf
 from visioncal.session import Session
 from visioncal.simulation.dynamics import Body, drive_torques, real_dynamics
@@ -243,7 +243,7 @@ def test_a_urdf_keeps_its_form(run):
     robot = load_robot("ur10e")
     given = {"schema": 1, "name": "mine", "tip": "tool0", "urdf": small_urdf(robot)}
     identified = replace(run.identified, robot=Robot.from_document(given))
-    from visioncal.exports import document
+    from visioncal.interchange.exports import document
 
     text = document(identified, "robot-urdf").text
     assert 'robot name="ur10e"' in text

@@ -11,18 +11,18 @@ from planned import postures_in_view, true_cell
 from test_kinematics import GOOD, WRONG_LINKS, error_m
 
 import visioncal
-from visioncal.compensation.correction import correct
-from visioncal.errors import DataError
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.elastic import deflection_words
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.workspace import postures
-from visioncal.exports import document
-from visioncal.pipeline.result import result_of
-from visioncal.planning.information import stop_factors
-from visioncal.planning.purposes import PURPOSES
+from visioncal.interchange.exports import document
+from visioncal.live.planning.information import stop_factors
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.results.compensation.correction import correct
 from visioncal.robot import Loads, load_robot
 from visioncal.simulation import CellOptions, Payload, simulate
-from visioncal.stages.elastic import deflection_words
-from visioncal.transforms import invert, log
 
 # A cobot's joints, from the base to the wrist [N m/rad].
 COBOT = np.array([2e4, 1.6e4, 1.2e4, 8e3, 7e3, 6e3])

@@ -10,22 +10,22 @@ import pytest
 from apart import clearances
 from small_arm import small_arm
 
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose
 from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.condition import smooth_condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.kept import kept_limits
+from visioncal.dynamics.limit_check import kept_limits
 from visioncal.dynamics.limits import Missing, Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.objective import Objective
-from visioncal.errors import DataError, DegenerateError
 from visioncal.robot import Robot, joint_torques, load_robot
 from visioncal.robot.bodies import Body
 from visioncal.simulation.arms import ur_arm
-from visioncal.transforms import compose
 
 QUICK = ExcitationRequest(harmonics=4, starts=1, steps=20)
 

@@ -18,11 +18,11 @@ from readers import FIXTURE_READERS, READERS, TOOL_READERS
 from rotations import CASES
 from samples import made_up
 
-from visioncal.calibration import CameraResult, Edge, Verdict
-from visioncal.errors import DataError
-from visioncal.exports import EXPORT_FORMATS, Selection, export
-from visioncal.transforms import compose, exp, invert, log
-from visioncal.types import Camera
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import Camera
+from visioncal.interchange.exports import EXPORT_FORMATS, Selection, export
+from visioncal.results import CameraResult, Edge, Verdict
 
 NAMES = [it.name for it in EXPORT_FORMATS]
 EDGE_NAMES = [it for it in NAMES if it not in readers.ARM_FORMATS]

@@ -8,7 +8,7 @@ from parts import away, even, feature_bound, placed, slopes, some_frame, some_to
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.estimation.features import FeatureProblem, fit_features
 from visioncal.estimation.groups import fit_groups
 

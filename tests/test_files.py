@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from visioncal.errors import DataError
-from visioncal.files import (
+from visioncal.core.errors import DataError
+from visioncal.core.files import (
     Table,
     check_free,
     decode_text,

@@ -11,16 +11,16 @@ from parts import away, placed, some_frame
 from samples import made_up
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Edge, FrameFile, Verdict
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp
 from visioncal.estimation.parts import Noise
-from visioncal.frames.drawn import drawn_fixture
-from visioncal.frames.fitted import Setting
+from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture import touched_fixture
+from visioncal.frames.fixture_fit import Setting
+from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.measured import Tool, touched_points
-from visioncal.frames.nominal import NominalPoints
 from visioncal.frames.touches import TouchRows, check_lengths
-from visioncal.transforms import compose, exp
+from visioncal.results import Edge, FrameFile, Verdict
 
 TIP = made.FLANGE_FROM_TOOL[:3, 3]
 GOOD = Verdict("good", ())

@@ -27,13 +27,13 @@ from foreign_samples import (
 )
 
 import visioncal
-from visioncal.conventions import Reading
-from visioncal.errors import DataError
-from visioncal.formats import PoseWishes, Wishes, convert, read_foreign
-from visioncal.formats.intrinsics import read_intrinsics
+from visioncal.core.conventions import Reading
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, pose_difference
+from visioncal.interchange.formats import PoseWishes, Wishes, convert, read_foreign
+from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
 from visioncal.session.columns import POSE
-from visioncal.transforms import exp, invert, pose_difference
 
 
 def poses_of(session, name):

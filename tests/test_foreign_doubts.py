@@ -18,9 +18,9 @@ from foreign_samples import (
 from typer.testing import CliRunner
 
 from visioncal.cli.app import app
-from visioncal.conventions import POSE_FORMS, PoseForm, write_pose
-from visioncal.errors import DataError
-from visioncal.formats import PoseWishes, Wishes, assemble, convert, read_foreign
+from visioncal.core.conventions import POSE_FORMS, PoseForm, write_pose
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import PoseWishes, Wishes, assemble, convert, read_foreign
 
 SEEN = Wishes(mount="eye-in-hand", target=CHARUCO)
 CAMERA = "cft_x_m,cft_y_m,cft_z_m,cft_qx,cft_qy,cft_qz,cft_qw"

@@ -12,12 +12,12 @@ from foreign_samples import BASE_FROM_FLANGE, CAM_FROM_TARGET, quaternions, stre
 from typer.testing import CliRunner
 
 from visioncal.cli.app import app
-from visioncal.conventions import ROTATION_FORMS, PoseNumbers, Reading
-from visioncal.errors import DataError
-from visioncal.formats import PoseWishes, Wishes, assemble, read_foreign
-from visioncal.formats.intrinsics import read_intrinsics
+from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers, Reading
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.interchange.formats import PoseWishes, Wishes, assemble, read_foreign
+from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
-from visioncal.transforms import exp, invert
 
 HAND = Wishes(mount="eye-in-hand")
 

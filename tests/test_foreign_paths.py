@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from foreign_samples import BASE_FROM_FLANGE, CHARUCO, picture, quaternions, visp
 
-from visioncal.errors import DataError
-from visioncal.files import natural
-from visioncal.formats import PoseWishes, Wishes, assemble, convert, read_foreign
-from visioncal.formats.finding import images_named, listed
+from visioncal.core.errors import DataError
+from visioncal.core.files import natural
+from visioncal.interchange.formats import PoseWishes, Wishes, assemble, convert, read_foreign
+from visioncal.interchange.formats.finding import images_named, listed
 
 WISHES = Wishes(mount="eye-in-hand", target=CHARUCO)
 

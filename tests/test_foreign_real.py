@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import visioncal
+from visioncal.core.transforms import compose, invert, mean_transform, pose_difference
 from visioncal.session import Session
-from visioncal.transforms import compose, invert, mean_transform, pose_difference
 
 POSITIONER = """
 schema = 1

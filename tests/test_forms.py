@@ -7,8 +7,8 @@ import pytest
 from aligned_cells import made_up_cell
 from samples import made_up, with_frames
 
-from visioncal.calibration import Alignment, Calibration
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.results import Alignment, Calibration
 
 
 @pytest.fixture(scope="module")

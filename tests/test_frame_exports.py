@@ -15,11 +15,11 @@ from readers import FIXTURE_READERS, READERS, TOOL_READERS
 from rotations import CASES
 from samples import made_up
 
-from visioncal.calibration import Calibration, FrameFile, Verdict
-from visioncal.errors import DataError
-from visioncal.exports import EXPORT_FORMATS, Load, Selection, document, export
-from visioncal.stored import load_calibration, load_placed
-from visioncal.transforms import compose, invert
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert
+from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
+from visioncal.interchange.result_files import load_calibration, load_placed
+from visioncal.results import Calibration, FrameFile, Verdict
 
 RNG = np.random.default_rng(6)
 SAMPLE = replace(made_up(5).calibration, frames={})

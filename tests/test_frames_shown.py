@@ -24,8 +24,7 @@ from samples import (
 )
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Calibration, Frame, Verdict, to_document
-from visioncal.recording import (
+from visioncal.present.recording import (
     notes,
     paths,
     read_calibration,
@@ -33,11 +32,12 @@ from visioncal.recording import (
     tools,
     write_recording,
 )
-from visioncal.recording.details import details
-from visioncal.recording.uncertainty import SIGMAS_95
-from visioncal.report.advice import next_steps
-from visioncal.report.page import render
-from visioncal.report.tools import frame_cards
+from visioncal.present.recording.details import details
+from visioncal.present.recording.uncertainty import SIGMAS_95
+from visioncal.present.report.advice import next_steps
+from visioncal.present.report.page import render
+from visioncal.present.report.tools import frame_cards
+from visioncal.results import Calibration, Frame, Verdict, to_document
 
 
 @pytest.fixture(scope="module")

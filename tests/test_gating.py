@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from visioncal.core.types import Corners
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.gating import gate
 from visioncal.estimation.planar import determines_pose
-from visioncal.types import Corners
 
 GRID = np.array([[x, y, 0.0] for y in range(5) for x in range(8)])
 

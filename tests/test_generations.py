@@ -13,14 +13,14 @@ from commands import visioncal
 from killed_calls import ALL, LESS, NAMES, expect_no_leftovers, visible, written
 from samples import made_up, with_frames
 
-from visioncal import recording, report
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError
-from visioncal.files import write_atomically
-from visioncal.generations import write_generation
-from visioncal.joining import rewrite
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import Run
+from visioncal.calibration.pipeline import Run
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.core.output_generations import write_generation
+from visioncal.interchange.merge_results import rewrite
+from visioncal.interchange.outputs import write_outputs
+from visioncal.present import recording, report
+from visioncal.results import Calibration
 from visioncal.simulation import CellOptions, simulate, write_session
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="links and locks are POSIX's")

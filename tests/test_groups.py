@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from visioncal.estimation.agreement import agreeing_groups
+from visioncal.estimation.group_outliers import agreeing_groups
 from visioncal.estimation.groups import Groups, fit_groups
 from visioncal.estimation.robust import small_sets
 

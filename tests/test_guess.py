@@ -12,16 +12,21 @@ from mistakes import MISTAKES, OTHER, guessed, is_named, measured, numbers, seen
 from scipy.spatial.transform import Rotation, Slerp
 
 import visioncal
-from visioncal.conventions import PoseNumbers, Reading
-from visioncal.errors import DataError, DegenerateError
-from visioncal.guess import guess_reading
-from visioncal.pipeline.guessing import chain_poses, guess_seen, guess_session, seen_poses
+from visioncal.calibration.guess import guess_reading
+from visioncal.calibration.pipeline.guess_inputs import (
+    chain_poses,
+    guess_seen,
+    guess_session,
+    seen_poses,
+)
+from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose, exp, invert, nearest_rotation
+from visioncal.core.types import MOUNTS, Corners, Target
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate
-from visioncal.solvers import SOLVERS
-from visioncal.transforms import compose, exp, invert, nearest_rotation
-from visioncal.types import MOUNTS, Corners, Target
 
 
 @lru_cache(maxsize=2)

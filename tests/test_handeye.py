@@ -9,17 +9,17 @@ from cells import calibrated, error_of
 from edges import solved
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DegenerateError
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.handeye import compare_solvers
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.linalg import covariance, damped_step, spectrum
 from visioncal.estimation.parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
 from visioncal.estimation.variance import Knowledge
-from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, exact, measured_poses, simulate
-from visioncal.solvers import SOLVERS
-from visioncal.stages.handeye import compare_solvers
-from visioncal.transforms import adjoint, compose, exp, invert, log
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 NOISE = Noise.of_robot(1e-3, 5e-4)
@@ -107,7 +107,7 @@ def test_rounds_of_a_calibration_solve_each_closed_form_once(monkeypatch):
         return call
 
     forms = {name: counted(name, it) for name, it in SOLVERS.items()}
-    monkeypatch.setattr("visioncal.stages.handeye.SOLVERS", forms)
+    monkeypatch.setattr("visioncal.calibration.stages.handeye.SOLVERS", forms)
     # Errors of the arm are taken up by several rounds.
     cell = simulate(CellOptions(views=40, dh_sigma_m=1e-3, dh_sigma_rad=1e-3, branches=True))
     known = calibrated(cell, joints=True)

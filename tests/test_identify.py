@@ -12,10 +12,7 @@ from boards import charuco, checkerboard, printed
 from typer.testing import CliRunner
 
 from visioncal.cli.target import target_app
-from visioncal.errors import DataError
-from visioncal.finders.identify import identify
-from visioncal.finders.identify_text import to_toml
-from visioncal.finders.imaging import decode_image
+from visioncal.core.errors import DataError
 from visioncal.simulation import (
     CellOptions,
     fisheye_camera,
@@ -23,7 +20,10 @@ from visioncal.simulation import (
     render,
     simulate,
 )
-from visioncal.targets import load_target, target_from_document, target_names
+from visioncal.vision.finders.identify import identify
+from visioncal.vision.finders.identify_text import to_toml
+from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.targets import load_target, target_from_document, target_names
 
 SHIPPED = {name: load_target(name, None)[0] for name in target_names()}
 ODD = {

@@ -18,7 +18,7 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
         names = archive.namelist()
     assert not [name for name in names if name.startswith(("tests/", "targets/"))]
     code = (
-        "import visioncal.targets as t, visioncal.robot as r, visioncal.report;"
+        "import visioncal.vision.targets as t, visioncal.robot as r, visioncal.present.report;"
         "target, _ = t.load_target('charuco_9x6_30mm', None);"
         "print(t.__file__, target.square_m, r.load_robot('ur10e').joint_count)"
     )
@@ -30,6 +30,11 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
         cwd=tmp_path,
         env={"PYTHONPATH": str(site), "PATH": ""},
     )
-    assert done.stdout.split() == [str(site / "visioncal/targets.py"), "0.03", "6"]
-    for data in ("report/report.html.j2", "report/report.css", "robots/ur10e.toml", "py.typed"):
+    assert done.stdout.split() == [str(site / "visioncal/vision/targets.py"), "0.03", "6"]
+    for data in (
+        "present/report/report.html.j2",
+        "present/report/report.css",
+        "robot/models/ur10e.toml",
+        "py.typed",
+    ):
         assert f"visioncal/{data}" in names

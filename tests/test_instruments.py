@@ -16,15 +16,15 @@ from tracked import (
 )
 
 import visioncal
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert
 from visioncal.estimation.positions import Mounting, Places, fit_mounting
 from visioncal.estimation.workspace import postures
-from visioncal.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.session import MemoryImages, Session
+from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.simulation.arms import forward
 from visioncal.simulation.records import POSE
 from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
-from visioncal.transforms import exp, invert
 
 PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
 KINDS = pytest.mark.parametrize("options", [PROBE, POINT, POINTS], ids=["probe", "point", "three"])

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from visioncal.camera import intrinsics
-from visioncal.errors import DataError, DegenerateError
+from visioncal.calibration.stages.intrinsics import IntrinsicsOptions, estimate_intrinsics
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.types import Camera
 from visioncal.simulation import CellOptions, fisheye_camera, simulate, wide_camera
-from visioncal.stages.intrinsics import IntrinsicsOptions, estimate_intrinsics
-from visioncal.targets import corner_positions
-from visioncal.types import Camera
+from visioncal.vision.camera import intrinsics
+from visioncal.vision.targets import corner_positions
 
 NOISE_PX = 0.1
 RATIONAL = Camera(

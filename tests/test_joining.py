@@ -9,18 +9,18 @@ import pytest
 from kept import assert_same, assert_same_evidence
 from samples import Sample, made_up, tool_frame, with_frames
 
-import visioncal.recording
-from visioncal.calibration import Calibration, FrameFile, to_document
+import visioncal.present.recording
+from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.calibrate import calibrate_command
-from visioncal.errors import DataError
-from visioncal.frames.seen_frame import SEEN_BY
-from visioncal.joining import leftover, rewrite
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import Run, run
-from visioncal.recording import read_calibration, read_evidence, read_session
+from visioncal.core.errors import DataError
+from visioncal.frames.frame_from_images import SEEN_BY
+from visioncal.interchange.merge_results import leftover, rewrite
+from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.result_files import load_stored
+from visioncal.present.recording import read_calibration, read_evidence, read_session
+from visioncal.results import Calibration, FrameFile, to_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.stored import load_stored
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_a_write_that_fails_leaves_the_old_files(sample, folder, monkeypatch, pa
 
     before = contents(folder)
     if part == "write_recording":
-        monkeypatch.setattr(visioncal.recording, "write_recording", fail)
+        monkeypatch.setattr(visioncal.present.recording, "write_recording", fail)
     else:
         monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(DataError, match="No space left on device"):

@@ -9,17 +9,17 @@ from cells import calibrated, error_of, known_of
 from scipy.spatial.transform import Rotation
 
 import visioncal
-from visioncal.errors import DataError
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.workspace import postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows
-from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, fine_camera, forward, simulate
 from visioncal.simulation.arms import inverse
 from visioncal.simulation.boards import centre_m, corners_m
-from visioncal.transforms import compose, exp, invert, log
 
 GOOD = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=30)
 WRONG_LINKS = replace(GOOD, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)

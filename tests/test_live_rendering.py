@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from visioncal.drivers.protocols import CameraDevice
-from visioncal.errors import DataError, DriverError
-from visioncal.finders.charuco import find_charuco
-from visioncal.finders.result import Seen
-from visioncal.rehearsal.camera import Clock, Pace, RehearsalCamera
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.drivers.protocols import CameraDevice
+from visioncal.live.rehearsal.camera import Clock, Pace, RehearsalCamera
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
 from visioncal.simulation.live import LiveView
+from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.finders.result import Seen
 
 TARGET = CellOptions().target
 # How each joint shares in a motion, in no special direction.

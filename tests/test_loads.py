@@ -7,7 +7,7 @@ import pytest
 from loaded import HUNG, NOMINAL, postures
 from tracked import known_of
 
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.loads import loads_of

@@ -17,13 +17,12 @@ from picks import (
 )
 
 import visioncal
-from visioncal.calibration import Calibration, CameraResult, Edge, Verdict, to_document
-from visioncal.camera import intrinsics, with_intrinsics
-from visioncal.errors import DataError
-from visioncal.finders.imaging import decode_image
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, log
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
+from visioncal.results import Calibration, CameraResult, Edge, Verdict, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -35,7 +34,8 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
-from visioncal.transforms import exp, invert, log
+from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.finders.imaging import decode_image
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 BOARD = charuco_target()

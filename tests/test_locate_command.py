@@ -10,13 +10,13 @@ from plates import CENTRES, marked_plate, plate_session
 from samples import fixture_frame
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Calibration, Edge, FrameFile, Verdict
 from visioncal.cli.fixture import fixture_command
 from visioncal.cli.locate import locate_command
 from visioncal.cli.tcp import tcp_command
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.frames.locate import locate
 from visioncal.frames.plane import Plane
+from visioncal.results import Calibration, Edge, FrameFile, Verdict
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 PIXEL = "700,350"

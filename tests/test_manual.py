@@ -8,15 +8,15 @@ from rotations import CASES
 from samples import made_up
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Edge
-from visioncal.documents.pendants import is_marked_pose, possible_forms, read_pose
-from visioncal.drivers.manual import ManualArm
-from visioncal.drivers.protocols import Arm
-from visioncal.errors import DataError, DriverError
-from visioncal.exports import export
-from visioncal.formats import PoseWishes, Wishes
-from visioncal.formats.columns import foreign_from, read_fields
-from visioncal.transforms import compose
+from visioncal.core.documents.pendants import is_marked_pose, possible_forms, read_pose
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.transforms import compose
+from visioncal.interchange.exports import export
+from visioncal.interchange.formats import PoseWishes, Wishes
+from visioncal.interchange.formats.columns import foreign_from, read_fields
+from visioncal.live.drivers.manual import ManualArm
+from visioncal.live.drivers.protocols import Arm
+from visioncal.results import Edge
 
 SAMPLE = made_up(5).calibration
 SHIFT = np.array([0.4, -0.1, 0.3])

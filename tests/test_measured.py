@@ -7,18 +7,18 @@ import pytest
 from cells import calibrated, error_of, known_of
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Calibration
-from visioncal.errors import DegenerateError
-from visioncal.pipeline import calibrate
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
-from visioncal.planning.information import worlds_of
-from visioncal.planning.purposes import PURPOSES
-from visioncal.planning.recorded import SoFar, begin
+from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.cell import read_cell
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.live.planning.information import worlds_of
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.recorded import SoFar, begin
+from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import Cell, CellOptions, Second, simulate
-from visioncal.stages.cell import read_cell
-from visioncal.transforms import compose, exp, invert, log
 
 SIGMA_M = 5e-4
 X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))

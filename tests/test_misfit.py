@@ -7,16 +7,16 @@ import pytest
 from cells import calibrated, error_of
 from problems import observed, world
 
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.core.transforms import exp
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
-from visioncal.estimation.misfit import drift, neighbours
 from visioncal.estimation.parts import ROBOT
+from visioncal.estimation.residual_tests import drift, neighbours
 from visioncal.estimation.solve import covariance_of
 from visioncal.estimation.variance import profile_interval
-from visioncal.pipeline.result import result_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.transforms import exp
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 MOUNTS = ("eye-in-hand", "eye-to-hand")

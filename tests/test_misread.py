@@ -16,15 +16,15 @@ from slips import (
     with_tool,
 )
 
-from visioncal.errors import DataError
-from visioncal.guess.misread import guess_joints
-from visioncal.pipeline.result import result_of
+from visioncal.calibration.guess.misread import guess_joints
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.joints import match_joints
+from visioncal.calibration.stages.reported_poses import reported_poses
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
 from visioncal.robot import load_robot, other_convention, placed_at, table_document, with_zeros
 from visioncal.robot.conversion import table_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.stages.joints import match_joints
-from visioncal.stages.reported import reported_poses
-from visioncal.transforms import exp, invert
 
 OPTIONS = CellOptions(
     camera=fine_camera(),

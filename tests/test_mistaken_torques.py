@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from moved_arms import changed, robot_with_bodies
 
+from visioncal.core.errors import DataError
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import condition
+from visioncal.dynamics.convention_hypotheses import check_mistakes
 from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.mistakes import check_mistakes
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.reading import read_recorded
-from visioncal.errors import DataError
 from visioncal.simulation.dynamics import nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import multi_sine, record, slow_sweep
 

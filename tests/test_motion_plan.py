@@ -16,17 +16,17 @@ from urscripts import STEP_S, driven
 
 from visioncal.cli import dynamics_plan
 from visioncal.cli.review import find_recording
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose
 from visioncal.dynamics.excitation import excite
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.programs import excitation_program, sweeps_program
 from visioncal.dynamics.sweeps import Stroke, SweepRequest, Sweeps, plan_sweeps
-from visioncal.errors import DataError, DegenerateError
-from visioncal.recording import paths
+from visioncal.present.recording import paths
 from visioncal.robot import load_robot
 from visioncal.robot.bodies import Body
 from visioncal.simulation.arms import ur_arm
-from visioncal.transforms import compose
 
 TABLES = {"excitation.csv", "sweeps.csv", "plan.json", "plan.rrd"}
 PROGRAMS = {"excitation.script", "sweeps.script"}

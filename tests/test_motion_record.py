@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from commands import visioncal as run
 
-from visioncal.capture.motions import record_motion
 from visioncal.cli import dynamics_record
-from visioncal.drivers.protocols import JointSample
-from visioncal.errors import DriverError
-from visioncal.rehearsal.controller import spawn
-from visioncal.rehearsal.options import ControllerOptions
+from visioncal.core.errors import DriverError
+from visioncal.live.capture.motions import record_motion
+from visioncal.live.drivers.protocols import JointSample
+from visioncal.live.rehearsal.controller import spawn
+from visioncal.live.rehearsal.options import ControllerOptions
 from visioncal.session import Session
 
 RATE_HZ = 100.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from moved_arms import robot_with_bodies
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.robot import body_regressor, joint_torques
 from visioncal.simulation.dynamics import (
     Body,

@@ -8,16 +8,16 @@ import pytest
 from cells import calibrated
 from test_verdict import SOUND, changed, directions
 
-from visioncal.calibration import Calibration, NeedMet, Picker, Rms, to_document
-from visioncal.calibration.verdicts import need_document, read_need
-from visioncal.chance import chi2_limit
-from visioncal.estimation.within import chance_within, radius_within
-from visioncal.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import exp
+from visioncal.core.types import Need
+from visioncal.estimation.tolerance_probability import chance_within, radius_within
+from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
+from visioncal.results.verdicts import need_document, read_need
 from visioncal.simulation import CellOptions, simulate
-from visioncal.stages.judge import judge
-from visioncal.stages.need import Picks, need_met
-from visioncal.transforms import exp
-from visioncal.types import Need
 
 
 @pytest.mark.parametrize("freedom", [np.inf, 15.0])

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from mjpeg import NetworkCamera, number_of, served
 
-from visioncal.drivers.protocols import CameraDevice, DeviceWishes
-from visioncal.drivers.uvc import UvcCamera
-from visioncal.errors import DriverError
+from visioncal.core.errors import DriverError
+from visioncal.live.drivers.protocols import CameraDevice, DeviceWishes
+from visioncal.live.drivers.uvc import UvcCamera
 
 SMALL = np.full((240, 320), 110, np.uint8)
 # Five megapixels that take long to decode.

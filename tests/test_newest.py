@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from visioncal.drivers.newest import Arrival, Newest
-from visioncal.errors import DriverError
+from visioncal.core.errors import DriverError
+from visioncal.live.drivers.newest import Arrival, Newest
 
 # Longer than any picture takes that comes at all [s].
 PATIENT_S = 20.0

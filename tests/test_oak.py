@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from samples import made_up
 
-from visioncal.calibration import CameraResult
-from visioncal.drivers import oak
-from visioncal.drivers.oak import OakCamera
-from visioncal.drivers.oak_calibration import calibration_json, factory_intrinsics
-from visioncal.drivers.oak_hosted import HostedOak
-from visioncal.drivers.oak_library import depthai
-from visioncal.drivers.oak_replay import ReplayedOak
-from visioncal.drivers.protocols import CameraDevice, DeviceWishes, Frame
-from visioncal.errors import DataError, DriverError
-from visioncal.exports import Selection, document
-from visioncal.rehearsal.camera import RehearsalCamera
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.types import Camera
+from visioncal.interchange.exports import Selection, document
+from visioncal.live.drivers import oak
+from visioncal.live.drivers.oak import OakCamera
+from visioncal.live.drivers.oak_calibration import calibration_json, factory_intrinsics
+from visioncal.live.drivers.oak_hosted import HostedOak
+from visioncal.live.drivers.oak_library import depthai
+from visioncal.live.drivers.oak_replay import ReplayedOak
+from visioncal.live.drivers.protocols import CameraDevice, DeviceWishes, Frame
+from visioncal.live.rehearsal.camera import RehearsalCamera
+from visioncal.results import CameraResult
 from visioncal.simulation import CellOptions, fisheye_camera, simulate, wide_camera
-from visioncal.types import Camera
 
 try:
     dai = depthai()

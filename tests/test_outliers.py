@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of
 
-from visioncal.errors import DegenerateError
+from visioncal.core.errors import DegenerateError
+from visioncal.core.transforms import exp
 from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances, inliers
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
-from visioncal.transforms import exp
 
 WORLDS = {
     "fine, given": CellOptions(camera=fine_camera(), pixel_sigma_px=0.1),

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from cells import calibrated, error_of, known_of, session_of
 
-from visioncal.errors import DataError
-from visioncal.pipeline.evident import view_evidence
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.view_evidence import view_evidence
+from visioncal.calibration.stages.observed import nothing_seen
+from visioncal.core.errors import DataError
+from visioncal.core.types import MOUNTS, Camera, Target
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.simulation import (
     CellOptions,
     fine_camera,
@@ -16,9 +19,6 @@ from visioncal.simulation import (
     simulate,
     wide_camera,
 )
-from visioncal.solvers import SOLVERS
-from visioncal.stages.observed import nothing_seen
-from visioncal.types import MOUNTS, Camera, Target
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 # Its corners look the same after half a turn, and at small tilts its mirrored pose fits as well.

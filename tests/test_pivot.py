@@ -20,12 +20,12 @@ from touched import (
     turned,
 )
 
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose, exp, invert
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.pivot import fit_pivot
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Placed, Touches, TouchProblem
-from visioncal.transforms import compose, exp, invert
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 ROBOT = Noise.of_robot(5e-5, 3e-5)

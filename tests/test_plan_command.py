@@ -12,15 +12,15 @@ import rerun as rr
 from commands import Done, visioncal
 from drawn import column
 
-from visioncal.calibration import Calibration
+from visioncal.calibration.stages.next_views_hint import with_proposal
 from visioncal.cli.review import find_recording
-from visioncal.errors import DataError
-from visioncal.recording import paths
+from visioncal.core.errors import DataError
+from visioncal.present.recording import paths
+from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.table import parse_csv, read_views
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.stages.proposing import with_proposal
 
 FILES = {"stops.csv", "plan.json", "plan.script", "plan.rrd"}
 CELL = {

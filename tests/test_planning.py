@@ -8,23 +8,23 @@ import pytest
 from cells import calibrated
 from planned import plan_cell, postures_in_view, so_far_of, true_cell
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
 from visioncal.estimation.linalg import covariance, covariance_root
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import fisher_information
-from visioncal.planning.accuracy import Wish
-from visioncal.planning.cell import Box
-from visioncal.planning.design import chosen, shortfall
-from visioncal.planning.improving import next_best
-from visioncal.planning.information import stop_factors, worlds_of
-from visioncal.planning.purposes import PURPOSES, purpose_of
-from visioncal.planning.recorded import Guess, begin
-from visioncal.planning.selection import CRITERIA
+from visioncal.live.planning.accuracy import Wish
+from visioncal.live.planning.cell import Box
+from visioncal.live.planning.design import chosen, shortfall
+from visioncal.live.planning.improving import next_best
+from visioncal.live.planning.information import stop_factors, worlds_of
+from visioncal.live.planning.purposes import PURPOSES, purpose_of
+from visioncal.live.planning.recorded import Guess, begin
+from visioncal.live.planning.selection import CRITERIA
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, exact, fine_camera, simulate
 from visioncal.simulation.options import Second
-from visioncal.targets import corner_positions
-from visioncal.transforms import exp
+from visioncal.vision.targets import corner_positions
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 HAND_EYE, OFFSETS, KINEMATICS = (PURPOSES[it] for it in ("hand-eye", "offsets", "kinematics"))

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from visioncal.calibration.stages.init_frames import place
+from visioncal.calibration.stages.pnp import estimate_poses
+from visioncal.calibration.stages.pose_ambiguity import chosen
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.simulation import (
     CellOptions,
     checkerboard_target,
@@ -13,13 +19,7 @@ from visioncal.simulation import (
     simulate,
     wide_camera,
 )
-from visioncal.solvers import SOLVERS
-from visioncal.stages.choose import chosen
-from visioncal.stages.place import place
-from visioncal.stages.pnp import estimate_poses
-from visioncal.targets import corner_positions, rotations
-from visioncal.transforms import exp, invert, log
-from visioncal.types import Corners
+from visioncal.vision.targets import corner_positions, rotations
 
 NOISE_PX = 0.2
 

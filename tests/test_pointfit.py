@@ -19,7 +19,7 @@ from parts import (
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest
 
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.estimation.groups import fit_groups
 from visioncal.estimation.pointfit import Placed, PointProblem, fit_points
 from visioncal.estimation.procrustes import align

@@ -23,18 +23,18 @@ from rigs import (
 )
 
 from visioncal import align, calibrate
-from visioncal.calibration import Calibration, to_document
-from visioncal.chance import chi2_limit
-from visioncal.errors import DataError
-from visioncal.pipeline import run
-from visioncal.recording import board, write_recording
-from visioncal.report import write_report
+from visioncal.calibration.pipeline import run
+from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.prediction import see_again
+from visioncal.core.errors import DataError
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import invert, log
+from visioncal.present.recording import board, write_recording
+from visioncal.present.report import write_report
+from visioncal.results import Calibration, to_document
 from visioncal.session import Session, corners
-from visioncal.stages.detect import detect
-from visioncal.targets import load_target, target_document, target_from_document
-from visioncal.transforms import invert, log
-from visioncal.verification.footing import Footing
-from visioncal.verification.seeing import see_again
+from visioncal.vision.targets import load_target, target_document, target_from_document
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 REFINED, AUTO = f'{LENS}intrinsics = "refine"\n', LENS

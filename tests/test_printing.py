@@ -12,14 +12,14 @@ from boards import MM_PER_INCH, any_page, charuco, checkerboard, printed, raster
 from typer.testing import CliRunner
 
 from visioncal.cli.target import target_app
-from visioncal.errors import DataError
-from visioncal.finders import Seen, find_target
-from visioncal.printing import Request, arrange, draw_pattern, pages_named, requested_target
-from visioncal.printing.drawing import to_pdf, to_png, to_svg
-from visioncal.printing.page import EDGE_MM
-from visioncal.printing.pattern import outlines
-from visioncal.targets import corner_positions, load_target, target_names
-from visioncal.types import Target
+from visioncal.core.errors import DataError
+from visioncal.core.types import Target
+from visioncal.vision.finders import Seen, find_target
+from visioncal.vision.printing import Request, arrange, draw_pattern, pages_named, requested_target
+from visioncal.vision.printing.drawing import to_pdf, to_png, to_svg
+from visioncal.vision.printing.page import EDGE_MM
+from visioncal.vision.printing.pattern import outlines
+from visioncal.vision.targets import corner_positions, load_target, target_names
 
 TARGETS = Path(__file__).parents[1] / "targets"
 # Least squares over all corners leave 0.03 % of the finder's errors on a marker's four; the rest of

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
+from visioncal.calibration.stages.init_network import tie
+from visioncal.calibration.stages.pair_observations import Sighted
+from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.outliers import agree, settle
 from visioncal.estimation.parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
@@ -18,9 +21,6 @@ from visioncal.estimation.solve import (
     solve_problem,
 )
 from visioncal.estimation.variance import Knowledge
-from visioncal.stages.pairwise import Candidates
-from visioncal.stages.sighted import Sighted
-from visioncal.stages.tie import tie
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
 NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))

@@ -11,13 +11,13 @@ from scipy.special import chdtrc
 from test_need import NEED
 from test_verdict import SOUND, changed, directions, left_out
 
-from visioncal.calibration import Cause, Rms, Verdict
-from visioncal.calibration.verdicts import read_verdict, verdict_document
+from visioncal.calibration.stages import causes as ranking
+from visioncal.calibration.stages.causes import EVIDENCE, with_misread
+from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.need import Picks
 from visioncal.cli.pointing import told_of
-from visioncal.stages import causes as ranking
-from visioncal.stages.causes import EVIDENCE, with_misread
-from visioncal.stages.judge import judge
-from visioncal.stages.need import Picks
+from visioncal.results import Cause, Rms, Verdict
+from visioncal.results.verdicts import read_verdict, verdict_document
 
 EXCHANGED = "Views 3 and 4 are exchanged: the image of each fits the pose in the other's row."
 POSTURE = "Residuals follow the arm's posture (likelihood ratio 45, noise stays under 15.1)"

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 import visioncal
+from visioncal.core.transforms import compose
 from visioncal.session import MemoryImages, Session
-from visioncal.transforms import compose
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 

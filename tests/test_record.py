@@ -20,18 +20,18 @@ from mjpeg import NetworkCamera, number_of, served
 from recorded import REPEATABILITY_M
 from scipy.spatial.transform import Rotation
 
-from visioncal.capture import devices
-from visioncal.capture.clock import HostClock
 from visioncal.cli import record as command
-from visioncal.errors import DataError, DriverError
-from visioncal.planning.plan import Request, make_plan
-from visioncal.planning.purposes import purpose_of
-from visioncal.planning.read_back import PlanFile, read_plan
-from visioncal.planning.written import plan_document
-from visioncal.recording import paths
-from visioncal.recording.live import LiveCell, LiveDrawing, LiveView
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.capture import devices
+from visioncal.live.capture.clock import HostClock
+from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.read_back import PlanFile, read_plan
+from visioncal.live.planning.written import plan_document
+from visioncal.present.recording import paths
+from visioncal.present.recording.live import LiveCell, LiveDrawing, LiveView
+from visioncal.present.viewer import live as viewer
 from visioncal.session import Session
-from visioncal.viewer import live as viewer
 
 ARM, CAMERA = ("--arm", "fake:here"), ("--camera", "fake")
 QUICK = ("--frames", 1, "--settle-s", 0.03)

@@ -13,12 +13,12 @@ from kept import KEPT, assert_same, kept_session, kept_streams
 from rerun.chunk import OptimizationProfile, RrdReader
 from samples import Sample, made_up
 
-from visioncal.errors import DataError
-from visioncal.evidence import ViewEvidence, magnification
-from visioncal.recording import codec, notes, paths, read_session, write_recording
+from visioncal.core.errors import DataError
+from visioncal.core.types import Corners
+from visioncal.present.recording import codec, notes, paths, read_session, write_recording
+from visioncal.present.viewer import blueprint
+from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import MemoryImages, Session, Stream
-from visioncal.types import Corners
-from visioncal.viewer import blueprint
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "sessions"
 

@@ -13,12 +13,12 @@ import pytest
 from kept import assert_same, cells
 from samples import Sample, made_up
 
-from visioncal.errors import DataError
-from visioncal.recording import RecordingWriter, paths, read_calibration, read_session
-from visioncal.recording.frames import Frame, scan
-from visioncal.recording.reader import chunks
+from visioncal.core.errors import DataError
+from visioncal.present.recording import RecordingWriter, paths, read_calibration, read_session
+from visioncal.present.recording.frames import Frame, scan
+from visioncal.present.recording.reader import chunks
+from visioncal.present.viewer import blueprint
 from visioncal.session import MemoryImages, Session
-from visioncal.viewer import blueprint
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ import sys
 from pathlib import Path
 from samples import made_up
 from kept import cells
-from visioncal.recording import RecordingWriter
+from visioncal.present.recording import RecordingWriter
 
 session = made_up().session
 with RecordingWriter(Path(sys.argv[1]), session) as writer:

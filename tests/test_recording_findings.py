@@ -10,12 +10,12 @@ from findings import healthy, sick, with_findings
 from rerun.chunk import RrdReader
 from samples import TARGET, Sample, made_up
 
-from visioncal.errors import DataError
-from visioncal.recording import notes, paths, write_recording
-from visioncal.recording.findings import Findings
-from visioncal.recording.overlays import Overlay
-from visioncal.targets import corner_positions, load_target
-from visioncal.viewer import blueprint
+from visioncal.core.errors import DataError
+from visioncal.present.recording import notes, paths, write_recording
+from visioncal.present.recording.findings import Findings
+from visioncal.present.recording.overlays import Overlay
+from visioncal.present.viewer import blueprint
+from visioncal.vision.targets import corner_positions, load_target
 
 
 @pytest.fixture(scope="module")

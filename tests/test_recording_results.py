@@ -18,9 +18,8 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 from samples import Sample, made_up
 
-from visioncal.calibration import Calibration, Verdict, to_document
-from visioncal.errors import DataError
-from visioncal.recording import (
+from visioncal.core.errors import DataError
+from visioncal.present.recording import (
     RecordingWriter,
     append_results,
     paths,
@@ -29,8 +28,9 @@ from visioncal.recording import (
     read_session,
     write_recording,
 )
-from visioncal.recording.frames import scan
-from visioncal.viewer import blueprint
+from visioncal.present.recording.frames import scan
+from visioncal.present.viewer import blueprint
+from visioncal.results import Calibration, Verdict, to_document
 
 
 @pytest.fixture(scope="module")

@@ -8,21 +8,21 @@ import pytest
 from cells import calibrated
 from commands import visioncal
 
-from visioncal.capture.core import Step, Times
-from visioncal.capture.drive import travel_s
-from visioncal.capture.options import CaptureOptions
-from visioncal.capture.take import Missed
+from visioncal.calibration.pipeline.result import result_of
 from visioncal.cli import rehearse as command
-from visioncal.errors import DriverError
-from visioncal.pipeline.result import result_of
-from visioncal.planning.purposes import purpose_of
-from visioncal.planning.read_back import PlanFile, Stop
-from visioncal.rehearsal.cell import GUESS_M, GUESS_RAD, RehearsalOptions, rehearsed_cell
-from visioncal.rehearsal.compared import edge_errors, explained
-from visioncal.rehearsal.witness import pace_of
+from visioncal.core.errors import DriverError
+from visioncal.core.transforms import exp, pose_difference
+from visioncal.live.capture.core import Step, Times
+from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.take import Missed
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.read_back import PlanFile, Stop
+from visioncal.live.rehearsal.cell import GUESS_M, GUESS_RAD, RehearsalOptions, rehearsed_cell
+from visioncal.live.rehearsal.compared import edge_errors, explained
+from visioncal.live.rehearsal.witness import pace_of
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
-from visioncal.transforms import exp, pose_difference
 
 EXTRAS = ("rtde_control", "rtde_receive", "depthai")
 MISSING = [it for it in EXTRAS if importlib.util.find_spec(it) is None]

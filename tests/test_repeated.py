@@ -7,6 +7,7 @@ import pytest
 from whole_cells import misfit
 
 from visioncal import calibrate
+from visioncal.core.transforms import exp, invert
 from visioncal.session import MemoryImages, Session
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
@@ -18,7 +19,6 @@ from visioncal.simulation import (
     simulate_network,
 )
 from visioncal.simulation.records import pose_row, target_document
-from visioncal.transforms import exp, invert
 
 SIGMA_PX = 0.05
 # The size of the board is known: else it is most of what transforms are uncertain by.

@@ -13,22 +13,22 @@ from findings import CONTRADICTS, healthy, sick, with_contradiction, with_findin
 from pages import Page, section
 from samples import CAMERA, REJECTED, Sample, made_up
 
-from visioncal.calibration import Calibration, CameraResult, Rms, Verdict, VerdictStatus
-from visioncal.errors import DataError
-from visioncal.figures import matched, significant
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import Run, run
-from visioncal.recording import write_recording
-from visioncal.report import write_report
-from visioncal.report.advice import listed, next_steps, suspects
-from visioncal.report.page import render
-from visioncal.report.thumbnails import thumbnail
-from visioncal.report.trends import twist_of
+from visioncal.calibration.pipeline import Run, run
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import Target
+from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.result_files import load_stored
+from visioncal.present.recording import write_recording
+from visioncal.present.report import write_report
+from visioncal.present.report.advice import listed, next_steps, suspects
+from visioncal.present.report.page import render
+from visioncal.present.report.thumbnails import thumbnail
+from visioncal.present.report.trends import twist_of
+from visioncal.results import Calibration, CameraResult, Rms, Verdict, VerdictStatus
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.stored import load_stored
-from visioncal.types import Target
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,13 @@ import pytest
 from cells import session_of
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
+from visioncal.calibration.stages.reported_poses import reported_poses
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
 from visioncal.robot import load_robot
 from visioncal.session import View
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate
-from visioncal.stages.reported import reported_poses
-from visioncal.transforms import exp
 
 CELL = simulate(CellOptions(views=8, seed=3))
 ROBOT = load_robot(CELL.options.robot)

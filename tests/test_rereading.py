@@ -10,9 +10,11 @@ import pytest
 from foreign_samples import easy_handeye_file
 from typer.testing import CliRunner
 
+from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.app import app
-from visioncal.errors import DataError
-from visioncal.formats import (
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.interchange.formats import (
     Wishes,
     assemble,
     guess_foreign,
@@ -21,11 +23,9 @@ from visioncal.formats import (
     reread,
     reread_session,
 )
-from visioncal.pipeline.guessing import guess_session
 from visioncal.robot import Robot, read_robot_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.transforms import exp, invert
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 JOINTS = tuple(f"q{at}_rad" for at in range(1, 7))

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 from samples import made_up
 
-from visioncal.recording import write_recording
-from visioncal.viewer import blueprint
+from visioncal.present.recording import write_recording
+from visioncal.present.viewer import blueprint
 
 ENVIRONMENT = os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
 

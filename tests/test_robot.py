@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from visioncal.errors import DataError
-from visioncal.files import parse_toml
+from visioncal.core.errors import DataError
+from visioncal.core.files import parse_toml
 from visioncal.robot import (
     Robot,
     load_robot,

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from visioncal.documents import read_yaml
-from visioncal.errors import DataError
+from visioncal.core.documents import read_yaml
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import (
     Robot,
     corrected_urdf,
@@ -22,7 +23,6 @@ from visioncal.robot import (
     unwritten,
     ur_kinematics_yaml,
 )
-from visioncal.transforms import exp, invert, log
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 # A lift and a slanted joint, a fixed joint on the way and one that carries the tip, a joint without

@@ -7,6 +7,11 @@ import pytest
 from cells import calibrated_sweep
 from swept_cells import HOW, cell_of, swept_session
 
+from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.stages import clock
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import MOUNTS
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.effects import EFFECTS
 from visioncal.estimation.effects.delays import (
@@ -14,17 +19,12 @@ from visioncal.estimation.effects.delays import (
     shares_of,
     target_twists,
 )
-from visioncal.pipeline import align, calibrate
-from visioncal.pipeline.known import Known
-from visioncal.recording import write_recording
-from visioncal.report.content import method_facts
+from visioncal.present.recording import write_recording
+from visioncal.present.report.content import method_facts
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Sweep, SweepOptions, sweep, sweep_session, write_sweep
 from visioncal.simulation.layout import NetworkOptions
-from visioncal.stages import clock
-from visioncal.targets import numbered_positions
-from visioncal.transforms import exp, invert, log
-from visioncal.types import MOUNTS
+from visioncal.vision.targets import numbered_positions
 
 READOUT_S = 0.0124
 # 12 s at 30 Hz, at up to 0.2 m/s and 0.5 rad/s.

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.robot import Loads, Robot, bent_joints, load_robot, placed_at, table_of
 from visioncal.robot.tables import table_document
 from visioncal.simulation import CellOptions, Payload, arm_named, forward, simulate

@@ -8,16 +8,16 @@ import pytest
 from picks import Stand, calibration_of, corners_at, really
 from plates import CENTRES, looking, marked_plate
 
-from visioncal.camera import intrinsics, with_intrinsics
-from visioncal.errors import DataError
-from visioncal.frames.chain import Eye
-from visioncal.frames.look import see
-from visioncal.frames.markers import seen_markers
-from visioncal.frames.seen import place_seen
-from visioncal.frames.sight import Sight, places
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import Target
+from visioncal.frames.camera_chain import Eye
+from visioncal.frames.marker_points import seen_markers
+from visioncal.frames.single_view import Sight, places
+from visioncal.frames.target_in_image import see
+from visioncal.frames.target_pose import place_seen
 from visioncal.simulation import CellOptions, charuco_target, checkerboard_target, exact, simulate
-from visioncal.transforms import compose, exp, invert, log
-from visioncal.types import Target
+from visioncal.vision.camera import intrinsics, with_intrinsics
 
 BOARD = charuco_target()
 MARKER = Target("marker", "marker", 1, 1, 0.06, 6e-5, dictionary="DICT_5X5_100", marker_id=3)

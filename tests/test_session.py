@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import Need
 from visioncal.session import FolderImages, MemoryImages, Session
 from visioncal.session.table import parse_csv
-from visioncal.types import Need
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "sessions"
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from visioncal.errors import DataError
-from visioncal.recording import write_recording
+from visioncal.core.errors import DataError
+from visioncal.present.recording import write_recording
 from visioncal.session import Session
 
 TOML = """schema = 1

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.frames.touches import touches_of
-from visioncal.recording import write_recording
+from visioncal.present.recording import write_recording
 from visioncal.session import Session
 from visioncal.session.single import check_one_of_each
 

@@ -8,14 +8,14 @@ import pytest
 from imaged import Shot, calibrated_cell, session_of, shots
 from plates import CENTRES, CLEAR, marked_plate, plate_session
 
-from visioncal.calibration import Verdict
-from visioncal.errors import DataError
-from visioncal.frames.marked import marked_fixture
-from visioncal.frames.nominal import NominalPoints
-from visioncal.frames.seen_frame import SeenOptions, rests_on_camera, seen_frame
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log, skew
+from visioncal.frames.drawing_points import NominalPoints
+from visioncal.frames.fixture_from_markers import marked_fixture
+from visioncal.frames.frame_from_images import SeenOptions, rests_on_camera, seen_frame
+from visioncal.results import Verdict
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
-from visioncal.transforms import invert, log, skew
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 VIEWS = 5

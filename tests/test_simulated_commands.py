@@ -9,9 +9,10 @@ import pytest
 from commands import visioncal
 from moved_arms import true_base
 
-from visioncal.calibration import Alignment, Calibration
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
 from visioncal.dynamics.identified import Identified
-from visioncal.errors import DataError
+from visioncal.results import Alignment, Calibration
 from visioncal.session import Session
 from visioncal.simulation import (
     cell_names,
@@ -20,7 +21,6 @@ from visioncal.simulation import (
     simulate_network,
 )
 from visioncal.simulation.dynamics import real_dynamics
-from visioncal.transforms import invert, log
 
 # Chi-square of six exceeds this in one case of a thousand.
 MOST = 22.5

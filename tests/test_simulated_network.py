@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, pose_difference
 from visioncal.session import Session
 from visioncal.simulation import (
     BoardAt,
@@ -20,7 +21,6 @@ from visioncal.simulation import (
     write_network,
 )
 from visioncal.simulation.network import is_symmetric
-from visioncal.transforms import invert, pose_difference
 
 EVEN = replace(checkerboard_target(), name="even", columns=8, rows=6)
 OPTIONS = NetworkOptions(

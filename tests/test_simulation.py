@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import visioncal.simulation
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log, rotation_angle
+from visioncal.core.types import Camera, Target
 from visioncal.session import Session
 from visioncal.simulation import (
     Cell,
@@ -33,8 +35,6 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
-from visioncal.transforms import invert, log, rotation_angle
-from visioncal.types import Camera, Target
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 SMALL = dataclasses.replace(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cells import calibrated
 
-from visioncal.errors import ConvergenceError
+from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import joint
 from visioncal.estimation.parts import ROBOT, Effect
 from visioncal.estimation.solve import (

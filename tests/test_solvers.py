@@ -26,11 +26,11 @@ from worlds import (
     turn_error,
 )
 
-from visioncal.errors import DataError, DegenerateError
-from visioncal.solvers import SOLVERS, HandEye, Solver
-from visioncal.solvers.pairs import rotation_pairs
-from visioncal.solvers.translation import complete
-from visioncal.types import FloatArray
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.types import FloatArray
+from visioncal.estimation.closed_form import SOLVERS, HandEye, Solver
+from visioncal.estimation.closed_form.pairs import rotation_pairs
+from visioncal.estimation.closed_form.translation import complete
 
 MOVEIT = Path(__file__).parents[2] / "shared/data/pose_pairs_small/moveit_eye_to_hand_50.json"
 
@@ -147,7 +147,7 @@ def quiet_opencv():
 def test_pairs_within_groups_tell_as_much_as_all(name, monkeypatch):
     problems = [simulate(replace(PRECISE, views=220), seed) for seed in range(12)]
     grouped = [turn_error(SOLVERS[name](it.robot, it.camera).x, it.x) for it in problems]
-    monkeypatch.setattr("visioncal.solvers.pairs._GROUP", 220)
+    monkeypatch.setattr("visioncal.estimation.closed_form.pairs._GROUP", 220)
     whole = [turn_error(SOLVERS[name](it.robot, it.camera).x, it.x) for it in problems]
     # A hundred partners leave 1 % of the variance; both share all but that of their noise, so 12
     # ratios are known to 3 %, and with neighbours alone as partners all would be far off.

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from kept import assert_same, kept_session, kept_streams
 
-from visioncal.errors import DataError
-from visioncal.formats import convert
-from visioncal.recording import codec, read_session, write_recording
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+from visioncal.interchange.formats import convert
+from visioncal.present.recording import codec, read_session, write_recording
 from visioncal.session import Session, Stream
 from visioncal.session.streams import check_stream, parse_stream, read_streams, write_stream
-from visioncal.types import FloatArray
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 

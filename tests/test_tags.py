@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from boards import any_page, printed
 
-from visioncal.errors import DataError
-from visioncal.finders import NotFound, find_target
-from visioncal.pipeline import run
+from visioncal.calibration.pipeline import run
+from visioncal.calibration.stages.detect import look_for
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import Corners
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -19,15 +21,13 @@ from visioncal.simulation import (
     tags_target,
     write_session,
 )
-from visioncal.stages.detect import look_for
-from visioncal.targets import (
+from visioncal.vision.finders import NotFound, find_target
+from visioncal.vision.targets import (
     corner_positions,
     load_target,
     target_document,
     target_from_document,
 )
-from visioncal.transforms import invert, log
-from visioncal.types import Corners
 
 TAGS = tags_target()
 PLATE = replace(TAGS, square_m=0.245, square_sigma_m=0.0)

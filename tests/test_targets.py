@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from visioncal.errors import DataError
-from visioncal.targets import (
+from visioncal.core.errors import DataError
+from visioncal.core.types import Target
+from visioncal.vision.targets import (
     DEFAULT_RELATIVE_SIGMA,
     charuco_board,
     corner_positions,
@@ -19,7 +20,6 @@ from visioncal.targets import (
     target_from_document,
     target_names,
 )
-from visioncal.types import Target
 
 CHARUCO: dict[str, Any] = {
     "kind": "charuco",

@@ -11,14 +11,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from touched import TIP, Job, error_of, relabelled, slipped, touched
 
-from visioncal.calibration import Calibration, FrameFile
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import run
-from visioncal.recording import read_calibration
+from visioncal.calibration.pipeline import run
+from visioncal.core.transforms import invert
+from visioncal.interchange.outputs import write_outputs
+from visioncal.present.recording import read_calibration
+from visioncal.results import Calibration, FrameFile
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.transforms import invert
 
 # Ten touches, 45 degrees, 0.1 mm: the tip is known to some 0.05 mm per axis.
 NEAR_MM = 0.3

@@ -11,7 +11,11 @@ from edges import solved
 from test_kinematics import MOUNTS, WRONG_LINKS
 
 import visioncal
-from visioncal.errors import DataError
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.arm_identifiability import tell
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.indices import Indices
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parameters import free_parameters, parameter_moves
@@ -20,14 +24,10 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import Knowledge
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline.result import result_of
-from visioncal.pipeline.steps import STAGES
 from visioncal.robot import CONVENTIONS, Robot, convert_table, load_robot, robot_names, table_of
 from visioncal.robot.slopes import number_slopes, table_moves
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate
-from visioncal.stages.tell import tell
-from visioncal.transforms import exp, invert, log
 
 # Three axes and a wrist, with rails among them.
 CRANE = {

@@ -8,10 +8,10 @@ import pytest
 from boards import charuco, checkerboard
 from rendered import Shot, photograph
 
-from visioncal.finders import Seen, blur_of, board, find_target
-from visioncal.finders.charuco import find_charuco
-from visioncal.finders.checkerboard import find_checkerboard
-from visioncal.finders.template import refine
+from visioncal.vision.finders import Seen, blur_of, board, find_target
+from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.finders.checkerboard import find_checkerboard
+from visioncal.vision.finders.template import refine
 
 # Columns and rows differ by an odd number: the checkerboard has one numbering.
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)

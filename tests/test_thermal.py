@@ -13,20 +13,21 @@ from scipy.integrate import solve_ivp
 from warmed import CELL, drift_of, warmed
 
 from visioncal import Session
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError, DegenerateError
-from visioncal.exports import document
-from visioncal.pipeline import calibrate
-from visioncal.recording import paths, write_recording
-from visioncal.report.page import render
+from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.stages.thermal_inputs import inputs_of
+from visioncal.calibration.verification import verify
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import invert, log
+from visioncal.interchange.exports import document
+from visioncal.present.recording import paths, write_recording
+from visioncal.present.report.page import render
+from visioncal.present.viewer import blueprint
+from visioncal.results import Calibration
 from visioncal.robot import load_robot
+from visioncal.robot.thermal import Heating, Inputs, OnlineCompensator, ThermalModel
 from visioncal.session.streams import Stream
 from visioncal.simulation import Heat, Round, WarmUpOptions, simulate_warm_up
-from visioncal.thermal import Heating, Inputs, OnlineCompensator, ThermalModel, inputs_of
-from visioncal.transforms import invert, log
-from visioncal.verification import verify
-from visioncal.verification.footing import Footing
-from visioncal.viewer import blueprint
 
 ROBOT = load_robot("ur5e")
 GROWTH, DRIFT = np.full(6, 2e-5), np.array([3.0, -2.0, 4.0, -1.0, 2.0, 0.0]) * 1e-6

@@ -11,12 +11,12 @@ import matplotlib as mpl
 from kept import assert_same_evidence
 from threadpoolctl import threadpool_info
 
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import run
-from visioncal.recording import read_evidence
+from visioncal.calibration.pipeline import run
+from visioncal.core.threads import Shared
+from visioncal.interchange.outputs import write_outputs
+from visioncal.present.recording import read_evidence
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.threads import Shared
 
 THREADS = 4
 CREATED = "2026-11-21T00:00:00+00:00"

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import FloatArray
 from visioncal.estimation.clock import clock_problem
+from visioncal.estimation.clock_correlation import Frames
 from visioncal.estimation.parts import State
 from visioncal.estimation.trajectory import Samples, Trajectory
-from visioncal.estimation.turned import Frames
-from visioncal.transforms import exp, invert, log
-from visioncal.types import FloatArray
 
 RATES = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])
 SIZES = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal import transforms
+from visioncal.core import transforms
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from cells import known_of
 
-from visioncal.pipeline.evident import view_evidence
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.result import result_of
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.view_evidence import view_evidence
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
 
 HELD = (3, 8, 21, 30)

@@ -12,11 +12,11 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from visioncal.drivers.protocols import MovingArm
-from visioncal.drivers.ur import UrArm
-from visioncal.errors import DriverError
-from visioncal.rehearsal.controller import spawn
-from visioncal.rehearsal.options import ControllerOptions, believed_arm
+from visioncal.core.errors import DriverError
+from visioncal.live.drivers.protocols import MovingArm
+from visioncal.live.drivers.ur import UrArm
+from visioncal.live.rehearsal.controller import spawn
+from visioncal.live.rehearsal.options import ControllerOptions, believed_arm
 from visioncal.simulation.arms import forward
 
 pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
@@ -215,7 +215,7 @@ def test_what_the_driver_does_not_use_is_served_too(controller):
 WALKER = f"""
 import sys, time
 import numpy as np
-from visioncal.drivers.ur import UrArm
+from visioncal.live.drivers.ur import UrArm
 arm = UrArm(sys.argv[1])
 arm.start_move(arm.state().q + np.array({FAR.tolist()}), speed={SLOW}, acceleration=1.0)
 print("moving", flush=True)

@@ -8,14 +8,14 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from visioncal.drivers.ur import UrArm
-from visioncal.drivers.ur_factory import factory_document, read_factory_dh, read_factory_file
-from visioncal.drivers.ur_net import check_states_come, connect, resolve
-from visioncal.drivers.ur_primary import read_tool_offset
-from visioncal.drivers.ur_status import read_condition
-from visioncal.errors import DataError, DriverError
-from visioncal.rehearsal.controller import free_host, spawn
-from visioncal.rehearsal.options import ControllerOptions, believed_arm
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.drivers.ur import UrArm
+from visioncal.live.drivers.ur_factory import factory_document, read_factory_dh, read_factory_file
+from visioncal.live.drivers.ur_net import check_states_come, connect, resolve
+from visioncal.live.drivers.ur_primary import read_tool_offset
+from visioncal.live.drivers.ur_status import read_condition
+from visioncal.live.rehearsal.controller import free_host, spawn
+from visioncal.live.rehearsal.options import ControllerOptions, believed_arm
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation.arms import ArmErrors, forward
 

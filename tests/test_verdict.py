@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.calibration import Rms, ViewResult
+from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor, judge
+from visioncal.core.number_format import figure
+from visioncal.core.types import Rejection
 from visioncal.estimation.observability import Direction
-from visioncal.figures import figure
-from visioncal.stages.judge import Arm, Findings, Pair, Place, Sensor, judge
-from visioncal.types import Rejection
+from visioncal.results import Rms, ViewResult
 
 
 def directions(*sigmas):

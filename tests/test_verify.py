@@ -12,22 +12,28 @@ from later import ANYHOW, FITTED, Change, again, knock, known_again, part, usual
 from pages import Page
 
 from visioncal import calibrate, verify
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError
-from visioncal.pipeline.result import result_of
-from visioncal.report.check import render_check
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.verification import (
+    facts_of,
+    load_policy,
+    outcomes,
+    sentences,
+    to_document,
+)
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.check import check
+from visioncal.calibration.verification.messages import _signed_axis
+from visioncal.calibration.verification.prediction import known_before, see_again, seen_by
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.present.report.check import render_check
+from visioncal.present.report.check_page import page_of
+from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Payload, simulate, write_session
 from visioncal.simulation.boards import centre_m
 from visioncal.simulation.second import Second
-from visioncal.transforms import compose, exp, invert, log
-from visioncal.verification import facts_of, load_policy, outcomes, sentences, to_document
-from visioncal.verification.check import check
-from visioncal.verification.footing import Footing
-from visioncal.verification.page import page_of
-from visioncal.verification.seeing import known_before, see_again, seen_by
-from visioncal.verification.words import _signed_axis
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 

@@ -17,15 +17,15 @@ from rerun.experimental import ViewerClient
 from samples import Sample, made_up, with_frames
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration import Edge
-from visioncal.evidence import ExplainedImage, ViewEvidence
-from visioncal.finders import find_target
-from visioncal.recording import arm, board, coverage, paths, write_recording
-from visioncal.recording.uncertainty import SIGMAS_95, Uncertainty
-from visioncal.targets import corner_positions, target_from_document
-from visioncal.transforms import exp, invert
-from visioncal.viewer import blueprint
-from visioncal.viewer.process import viewer_process
+from visioncal.core.transforms import exp, invert
+from visioncal.present.recording import arm, board, coverage, paths, write_recording
+from visioncal.present.recording.uncertainty import SIGMAS_95, Uncertainty
+from visioncal.present.viewer import blueprint
+from visioncal.present.viewer.process import viewer_process
+from visioncal.results import Edge
+from visioncal.results.evidence import ExplainedImage, ViewEvidence
+from visioncal.vision.finders import find_target
+from visioncal.vision.targets import corner_positions, target_from_document
 
 RASTERISERS = list(Path("/usr/share/vulkan/icd.d").glob("lvp*"))
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from cells import calibrated
 
+from visioncal.core.transforms import invert, log
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.simulation import CellOptions, simulate
-from visioncal.transforms import invert, log
 
 
 @pytest.mark.parametrize("freedom", [8.0, 100.0])

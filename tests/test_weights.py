@@ -8,8 +8,8 @@ from cells import calibrated
 from test_elastic import CARRIED, COBOT, SAGGING
 from test_kinematics import error_m
 
+from visioncal.calibration.pipeline.result import result_of
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline.result import result_of
 from visioncal.robot import Robot, WeightFunctions, load_robot
 from visioncal.simulation import simulate
 

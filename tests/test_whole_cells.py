@@ -9,11 +9,12 @@ from commands import visioncal
 from whole_cells import FLOOR, LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
 import visioncal as package
-from visioncal.calibration import Alignment, Calibration, RobotResult, to_document
-from visioncal.camera import project
-from visioncal.errors import DataError
-from visioncal.figures import significant
-from visioncal.frames.chain import noise_freedom
+from visioncal.calibration.verification import verify
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import significant
+from visioncal.core.transforms import invert, log
+from visioncal.interchange.result_files import load_result
+from visioncal.results import Alignment, Calibration, RobotResult, to_document
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -23,10 +24,8 @@ from visioncal.simulation import (
     network_session,
     simulate_network,
 )
-from visioncal.stored import load_result
-from visioncal.targets import corner_positions
-from visioncal.transforms import invert, log
-from visioncal.verification import verify
+from visioncal.vision.camera import project
+from visioncal.vision.targets import corner_positions
 
 # Chi-square of twelve, and of six, exceed these in one case of a thousand.
 MOST_OF_TWELVE, MOST_OF_SIX = 32.9, 22.5
@@ -99,7 +98,7 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
     # Two levels of 20 stops, some directions of which the frames have taken: not known exactly.
     part = found.of("left", "b", "plate_b")
     assert part.stages["uncertainty"]["noise_95"].keys() < part.noise.keys()
-    assert 20.0 < noise_freedom(part) < 120.0
+    assert 20.0 < part.noise_dof < 120.0
     low = written["uncertainty"]["noise_95"]["b"]["translation_mm"][0]
     assert f"(95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
 

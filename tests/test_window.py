@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from visioncal.camera import project
-from visioncal.planning.window import Window
-from visioncal.types import Camera
+from visioncal.core.types import Camera
+from visioncal.live.planning.window import Window
+from visioncal.vision.camera import project
 
 SIZE = (1280, 800)
 MATRIX = np.array([600.0, 610.0, 650.0, 390.0])

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.types import FloatArray
 from visioncal.robot import read_robot_document
 from visioncal.session import MemoryImages, Session
-from visioncal.types import FloatArray
 
 # What is not stated of these instruments is taken as usual for their kind.
 MEASURING_ARM, LASER = {"sigma_m": 6e-5}, {"sigma_m": 2e-5, "sigma_rad": 1e-4}

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.simulation.arms import forward, link_frames
 from visioncal.simulation.tracked import Shop
-from visioncal.transforms import exp, invert, log
-from visioncal.types import FloatArray
 
 
 def known_of(session: Session, **changes) -> Known:

@@ -9,7 +9,7 @@ import numpy as np
 import tomli_w
 from scipy.spatial.transform import Rotation
 
-BUILT_IN = Path(__file__).parents[1] / "visioncal" / "robots"
+BUILT_IN = Path(__file__).parents[1] / "visioncal" / "robot" / "models"
 ROUNDS, SETTLED = 40, 1e-10
 
 

@@ -21,10 +21,10 @@ from varied_cells import Cell, cell, write
 import visioncal.cli.app
 from visioncal import Session
 from visioncal.cli.review import find_recording
-from visioncal.errors import VisioncalError
-from visioncal.outputs import CALIBRATION, RECORDING, REPORT
-from visioncal.stored import load_calibration
-from visioncal.viewer import blueprint
+from visioncal.core.errors import VisioncalError
+from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT
+from visioncal.interchange.result_files import load_calibration
+from visioncal.present.viewer import blueprint
 
 POSES = ("ros", "ros-launch", "moveit", "easy-handeye2", "urdf", "opencv", "zivid", "text", "ur",
          "kuka", "fanuc", "abb", "staubli", "yaskawa", "doosan")  # fmt: skip

@@ -4,16 +4,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration import Calibration
+from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.stages.thermal_inputs import inputs_of
+from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline import calibrate
+from visioncal.results import Calibration
 from visioncal.robot import load_robot
+from visioncal.robot.thermal import Inputs
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, WarmUp, WarmUpOptions, simulate_warm_up
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.warmup import heated_poses
-from visioncal.thermal import Inputs, inputs_of
-from visioncal.types import FloatArray
 
 # What 100 minutes are to predict: the rest of five hours [s].
 TRAINED_S, END_S = 6000.0, 18000.0

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.transforms import invert, log
 from visioncal.session import Session
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
@@ -19,7 +20,6 @@ from visioncal.simulation import (
     network_session,
     simulate_network,
 )
-from visioncal.transforms import invert, log
 
 # Boards whose size is known: else it is most of what a target's place is uncertain by.
 FLOOR = replace(charuco_target(), square_sigma_m=1e-7)

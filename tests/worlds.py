@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from visioncal.types import FloatArray, Mount
+from visioncal.core.types import FloatArray, Mount
 
 BOARD_CENTRE_M = np.array([0.12, 0.08, 0.0])
 BOARD_M = np.array([(0.015 + 0.03 * x, 0.02 + 0.03 * y, 0.0) for y in range(5) for x in range(8)])

@@ -13,56 +13,56 @@ The names below are imported on first use, so that `import visioncal` costs noth
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from visioncal.version import __version__
+from visioncal.core.version import __version__
 
 if TYPE_CHECKING:
-    from visioncal.calibration import Alignment, Calibration
-    from visioncal.compensation import CalibratedArm, Corrected, correct
-    from visioncal.errors import (
+    from visioncal.calibration.pipeline import align, calibrate
+    from visioncal.calibration.verification import verify
+    from visioncal.core.errors import (
         ConvergenceError,
         DataError,
         DegenerateError,
         DriverError,
         VisioncalError,
     )
+    from visioncal.frames.frame_from_images import seen_frame
     from visioncal.frames.locate import locate, locate_target
     from visioncal.frames.located import Located
     from visioncal.frames.picks import locate_views
     from visioncal.frames.plane import Plane
-    from visioncal.frames.seen import place_seen
-    from visioncal.frames.seen_frame import seen_frame
-    from visioncal.frames.sight import Sight
-    from visioncal.pipeline import align, calibrate
+    from visioncal.frames.single_view import Sight
+    from visioncal.frames.target_pose import place_seen
+    from visioncal.results import Alignment, Calibration
+    from visioncal.results.compensation import CalibratedArm, Corrected, correct
     from visioncal.robot import Loads
+    from visioncal.robot.thermal import OnlineCompensator
     from visioncal.session import Session
-    from visioncal.thermal import OnlineCompensator
-    from visioncal.verification import verify
 
 _HOMES = {
-    "Alignment": "visioncal.calibration",
-    "CalibratedArm": "visioncal.compensation",
-    "Calibration": "visioncal.calibration",
-    "Corrected": "visioncal.compensation",
-    "correct": "visioncal.compensation",
-    "ConvergenceError": "visioncal.errors",
-    "DataError": "visioncal.errors",
-    "DegenerateError": "visioncal.errors",
-    "DriverError": "visioncal.errors",
+    "Alignment": "visioncal.results",
+    "CalibratedArm": "visioncal.results.compensation",
+    "Calibration": "visioncal.results",
+    "Corrected": "visioncal.results.compensation",
+    "correct": "visioncal.results.compensation",
+    "ConvergenceError": "visioncal.core.errors",
+    "DataError": "visioncal.core.errors",
+    "DegenerateError": "visioncal.core.errors",
+    "DriverError": "visioncal.core.errors",
     "Loads": "visioncal.robot",
     "Located": "visioncal.frames.located",
-    "OnlineCompensator": "visioncal.thermal",
+    "OnlineCompensator": "visioncal.robot.thermal",
     "Plane": "visioncal.frames.plane",
     "Session": "visioncal.session",
-    "Sight": "visioncal.frames.sight",
-    "VisioncalError": "visioncal.errors",
-    "align": "visioncal.pipeline",
-    "calibrate": "visioncal.pipeline",
+    "Sight": "visioncal.frames.single_view",
+    "VisioncalError": "visioncal.core.errors",
+    "align": "visioncal.calibration.pipeline",
+    "calibrate": "visioncal.calibration.pipeline",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.picks",
-    "place_seen": "visioncal.frames.seen",
-    "seen_frame": "visioncal.frames.seen_frame",
-    "verify": "visioncal.verification",
+    "place_seen": "visioncal.frames.target_pose",
+    "seen_frame": "visioncal.frames.frame_from_images",
+    "verify": "visioncal.calibration.verification",
 }
 
 __all__ = [

@@ -20,7 +20,7 @@ from results import few, first, write_section
 
 import visioncal
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
-from visioncal.targets import charuco_board
+from visioncal.vision.targets import charuco_board
 
 VIEWS, REPEATS = few((40, 5), (6, 1))
 THREADS = os.cpu_count() or 1

@@ -17,22 +17,22 @@ from killed import kill_and_resume
 from planned import true_cell
 from results import few, first, need, write_section
 
-from visioncal.capture.core import Step, Watcher
-from visioncal.capture.facts import Facts
-from visioncal.capture.journal import Journal
-from visioncal.capture.live import LiveCell
-from visioncal.capture.options import CaptureOptions
-from visioncal.capture.record import record
-from visioncal.capture.take import Taken
-from visioncal.drivers.ur import UrArm
-from visioncal.errors import VisioncalError
-from visioncal.planning.plan import Request, make_plan
-from visioncal.planning.purposes import purpose_of
-from visioncal.planning.read_back import PlanFile, Stop
-from visioncal.rehearsal.camera import RehearsalCamera
-from visioncal.rehearsal.controller import spawn
-from visioncal.rehearsal.options import ControllerOptions
-from visioncal.rehearsal.truth import TruthClient
+from visioncal.core.errors import VisioncalError
+from visioncal.live.capture.core import Step, Watcher
+from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.record import record
+from visioncal.live.capture.take import Taken
+from visioncal.live.drivers.ur import UrArm
+from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.read_back import PlanFile, Stop
+from visioncal.live.rehearsal.camera import RehearsalCamera
+from visioncal.live.rehearsal.controller import spawn
+from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.arms import ArmErrors

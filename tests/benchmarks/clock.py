@@ -14,10 +14,10 @@ from multiprocessing import Pool
 import numpy as np
 from results import first, wished, write_section
 
-from visioncal.errors import VisioncalError
-from visioncal.pipeline import calibrate
+from visioncal.calibration.pipeline import calibrate
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import invert, log
 from visioncal.simulation import CellOptions, SweepOptions, sweep, sweep_session
-from visioncal.transforms import invert, log
 
 SWEEPS = 20
 

@@ -29,8 +29,8 @@ from worlds import (  # noqa: E402
     turn_error,
 )
 
-from visioncal.solvers import SOLVERS  # noqa: E402
-from visioncal.types import FloatArray  # noqa: E402
+from visioncal.core.types import FloatArray  # noqa: E402
+from visioncal.estimation.closed_form import SOLVERS  # noqa: E402
 
 SEEDS = few(200, 3)
 FAR_MM, FAR_MRAD = 50.0, 1e3 * np.radians(5.0)

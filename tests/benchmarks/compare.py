@@ -21,9 +21,9 @@ sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
 from pairs import calibrated_cell, halves, with_moved_result  # noqa: E402
 
-from visioncal.compare import EdgeChange, compare  # noqa: E402
+from visioncal.core.types import FloatArray, Mount  # noqa: E402
+from visioncal.results.compare import EdgeChange, compare  # noqa: E402
 from visioncal.simulation import CellOptions, simulate  # noqa: E402
-from visioncal.types import FloatArray, Mount  # noqa: E402
 
 PAIRS, SIGMAS = few(200, 2), 5.0
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")

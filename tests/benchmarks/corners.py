@@ -21,10 +21,10 @@ from boards import aprilgrid, charuco, checkerboard, circles
 from rendered import Shot, photograph
 from results import few, write_section
 
-from visioncal.finders.board import FINDERS, find_board
-from visioncal.finders.result import Seen
-from visioncal.finders.template import refine
-from visioncal.types import FloatArray, Image, Target
+from visioncal.core.types import FloatArray, Image, Target
+from visioncal.vision.finders.board import FINDERS, find_board
+from visioncal.vision.finders.result import Seen
+from visioncal.vision.finders.template import refine
 
 PICTURES, REPEATS = few((2, 7), (1, 1))
 # Columns and rows of corners differ by an odd number: the checkerboard has one numbering.

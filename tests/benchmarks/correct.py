@@ -19,8 +19,8 @@ from results import few, first, wished, write_section
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 import visioncal
+from visioncal.calibration.pipeline.result import result_of
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline.result import result_of
 from visioncal.robot.inverse import Inverse
 from visioncal.simulation import Cell, forward, simulate
 

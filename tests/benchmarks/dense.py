@@ -21,19 +21,19 @@ from rendered import Shot, photograph
 from results import few, first, need, wished, write_section
 from smeared import smeared
 
+from visioncal.calibration.stages.dense import Dense, fit_densely
+from visioncal.calibration.stages.detect import image_of, look_for
+from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.estimation.viewnoise import weights_by_view
-from visioncal.finders.board import find_board
-from visioncal.finders.template import refine
 from visioncal.session import MemoryImages
 from visioncal.simulation import Cell, CellOptions, simulate
-from visioncal.stages.dense import Dense, fit_densely
-from visioncal.stages.detect import image_of, look_for
-from visioncal.types import Corners, FloatArray, Target
+from visioncal.vision.finders.board import find_board
+from visioncal.vision.finders.template import refine
 
 need("torch", "'visioncal[dense]'")
 need("kornia", "'visioncal[dense]'")
 
-from visioncal.dense.fit import fit_corners  # noqa: E402 - where the extra is missing, it ends above
+from visioncal.vision.dense.fit import fit_corners  # noqa: E402 - where the extra is missing, it ends above
 
 PICTURES, SEEDS = few(2, 1), wished(20)
 WORLDS = {"sharp": {}, "defocus 3 px": {"disc_px": 3.0}, "motion 6 px": {"motion_px": 6.0}}

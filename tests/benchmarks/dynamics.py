@@ -17,6 +17,8 @@ import numpy as np
 from moved_arms import recorded, robot_with_bodies, true_base
 from results import few, wished, write_section
 
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
@@ -30,8 +32,6 @@ from visioncal.dynamics.validate import friction_of_known, predict, validate
 from visioncal.robot import load_robot, small_urdf
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import Exercise, multi_sine, slow_sweep
-from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray
 
 WORLDS, RATE_HZ, REPEATS = 20, 500.0, few(3, 1)
 SEARCH = few(ExcitationRequest(), ExcitationRequest(starts=1, steps=3))

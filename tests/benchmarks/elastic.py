@@ -18,10 +18,10 @@ from loaded import COMPLIANCE, HUNG, STIFFNESS, STRETCHED, deflection_m, loaded,
 from results import WORDS, few, first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
+from visioncal.calibration.stages.elastic import deflection_words
 from visioncal.estimation.workspace import postures
 from visioncal.robot import Loads, load_robot
 from visioncal.simulation import CellOptions, simulate
-from visioncal.stages.elastic import deflection_words
 
 WORLDS = 20
 # Least and greatest stiffness of a joint [N m/rad].

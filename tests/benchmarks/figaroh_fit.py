@@ -21,9 +21,9 @@ from figaroh.calibration.calibration_tools import calc_updated_fkm
 from figaroh.tools.load_robot import load_robot as load_figaroh_robot
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import compose
+from visioncal.core.types import FloatArray
 from visioncal.robot import Robot, small_urdf
-from visioncal.transforms import compose
-from visioncal.types import FloatArray
 
 _POSE = ("x1", "y1", "z1", "phix1", "phiy1", "phiz1")
 

@@ -20,9 +20,13 @@ from results import few, first, need, wished, write_section
 from test_kinematics import WRONG_LINKS, target_in_camera
 
 import visioncal
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, fit_level
 from visioncal.estimation.parts import ROBOT, Noise, State
 from visioncal.estimation.problem import Problem
@@ -30,10 +34,6 @@ from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
-from visioncal.solvers import SOLVERS
-from visioncal.threads import one_blas_thread
-from visioncal.transforms import invert, log
-from visioncal.types import FloatArray
 
 WORLDS, REPEATS = 10, few(3, 1)
 # The arm's true departures, of which the ways that are `told` know.

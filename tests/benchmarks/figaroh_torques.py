@@ -19,9 +19,9 @@ import yaml
 from figaroh.identification.base_identification import BaseIdentification
 from figaroh.tools.load_robot import load_robot as load_figaroh_robot
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Measured
 from visioncal.robot import Robot
-from visioncal.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,12 +30,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray
 from visioncal.estimation.features import fit_features
 from visioncal.estimation.pointfit import fit_points
 from visioncal.estimation.pointpairs import PointPairs
-from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray
 
 COUNTS, SEEDS = (3, 4, 6, 12), few(300, 3)
 EVEN_M, SLIPS_M = 1e-4, (1e-3, 3e-3)

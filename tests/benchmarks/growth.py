@@ -18,8 +18,8 @@ import numpy as np
 from cells import known_of
 from results import write_section
 
-from visioncal.pipeline import align
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.network import simulate_network

@@ -16,8 +16,8 @@ import numpy as np
 from mistakes import MISTAKES, Poses, guessed, is_named, seen_in
 from results import few, write_section
 
+from visioncal.core.types import MOUNTS
 from visioncal.simulation import CellOptions, simulate
-from visioncal.types import MOUNTS
 
 PLANTED, SOUND = few((20, 30), (1, 1))
 ROBOTS = ("ur3e", "ur5e", "ur10e")

@@ -19,12 +19,12 @@ from cells import calibrated, error_of
 from results import few, first, wished, write_section
 from worlds import BOTH_AT_ONCE, Problem, opencv
 
-from visioncal.errors import VisioncalError
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate, wide_camera
 from visioncal.simulation.boards import Sheet, corners_m
-from visioncal.transforms import invert, log
-from visioncal.types import FloatArray
 
 SEEDS, FEW = 1000, 50
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
@@ -317,11 +317,11 @@ def healthy(seed: int) -> float:
 
 def real_folds(path: Path, repeats: int) -> tuple[float, float]:
     """Held-out position [mm] and rotation [deg] of the board, rms over repeated 5-fold."""
+    from visioncal.calibration.pipeline.run_state import Known
+    from visioncal.calibration.pipeline.solving import solve
+    from visioncal.calibration.pipeline.steps import STAGES
+    from visioncal.calibration.stages.cell import read_cell
     from visioncal.estimation.parts import State
-    from visioncal.pipeline.known import Known
-    from visioncal.pipeline.solving import solve
-    from visioncal.pipeline.steps import STAGES
-    from visioncal.stages.cell import read_cell
 
     session = Session.load(path)
     seen = Known(session)

@@ -21,16 +21,16 @@ from tracked import (
     solved_of,
 )
 
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import State
 from visioncal.estimation.positions import fit_mounting
 from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline.known import Known
 from visioncal.session import Session
 from visioncal.simulation.arms import forward
 from visioncal.simulation.tracked import THREE, Shop, Tracked, session_of, tracked
-from visioncal.transforms import invert
-from visioncal.types import FloatArray
 
 WORLDS = 20
 DATA = Path(__file__).parents[3] / "shared" / "data"

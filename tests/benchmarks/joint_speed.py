@@ -13,6 +13,9 @@ from dataclasses import replace
 import numpy as np
 from results import few, need, write_section
 
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
+from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance
@@ -20,10 +23,7 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.solve import solve_problem
 from visioncal.simulation import Cell, CellOptions, charuco_target, fine_camera, simulate
-from visioncal.targets import corner_positions
-from visioncal.threads import one_blas_thread
-from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
-from visioncal.types import FloatArray
+from visioncal.vision.targets import corner_positions
 
 need("pyceres", "pyceres")
 import pyceres  # noqa: E402

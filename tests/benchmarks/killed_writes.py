@@ -18,8 +18,8 @@ from pathlib import Path
 
 from results import write_section
 
-from visioncal.files import write_atomically
-from visioncal.generations import write_generation
+from visioncal.core.files import write_atomically
+from visioncal.core.output_generations import write_generation
 
 FILES = RECORDING, REPORT, CALIBRATION = ("recording.rrd", "report.html", "calibration.json")
 KILLS = {"drawn": 40, "ready": 160}
@@ -35,8 +35,8 @@ def write_drawn(folder: Path, number: int) -> None:
     # A second to load, which the other kind need not wait for.
     from samples import made_up
 
-    from visioncal.outputs import write_outputs
-    from visioncal.pipeline import Run
+    from visioncal.calibration.pipeline import Run
+    from visioncal.interchange.outputs import write_outputs
 
     sample = made_up(5)
     created = f"2026-11-20T{number // 60:02}:{number % 60:02}:00+00:00"
@@ -45,9 +45,9 @@ def write_drawn(folder: Path, number: int) -> None:
 
 def numbers_drawn(folder: Path) -> set[str]:
     """The generations that the files in a folder are of."""
-    from visioncal.calibration import Calibration
-    from visioncal.recording import read_calibration
-    from visioncal.report.content import readable_time
+    from visioncal.present.recording import read_calibration
+    from visioncal.present.report.content import readable_time
+    from visioncal.results import Calibration
 
     created = Calibration.load(folder).created
     recorded = read_calibration(folder / RECORDING)

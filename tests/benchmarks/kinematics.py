@@ -19,13 +19,13 @@ from cells import calibrated, known_of
 from results import first, wished, write_section
 from test_kinematics import WRONG_LINKS, error_m
 
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages import kinematics as levels
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.steps import STAGES
 from visioncal.simulation import Cell, CellOptions, simulate
-from visioncal.stages import kinematics as levels
 
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")

@@ -16,9 +16,9 @@ import numpy as np
 from picks import Pick, calibration_of, pick_by_plane, pick_by_target
 from results import first, wished, write_section
 
-from visioncal.errors import VisioncalError
+from visioncal.core.errors import VisioncalError
+from visioncal.core.types import Target
 from visioncal.simulation import CellOptions, charuco_target, fine_camera, simulate, wide_camera
-from visioncal.types import Target
 
 CELLS = 200
 # Picks of one cell share its calibration; five keep their mean nearly as good as five cells'.

@@ -20,19 +20,19 @@ from picks import seen_corners
 from results import wished, write_section
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.errors import VisioncalError
-from visioncal.estimation.within import radius_within
-from visioncal.frames.chain import Eye
-from visioncal.frames.look import see
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.result import result_of
-from visioncal.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import exp, invert, rotation_angle
+from visioncal.core.types import FloatArray, Need
+from visioncal.estimation.tolerance_probability import radius_within
+from visioncal.frames.camera_chain import Eye
+from visioncal.frames.target_in_image import see
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import Cell, CellOptions, charuco_target, simulate
-from visioncal.targets import corner_positions
-from visioncal.transforms import exp, invert, rotation_angle
-from visioncal.types import FloatArray, Need
+from visioncal.vision.targets import corner_positions
 
 CELLS, PICKS, BINS = 1000, 20, 10
 BOARD = charuco_target()

@@ -15,13 +15,13 @@ import numpy as np
 from networkbound import network_bound
 from results import few, wished, write_section
 
-from visioncal.calibration import Alignment
-from visioncal.pipeline import align
+from visioncal.calibration.pipeline import align
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray
+from visioncal.results import Alignment
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.network import Network, simulate_network
 from visioncal.simulation.network_records import network_session
-from visioncal.transforms import invert, log
-from visioncal.types import FloatArray
 
 CELLS = 50
 STOPS = 30

@@ -18,19 +18,19 @@ from results import few, first, wished, write_section
 from test_candidates import cell_of, whole
 from test_kinematics import WRONG_LINKS, error_m
 
-from visioncal.errors import DataError
-from visioncal.pipeline.known import Known
-from visioncal.planning.candidates import candidates
-from visioncal.planning.design import chosen
-from visioncal.planning.improving import next_best
-from visioncal.planning.information import WORLDS as SAMPLE
-from visioncal.planning.information import World, worlds_of
-from visioncal.planning.purposes import PURPOSES
-from visioncal.planning.recorded import Begun, begin
-from visioncal.planning.selection import CRITERIA
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
+from visioncal.core.types import FloatArray
+from visioncal.live.planning.candidates import candidates
+from visioncal.live.planning.design import chosen
+from visioncal.live.planning.improving import next_best
+from visioncal.live.planning.information import WORLDS as SAMPLE
+from visioncal.live.planning.information import World, worlds_of
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.recorded import Begun, begin
+from visioncal.live.planning.selection import CRITERIA
 from visioncal.simulation import Cell, CellOptions, simulate
-from visioncal.transforms import exp
-from visioncal.types import FloatArray
 
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")

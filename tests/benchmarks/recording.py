@@ -17,11 +17,16 @@ from pathlib import Path
 
 from results import few, write_section
 
-from visioncal.pipeline import Run, run
-from visioncal.recording import RecordingWriter, append_results, read_session, write_recording
+from visioncal.calibration.pipeline import Run, run
+from visioncal.present.recording import (
+    RecordingWriter,
+    append_results,
+    read_session,
+    write_recording,
+)
+from visioncal.present.viewer import blueprint
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
-from visioncal.viewer import blueprint
 
 VIEWS, REPEATS = few((60, 5), (8, 1))
 LIMIT_MS = 15.0

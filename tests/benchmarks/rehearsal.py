@@ -20,24 +20,24 @@ import numpy as np
 from killed import kill_and_resume
 from results import WORDS, few, first, need, write_section
 
-from visioncal.capture.core import Step
-from visioncal.capture.journal import Journal
-from visioncal.capture.live import LiveCell
-from visioncal.capture.record import record
-from visioncal.capture.take import Taken
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of
 from visioncal.cli.rehearsed import TAKING, planned, recorded
-from visioncal.drivers.oak_hosted import HostedOak
-from visioncal.drivers.ur import UrArm
-from visioncal.errors import DataError, DriverError
-from visioncal.rehearsal.bench import Bench
-from visioncal.rehearsal.camera import RehearsalCamera
-from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
-from visioncal.rehearsal.controller import spawn
-from visioncal.rehearsal.options import ControllerOptions
-from visioncal.rehearsal.trouble import Trouble
-from visioncal.rehearsal.truth import TruthClient
-from visioncal.rehearsal.witness import Witness, pace_of
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.capture.core import Step
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.record import record
+from visioncal.live.capture.take import Taken
+from visioncal.live.drivers.oak_hosted import HostedOak
+from visioncal.live.drivers.ur import UrArm
+from visioncal.live.rehearsal.bench import Bench
+from visioncal.live.rehearsal.camera import RehearsalCamera
+from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
+from visioncal.live.rehearsal.controller import spawn
+from visioncal.live.rehearsal.fault_injection import Trouble
+from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.truth import TruthClient
+from visioncal.live.rehearsal.witness import Witness, pace_of
 from visioncal.session import Session
 
 COMMAND = "PYTHONPATH=tests python tests/benchmarks/rehearsal.py"

@@ -13,11 +13,11 @@ import numpy as np
 from cells import calibrated_sweep
 from results import few, first, wished, write_section
 
-from visioncal.pipeline.known import Known
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.stages import clock
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray
 from visioncal.simulation import CellOptions, Sweep, SweepOptions, sweep
-from visioncal.stages import clock
-from visioncal.transforms import invert, log
-from visioncal.types import FloatArray
 
 SWEEPS = 20
 # So many of them are calibrated without a look at the rows, too: that takes much longer.

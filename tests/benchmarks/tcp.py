@@ -13,9 +13,9 @@ import numpy as np
 from results import few, write_section
 from touched import TURN, Job, Made, bound, error_of, slipped, touched, turned
 
+from visioncal.core.transforms import compose
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.pivot import fit_pivot
-from visioncal.transforms import compose
 
 SEEDS, SLIP_SEEDS, WORKERS = *few((1000, 300), (3, 3)), 2
 ROBOT = Noise.of_robot(5e-5, 3e-5)

@@ -16,8 +16,8 @@ import numpy as np
 from mjpeg import NetworkCamera, number_of, served
 from results import write_section
 
-from visioncal.drivers.protocols import Frame
-from visioncal.drivers.uvc import UvcCamera
+from visioncal.live.drivers.protocols import Frame
+from visioncal.live.drivers.uvc import UvcCamera
 
 RATE_HZ, SIZE = 12.0, (2592, 1944)
 # Pauses in which nobody asks, and pictures that are asked for after each [s].

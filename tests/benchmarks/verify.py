@@ -17,11 +17,11 @@ import numpy as np
 from later import ANYHOW, Change, Lot, knock, known_again, lot
 from results import few, first, wished, write_section
 
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.check import check
+from visioncal.calibration.verification.prediction import seen_by
+from visioncal.core.types import Mount
 from visioncal.simulation import CellOptions
-from visioncal.types import Mount
-from visioncal.verification.check import check
-from visioncal.verification.footing import Footing
-from visioncal.verification.seeing import seen_by
 
 CHECKS, CELLS, FURTHER = 200, few(4, 1), few(240, 60)
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")

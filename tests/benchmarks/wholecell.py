@@ -17,8 +17,10 @@ from multiprocessing import Pool
 import numpy as np
 from results import wished, write_section
 
-from visioncal.calibration import Alignment
-from visioncal.pipeline import align
+from visioncal.calibration.pipeline import align
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import Corners, FloatArray
+from visioncal.results import Alignment
 from visioncal.session import Session
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network
@@ -26,8 +28,6 @@ from visioncal.simulation.network_records import network_session
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import checkerboard_target
 from visioncal.simulation.seen import Network
-from visioncal.transforms import invert, log
-from visioncal.types import Corners, FloatArray
 
 CELLS = 50
 STOPS = 40

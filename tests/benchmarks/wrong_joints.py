@@ -25,8 +25,8 @@ from slips import (
     with_tool,
 )
 
+from visioncal.core.types import MOUNTS
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
-from visioncal.types import MOUNTS
 
 SESSIONS = 20
 ROBOTS = ("ur3e", "ur5e", "ur10e")

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from rich.table import Table
 
-from visioncal.calibration import Calibration
-from visioncal.rehearsal.compared import edge_errors
-from visioncal.types import Camera, FloatArray
+from visioncal.core.types import Camera, FloatArray
+from visioncal.live.rehearsal.compared import edge_errors
+from visioncal.results import Calibration
 
 
 def truth_table(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.calibration import Alignment
+from visioncal.calibration.pipeline import align
 from visioncal.cli.console import (
     messages,
     print_verdict,
@@ -18,10 +18,10 @@ from visioncal.cli.console import (
 )
 from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_verdict
-from visioncal.figures import figure
-from visioncal.joining import leftover
-from visioncal.outputs import write_alignment
-from visioncal.pipeline import align
+from visioncal.core.number_format import figure
+from visioncal.interchange.merge_results import leftover
+from visioncal.interchange.outputs import write_alignment
+from visioncal.results import Alignment
 from visioncal.robot import Convention
 from visioncal.session import Session
 

@@ -27,8 +27,8 @@ from visioncal.cli.streams import guarded_streams
 from visioncal.cli.target import target_app
 from visioncal.cli.tcp import tcp_command
 from visioncal.cli.verify import verify_command
-from visioncal.errors import DataError, VisioncalError
-from visioncal.version import __version__
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.version import __version__
 
 app = typer.Typer(
     name="visioncal",

@@ -8,21 +8,21 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.calibration import to_document
-from visioncal.calibration.whole import whole_document
+from visioncal.calibration.pipeline import run, run_dense
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.running import check_dense, check_solver
 from visioncal.cli.align import align_into
 from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
 from visioncal.cli.needs import NeedDeg, NeedMm
 from visioncal.cli.pointing import naming, told_of
-from visioncal.joining import leftover
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import run, run_dense
-from visioncal.pipeline.known import Known
-from visioncal.pipeline.running import check_dense, check_solver
+from visioncal.core.types import SolverName
+from visioncal.interchange.merge_results import leftover
+from visioncal.interchange.outputs import write_outputs
+from visioncal.results import to_document
+from visioncal.results.whole import whole_document
 from visioncal.robot import Convention
 from visioncal.session import Session
 from visioncal.session.single import is_whole_cell
-from visioncal.types import SolverName
 
 
 def calibrate_command(

@@ -11,12 +11,12 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from visioncal.calibration import Calibration, Sight, Verdict, ViewResult
-from visioncal.errors import VisioncalError
-from visioncal.files import some_of
-from visioncal.outputs import Written
-from visioncal.transforms import pose_difference
-from visioncal.types import Progress as Told
+from visioncal.core.errors import VisioncalError
+from visioncal.core.files import some_of
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import Progress as Told
+from visioncal.interchange.outputs import Written
+from visioncal.results import Calibration, Sight, Verdict, ViewResult
 
 # 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check said
 # no (verify).

@@ -6,13 +6,13 @@ from functools import partial
 import typer
 from rich.markup import escape
 
+from visioncal.calibration.guess import Candidate, Guess
+from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli import convert_options as option
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.guessed import print_guess
-from visioncal.errors import DataError
-from visioncal.formats import Foreign, PoseWishes, Wishes, convert, guess_foreign
-from visioncal.guess import Candidate, Guess
-from visioncal.pipeline.guessing import guess_session
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import Foreign, PoseWishes, Wishes, convert, guess_foreign
 from visioncal.session import Session
 
 

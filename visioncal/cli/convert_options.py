@@ -5,9 +5,9 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
-from visioncal.errors import DataError
-from visioncal.formats import FOREIGN_FORMATS
-from visioncal.types import CameraMount
+from visioncal.core.errors import DataError
+from visioncal.core.types import CameraMount
+from visioncal.interchange.formats import FOREIGN_FORMATS
 
 _POSES = "The poses of somebody else's recording"
 _CAMERA = "Its camera"

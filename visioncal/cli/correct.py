@@ -9,22 +9,27 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.calibration import Calibration
 from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages
 from visioncal.cli.numbers import numbers_in
-from visioncal.compensation.arms import CalibratedArm, predicted_sigma_mm
-from visioncal.compensation.correction import WIDEST_RAD, Corrected, correct
-from visioncal.compensation.table import Targets, columns_to_send, read_targets, table_to_send
-from visioncal.errors import DataError
-from visioncal.figures import figure
-from visioncal.files import check_free, did_you_mean, some_of, write_atomically
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.interchange.result_files import load_calibration
+from visioncal.results import Calibration
+from visioncal.results.compensation.arms import CalibratedArm, predicted_sigma_mm
+from visioncal.results.compensation.correction import WIDEST_RAD, Corrected, correct
+from visioncal.results.compensation.table import (
+    Targets,
+    columns_to_send,
+    read_targets,
+    table_to_send,
+)
 from visioncal.robot import Loads
 from visioncal.session.choosing import ARM, EYE, Choice
 from visioncal.session.columns import no_celsius
-from visioncal.stored import load_calibration
-from visioncal.transforms import invert
-from visioncal.types import FloatArray, IntArray
 
 _SHOWN = 10
 _MOST_DEG = 720.0

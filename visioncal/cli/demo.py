@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from visioncal.calibration.pipeline import run
 from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import messages, print_summary, shown_progress, tell_written
-from visioncal.outputs import write_outputs
-from visioncal.pipeline import run
+from visioncal.interchange.outputs import write_outputs
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
 

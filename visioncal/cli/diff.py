@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from visioncal.cli.choosing import CameraName, RobotName, TargetName
-from visioncal.compare import Comparison, LensChange, Significance, compare, to_document
-from visioncal.stored import load_result
+from visioncal.interchange.result_files import load_result
+from visioncal.results.compare import Comparison, LensChange, Significance, compare, to_document
 
 # Under a nanometre and a micro-degree lies rounding.
 _DECIMALS = 6

@@ -12,13 +12,13 @@ from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages
 from visioncal.cli.dynamics_options import CutoffOption, SessionArgument
 from visioncal.cli.numbers import numbers_in
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import FloatArray
 from visioncal.dynamics import BaseModel, DynamicModel, FrictionTerms, Gains, drive_gains
 from visioncal.dynamics.run import current_streams, of_one_arm, robot_of
-from visioncal.errors import DataError
-from visioncal.figures import matched, significant
 from visioncal.robot import Inertias, matrices
 from visioncal.session import Session
-from visioncal.types import FloatArray
 
 
 def dynamics_gains_command(

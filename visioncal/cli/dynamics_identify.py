@@ -9,7 +9,6 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.calibration import Verdict
 from visioncal.cli.choosing import RobotName
 from visioncal.cli.console import messages, print_verdict, tell_written
 from visioncal.cli.dynamics_options import (
@@ -21,6 +20,8 @@ from visioncal.cli.dynamics_options import (
     identified_of,
     number_list,
 )
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
 from visioncal.dynamics.document import stribeck_rows, to_document
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import CLASSES, FILE, NOT_TOLD, Identified
@@ -28,9 +29,8 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.run import Request, identify_session, validate_session
 from visioncal.dynamics.validate import Prediction, validate
-from visioncal.errors import DataError
-from visioncal.figures import figure
-from visioncal.outputs import write_dynamics
+from visioncal.interchange.outputs import write_dynamics
+from visioncal.results import Verdict
 from visioncal.session import Session
 
 _FRICTION = ("coulomb", "viscous", "offset")

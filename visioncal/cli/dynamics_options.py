@@ -5,8 +5,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from visioncal.core.errors import DataError
 from visioncal.dynamics.identified import FILE, Identified
-from visioncal.errors import DataError
 
 SessionArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")

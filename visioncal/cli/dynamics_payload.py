@@ -15,11 +15,11 @@ from visioncal.cli.dynamics_options import (
     identified_of,
     number_list,
 )
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import FloatArray
 from visioncal.dynamics import Payload, estimate_payload
 from visioncal.dynamics.run import Request, conditioned_streams
-from visioncal.figures import matched, significant
 from visioncal.session import Session
-from visioncal.types import FloatArray
 
 
 def dynamics_payload_command(

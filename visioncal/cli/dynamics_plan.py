@@ -12,19 +12,19 @@ from visioncal.cli.console import messages, shown_progress, tell_written
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.plan_options import BoxOption, Clearance, Floor, Margin
 from visioncal.cli.planned_cell import box_of, floor_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.limits import Allowed, Missing, Share, allowed_motion
 from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.written import motion_document
-from visioncal.errors import DataError
-from visioncal.files import some_of
-from visioncal.outputs import write_motions
-from visioncal.planning.motions import plan_warnings, plan_words
+from visioncal.interchange.outputs import write_motions
+from visioncal.live.planning.motions import plan_warnings, plan_words
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.bodies import Body, capsule
-from visioncal.types import FloatArray
 
 
 def dynamics_plan_command(

@@ -7,12 +7,12 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.capture.motions import record_motion
 from visioncal.cli.console import messages
 from visioncal.cli.interrupts import ended_like_ctrl_c
-from visioncal.drivers.ur_motion import UrMotion
-from visioncal.errors import DataError
-from visioncal.files import check_free
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free
+from visioncal.live.capture.motions import record_motion
+from visioncal.live.drivers.ur_motion import UrMotion
 from visioncal.session import STREAMS, Session, Stream, check_stream, save_stream
 
 

@@ -8,10 +8,10 @@ from rich.markup import escape
 
 from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.console import messages
-from visioncal.errors import DataError
-from visioncal.exports import EXPORT_FORMATS, Load, Selection, document
-from visioncal.files import check_free, read_text, write_atomically
-from visioncal.stored import load_exportable
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, read_text, write_atomically
+from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document
+from visioncal.interchange.result_files import load_exportable
 
 
 def _show_formats(wanted: bool) -> None:

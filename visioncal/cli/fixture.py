@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from visioncal.calibration import Calibration
 from visioncal.cli.choosing import CameraName, RobotName, TargetName
 from visioncal.cli.convert_options import (
     JointColumns,
@@ -36,13 +35,14 @@ from visioncal.cli.seeing import (
     refuse_given,
     touch_options,
 )
-from visioncal.errors import DataError
-from visioncal.formats.touches import read_nominal, read_touches
+from visioncal.core.errors import DataError
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.measured import NO_TOOL, Tool
 from visioncal.frames.naming import transform_name
+from visioncal.interchange.formats.touches import read_nominal, read_touches
+from visioncal.interchange.result_files import load_placed
+from visioncal.results import Calibration
 from visioncal.session.choosing import ARM, EYE, Choice
-from visioncal.stored import load_placed
 
 
 def fixture_command(

@@ -9,20 +9,20 @@ from typing import Annotated, TypeAlias
 import typer
 from rich.markup import escape
 
-from visioncal.calibration import Calibration, Frame, FrameFile
-from visioncal.calibration.frame import frames_document
-from visioncal.calibration.selecting import placed_name
 from visioncal.cli.console import messages, print_verdict, tell_written
 from visioncal.cli.convert_options import names_in
-from visioncal.errors import DataError
-from visioncal.figures import figure
-from visioncal.formats import PoseWishes, Wishes
-from visioncal.joining import rewrite
-from visioncal.outputs import RECORDING, Written
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import pose_difference
+from visioncal.interchange.formats import PoseWishes, Wishes
+from visioncal.interchange.merge_results import rewrite
+from visioncal.interchange.outputs import RECORDING, Written
+from visioncal.interchange.result_files import load_result
+from visioncal.results import Calibration, Frame, FrameFile
+from visioncal.results.frame import frames_document
+from visioncal.results.selecting import placed_name
 from visioncal.robot import Robot, load_robot
 from visioncal.session.choosing import PARTS, Choice, Part
-from visioncal.stored import load_result
-from visioncal.transforms import pose_difference
 
 CalibrationOption: TypeAlias = Annotated[
     Path | None,

@@ -3,8 +3,8 @@
 from rich.markup import escape
 from rich.table import Table
 
+from visioncal.calibration.guess import Guess
 from visioncal.cli.console import messages
-from visioncal.guess import Guess
 
 
 def print_guess(guess: Guess) -> None:

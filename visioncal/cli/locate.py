@@ -11,31 +11,32 @@ import typer
 from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.calibration import Calibration, Edge
-from visioncal.calibration.selecting import boards_before
+from visioncal.calibration.stages.observed import by_reason
 from visioncal.cli.choosing import CameraName, RobotName
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.planes import FORMS, plane_of
 from visioncal.cli.seeing import refuse_given
-from visioncal.errors import DataError
-from visioncal.figures import figure
-from visioncal.files import some_of
-from visioncal.finders.imaging import read_image
-from visioncal.formats.boards import described_target
-from visioncal.frames.chain import Eye
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray, Target
+from visioncal.frames.camera_chain import Eye
 from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
-from visioncal.frames.look import check_size
 from visioncal.frames.picks import locate_views
-from visioncal.frames.sighting import check_mount, pose_of
+from visioncal.frames.session_observations import pose_of
+from visioncal.frames.target_in_image import check_size
+from visioncal.interchange.formats.boards import described_target
+from visioncal.interchange.result_files import load_result
+from visioncal.results import Calibration, Edge
+from visioncal.results.selecting import boards_before
+from visioncal.results.session_match import check_mount
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
 from visioncal.session.selecting import has_several, select
-from visioncal.stages.observed import by_reason
-from visioncal.stored import load_result
-from visioncal.targets import target_from_document
-from visioncal.types import FloatArray, Target
+from visioncal.vision.finders.imaging import read_image
+from visioncal.vision.targets import target_from_document
 
 _POSE = "x,y,z,qx,qy,qz,qw"
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.

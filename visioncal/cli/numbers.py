@@ -2,7 +2,7 @@
 
 import math
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 
 
 def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:

@@ -20,17 +20,17 @@ from visioncal.cli.planned_cell import (
     find_source,
     floor_of,
 )
-from visioncal.errors import DataError
-from visioncal.files import some_of
-from visioncal.outputs import write_plan
-from visioncal.planning.accuracy import Wish
-from visioncal.planning.cell import Limits, PlanCell
-from visioncal.planning.plan import Plan, Request, make_plan
-from visioncal.planning.purposes import purpose_of
-from visioncal.planning.recorded import Begun
-from visioncal.planning.telling import accuracy_words, looks_note, summary_of
-from visioncal.planning.written import plan_document
-from visioncal.types import FloatArray, Progress
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.types import FloatArray, Progress
+from visioncal.interchange.outputs import write_plan
+from visioncal.live.planning.accuracy import Wish
+from visioncal.live.planning.cell import Limits, PlanCell
+from visioncal.live.planning.messages import accuracy_words, looks_note, summary_of
+from visioncal.live.planning.plan import Plan, Request, make_plan
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.recorded import Begun
+from visioncal.live.planning.written import plan_document
 
 _SHOWN = 12
 # The cosine of a board's z to the base's, from which on only a camera below would see it.

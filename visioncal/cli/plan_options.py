@@ -5,9 +5,9 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from visioncal.planning.purposes import PURPOSES
-from visioncal.planning.selection import Criterion
-from visioncal.types import Mount
+from visioncal.core.types import Mount
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.selection import Criterion
 
 _WHAT = "What is planned"
 _CELL = "The cell, where the source does not say it"

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from visioncal.calibration import Calibration, Edge
 from visioncal.cli.numbers import numbers_in
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean, some_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
 from visioncal.frames.plane import Plane
+from visioncal.results import Calibration, Edge
 
 FORMS = (
     "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "

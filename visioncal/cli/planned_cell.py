@@ -7,26 +7,26 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration import Calibration
 from visioncal.cli.numbers import numbers_in
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.files import absence, read_bytes, some_of
+from visioncal.core.transforms import compose
+from visioncal.core.types import Camera, FloatArray, Mount, Progress, Target
 from visioncal.estimation.parts import Noise
-from visioncal.files import absence, read_bytes, some_of
-from visioncal.formats.boards import described_target
-from visioncal.formats.intrinsics import read_intrinsics
-from visioncal.outputs import CALIBRATION
-from visioncal.planning.cell import Box, Limits, PlanCell
-from visioncal.planning.recorded import Begun, Guess, begin, so_far
-from visioncal.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibration
+from visioncal.interchange.formats.boards import described_target
+from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.interchange.outputs import CALIBRATION
+from visioncal.interchange.result_files import load_calibration, load_stored
+from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.recorded import Begun, Guess, begin, so_far
+from visioncal.live.planning.sources import TYPICAL_NOISE, TYPICAL_PX, cell_of_calibration
+from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.session.choosing import ANY, LENS, Choice
 from visioncal.session.selecting import select
 from visioncal.session.single import is_to_be_parted
-from visioncal.stored import load_calibration, load_stored
-from visioncal.targets import target_from_document
-from visioncal.transforms import compose
-from visioncal.types import Camera, FloatArray, Mount, Progress, Target
+from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"
 
@@ -83,7 +83,7 @@ def find_source(name: str) -> Source:
         return Source(f"session {name}", session=Session.load(path))
     if path.suffix.lower() == ".rrd":
         # The codec takes half a second to import, which a robot need not wait for.
-        from visioncal.recording import read_calibration
+        from visioncal.present.recording import read_calibration
 
         calibration, session = read_calibration(path), Session.load(path)
         return Source(f"recording {name}", calibration=calibration, session=session)

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from visioncal.calibration import Calibration, Verdict
-from visioncal.errors import VisioncalError
+from visioncal.core.errors import VisioncalError
+from visioncal.results import Calibration, Verdict
 
 # How advice names the session in a command, where it does not know what the user calls it.
 _COMMAND = re.compile(r"\b(visioncal \w+) SESSION\b")

@@ -10,23 +10,23 @@ from typing import Any
 import typer
 from rich.markup import escape
 
-from visioncal.capture.clock import HostClock
-from visioncal.capture.core import Step, Watcher, missed
-from visioncal.capture.devices import ArmWish, is_folder, open_arm, open_camera
-from visioncal.capture.journal import Journal
-from visioncal.capture.live import LiveCell
-from visioncal.capture.options import CaptureOptions, Stillness
-from visioncal.capture.record import Departure, departure, record
-from visioncal.capture.words import line_of
 from visioncal.cli import record_options as options
 from visioncal.cli.console import messages
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.numbers import numbers_in
 from visioncal.cli.recorded_cell import Scene, facts_of, guided, scene_of, shown_in
-from visioncal.drivers.protocols import DeviceWishes, MovingArm
-from visioncal.errors import DataError, DriverError
-from visioncal.figures import figure
-from visioncal.planning.written import SPEED
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.number_format import figure
+from visioncal.live.capture.clock import HostClock
+from visioncal.live.capture.core import Step, Watcher, missed
+from visioncal.live.capture.devices import ArmWish, is_folder, open_arm, open_camera
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.messages import line_of
+from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.record import Departure, departure, record
+from visioncal.live.drivers.protocols import DeviceWishes, MovingArm
+from visioncal.live.planning.written import SPEED
 
 
 def record_command(

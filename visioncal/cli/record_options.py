@@ -5,8 +5,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from visioncal.capture.options import Keep
-from visioncal.types import CameraMount
+from visioncal.core.types import CameraMount
+from visioncal.live.capture.options import Keep
 
 _CELL = "The cell, where no plan says it"
 _TAKING = "How views are taken"

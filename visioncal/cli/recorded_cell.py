@@ -7,23 +7,23 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from visioncal.capture.agree import Agreement
-from visioncal.capture.coach import Coach
-from visioncal.capture.core import Capture, Step, Watcher
-from visioncal.capture.facts import Facts
-from visioncal.capture.follow import ask_and_take, follow
-from visioncal.capture.journal import Journal
-from visioncal.capture.live import LiveCell
-from visioncal.capture.options import CaptureOptions
-from visioncal.capture.predict import RecordedAccuracy
 from visioncal.cli.console import messages
-from visioncal.drivers.protocols import MovingArm
-from visioncal.errors import DataError, DriverError
-from visioncal.formats.boards import described_target
-from visioncal.planning.read_back import PlanFile, read_plan
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.types import Camera, CameraMount, Mount, Target
+from visioncal.interchange.formats.boards import described_target
+from visioncal.live.capture.coach import Coach
+from visioncal.live.capture.core import Capture, Step, Watcher
+from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.follow import ask_and_take, follow
+from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.predict import RecordedAccuracy
+from visioncal.live.drivers.protocols import MovingArm
+from visioncal.live.planning.read_back import PlanFile, read_plan
 from visioncal.robot import Robot, load_robot
-from visioncal.targets import target_from_document
-from visioncal.types import Camera, CameraMount, Mount, Target
+from visioncal.vision.targets import target_from_document
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +185,9 @@ def shown_in(scene: Scene, cell: LiveCell, *, wanted: bool) -> Iterator[list[Wat
         yield []
         return
     # Rerun takes half a second to import, which a recording that nobody watches need not wait for.
-    from visioncal.capture.shown import Shown
-    from visioncal.recording import live
-    from visioncal.viewer.live import live_viewer
+    from visioncal.live.capture.shown import Shown
+    from visioncal.present.recording import live
+    from visioncal.present.viewer.live import live_viewer
 
     plan = None if scene.plan is None else scene.plan.cell
     drawn = live.LiveCell(

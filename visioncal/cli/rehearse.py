@@ -13,21 +13,21 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
-from visioncal.calibration import Calibration
 from visioncal.cli.against_truth import truth_table
 from visioncal.cli.console import messages, print_summary, tell_written
 from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded
-from visioncal.drivers.extras import client_library
-from visioncal.errors import DataError
-from visioncal.files import write_atomically
-from visioncal.outputs import Written
-from visioncal.rehearsal.bench import Bench
-from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
-from visioncal.rehearsal.compared import Explained, edge_errors, explained
-from visioncal.rehearsal.trouble import Trouble
-from visioncal.rehearsal.witness import Pace, Witness, pace_of
-from visioncal.types import CameraMount
-from visioncal.version import __version__
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.core.types import CameraMount
+from visioncal.core.version import __version__
+from visioncal.interchange.outputs import Written
+from visioncal.live.drivers.extras import client_library
+from visioncal.live.rehearsal.bench import Bench
+from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
+from visioncal.live.rehearsal.compared import Explained, edge_errors, explained
+from visioncal.live.rehearsal.fault_injection import Trouble
+from visioncal.live.rehearsal.witness import Pace, Witness, pace_of
+from visioncal.results import Calibration
 
 # A check said no: the result is there, and it is farther from the truth than it says.
 EXIT_WRONG = 3

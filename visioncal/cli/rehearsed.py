@@ -7,24 +7,24 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.capture.core import Step, Watcher, missed
-from visioncal.capture.journal import Journal
-from visioncal.capture.options import CaptureOptions
-from visioncal.capture.take import Taken
+from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.console import messages, report_error, shown_progress, tell_written
 from visioncal.cli.interrupts import ended_like_ctrl_c
 from visioncal.cli.record import ViewLines, driven
 from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
-from visioncal.errors import DataError, DriverError, VisioncalError
-from visioncal.outputs import Written, write_outputs, write_plan
-from visioncal.pipeline import Run, run
-from visioncal.planning.plan import Request, make_plan
-from visioncal.planning.purposes import purpose_of
-from visioncal.planning.telling import summary_of
-from visioncal.planning.written import plan_document
-from visioncal.rehearsal.bench import Bench
-from visioncal.rehearsal.cell import RehearsalOptions, RehearsedCell
-from visioncal.rehearsal.trouble import Befalling, Trouble
+from visioncal.core.errors import DataError, DriverError, VisioncalError
+from visioncal.interchange.outputs import Written, write_outputs, write_plan
+from visioncal.live.capture.core import Step, Watcher, missed
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.take import Taken
+from visioncal.live.planning.messages import summary_of
+from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.planning.written import plan_document
+from visioncal.live.rehearsal.bench import Bench
+from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell
+from visioncal.live.rehearsal.fault_injection import Befalling, Trouble
 from visioncal.session import Session
 
 # The pace at which a UR moves where its program says nothing else; nobody stands beside this one.

@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.stored import load_stored
+from visioncal.interchange.result_files import load_stored
 
 
 def report_command(
@@ -27,11 +27,11 @@ def report_command(
     where it is missing or belongs to another result, the report says so.
     """
     # Plots take half a second to import, which help need not wait for.
-    from visioncal.report import write_report
+    from visioncal.present.report import write_report
 
     stored = load_stored(calibration)
     if stored.calibration.cell is not None:
-        from visioncal.report.cells import write_cell_report
+        from visioncal.present.report.cells import write_cell_report
 
         write_cell_report(out, stored.calibration.cell)
         messages().print(f"wrote {escape(str(out))}")

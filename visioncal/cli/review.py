@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from visioncal.cli.console import messages
-from visioncal.errors import DataError
-from visioncal.files import absence
-from visioncal.outputs import PREVIEW, RECORDING
+from visioncal.core.errors import DataError
+from visioncal.core.files import absence
+from visioncal.interchange.outputs import PREVIEW, RECORDING
 
 # The first bytes of every recording that rerun writes.
 _MAGIC = b"RRF2"
@@ -39,7 +39,7 @@ def review_command(
         raise typer.BadParameter("--port and --no-open belong to --web.")
     file = find_recording(recording)
     # Half a second, which help need not wait for.
-    from visioncal.viewer import review_native, review_web
+    from visioncal.present.viewer import review_native, review_web
 
     if not web:
         review_native(file)

@@ -7,16 +7,16 @@ from typing import Annotated, TypeAlias
 import numpy as np
 import typer
 
-from visioncal.calibration import Calibration, Frame
 from visioncal.cli.console import shown_progress
 from visioncal.cli.framing import Place
 from visioncal.cli.numbers import numbers_in
-from visioncal.errors import DataError
-from visioncal.files import some_of
-from visioncal.frames.marked import marked_fixture
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.frames.drawing_points import NominalPoints
+from visioncal.frames.fixture_from_markers import marked_fixture
+from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.naming import FrameKind
-from visioncal.frames.nominal import NominalPoints
-from visioncal.frames.seen_frame import seen_frame
+from visioncal.results import Calibration, Frame
 from visioncal.session import Session
 from visioncal.session.choosing import Choice
 from visioncal.session.selecting import has_several, select

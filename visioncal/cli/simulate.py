@@ -8,6 +8,7 @@ import typer
 from visioncal.cli.console import messages, shown_progress
 from visioncal.cli.simulated import given_for
 from visioncal.cli.simulated_cell import CENTRE_M, Along, Read, exercise_options, whole_cell
+from visioncal.core.types import CameraMount
 from visioncal.simulation import (
     ARMS,
     CAMERAS,
@@ -38,7 +39,6 @@ from visioncal.simulation import sweep as swept
 from visioncal.simulation.exercise import write_exercise
 from visioncal.simulation.records import truth_of, write_truth
 from visioncal.simulation.tracked import THREE, Tracked, tracked, write_tracked
-from visioncal.types import CameraMount
 
 _BOARDS = {
     "charuco": charuco_target,

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import typer
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 
 # What a cell of one robot takes, whatever is recorded of it.
 _SINGLE = frozenset(

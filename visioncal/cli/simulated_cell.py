@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.cli.console import shown_progress
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (
     CellOptions,

@@ -7,7 +7,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, TextIO, cast
 
 from visioncal.cli.console import EXIT_NO_RESULT, report_error
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 
 # As a shell reports a program that SIGPIPE ended.
 _EXIT_BROKEN_PIPE = 128 + 13

@@ -8,12 +8,13 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages
-from visioncal.errors import DataError
-from visioncal.files import check_free, write_atomically
-from visioncal.finders.identify import identify
-from visioncal.finders.identify_text import describe, to_document, to_toml
-from visioncal.finders.imaging import read_image
-from visioncal.printing import (
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, write_atomically
+from visioncal.core.types import Target
+from visioncal.vision.finders.identify import identify
+from visioncal.vision.finders.identify_text import describe, to_document, to_toml
+from visioncal.vision.finders.imaging import read_image
+from visioncal.vision.printing import (
     Page,
     Request,
     arrange,
@@ -22,8 +23,12 @@ from visioncal.printing import (
     side_metres,
     write_board,
 )
-from visioncal.targets import load_target, target_document, target_from_document, target_names
-from visioncal.types import Target
+from visioncal.vision.targets import (
+    load_target,
+    target_document,
+    target_from_document,
+    target_names,
+)
 
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",

@@ -35,9 +35,9 @@ from visioncal.cli.seeing import (
     refuse_given,
     touch_options,
 )
-from visioncal.formats.touches import read_touches
 from visioncal.frames.naming import transform_name
 from visioncal.frames.tcp import touched_tool
+from visioncal.interchange.formats.touches import read_touches
 from visioncal.session.choosing import ARM, EYE, Choice
 
 

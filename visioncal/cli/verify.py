@@ -8,15 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.calibration import picked
-from visioncal.cli.choosing import CameraName, RobotName, TargetName
-from visioncal.cli.console import messages, shown_progress, tell_written
-from visioncal.errors import DataError
-from visioncal.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
-from visioncal.session import Session
-from visioncal.session.choosing import Choice
-from visioncal.stored import load_result
-from visioncal.verification import (
+from visioncal.calibration.verification import (
     Check,
     Outcome,
     facts_of,
@@ -26,6 +18,14 @@ from visioncal.verification import (
     to_document,
     verify,
 )
+from visioncal.cli.choosing import CameraName, RobotName, TargetName
+from visioncal.cli.console import messages, shown_progress, tell_written
+from visioncal.core.errors import DataError
+from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
+from visioncal.interchange.result_files import load_result
+from visioncal.results import picked
+from visioncal.session import Session
+from visioncal.session.choosing import Choice
 
 # A check said no.
 _EXIT_FAILED = 3

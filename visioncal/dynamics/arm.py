@@ -5,11 +5,11 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.friction import Friction
 from visioncal.dynamics.identified import Identified
-from visioncal.errors import DataError
 from visioncal.robot import Inertias, Robot, joint_torques, momenta, moving, with_inertias
-from visioncal.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

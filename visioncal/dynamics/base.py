@@ -12,10 +12,10 @@ from typing import Self
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
-from visioncal.errors import DataError
-from visioncal.types import FloatArray, IntArray
 
 # States that stand for all, and their greatest speeds [rad/s] and accelerations [rad/s^2]; at these
 # gravity, speed and acceleration have like shares in the torques.

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp, softmax
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.motion import Motion
-from visioncal.types import FloatArray
 
 # A motion without effect on a parameter must not divide by zero.
 _TINY = 1e-12

@@ -8,13 +8,13 @@ from typing import Self
 import numpy as np
 from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
 
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.motion import Measured, Motion
 from visioncal.dynamics.reading import Recorded
 from visioncal.dynamics.smoothing import WIDER, band_of, smoothed_motion, window_of
-from visioncal.errors import DataError
-from visioncal.files import some_of
-from visioncal.types import FloatArray, Mask
 
 # Torques of a rigid arm have all but their friction's corners within so many times the band of its
 # motion; below so many a second there is little to tell noise by, and beyond the other gears and

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
+from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.base import BaseModel
-from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import covariance, damped_step
 from visioncal.robot import Inertias, LogCholesky
-from visioncal.types import FloatArray, Mask
 
 # Links differ from what is known of them by about so much in each coordinate: a third of their
 # extent, and twice that of their mass.

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.validate import Prediction
-from visioncal.types import FloatArray
 
 
 def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
+from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
 from visioncal.dynamics.friction import FrictionTerms
@@ -13,8 +15,6 @@ from visioncal.dynamics.judge import judge
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Robot
-from visioncal.types import FloatArray
-from visioncal.version import __version__
 
 SCHEMA = 1
 # What a validation has of each joint, always and where it is known.

@@ -15,18 +15,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import minimize
 
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import some_of
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, Progress
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.condition import Condition, condition_of
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.friction import FrictionTerms
-from visioncal.dynamics.kept import CHECK_HZ, Kept, kept_limits
+from visioncal.dynamics.limit_check import CHECK_HZ, Kept, kept_limits
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.objective import Objective
-from visioncal.errors import DataError, DegenerateError
-from visioncal.files import some_of
-from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, Progress
 
 # How long a motion may be [s], and of how many harmonics: fewer cannot tell the parameters of six
 # joints, more have speeds that shake the arm.

@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import null_space
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
-from visioncal.types import FloatArray
 
 
 @dataclass(frozen=True)

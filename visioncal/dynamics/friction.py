@@ -5,8 +5,8 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
-from visioncal.types import FloatArray
 
 # Below this speed a joint may stick, and its friction has no sign of its own [rad/s].
 SLOW_RAD_S = 0.005

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import qr
 
+from visioncal.core.errors import DegenerateError
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.motion import Motion
-from visioncal.errors import DegenerateError
 from visioncal.robot import body_regressor
-from visioncal.types import FloatArray
 
 # A gain that is known no better than to this share of itself is not told [-].
 _WORST = 0.1

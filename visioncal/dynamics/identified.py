@@ -9,15 +9,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from visioncal.documents import parse_stored
+from visioncal.core.documents import parse_stored
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.stribeck import Stribeck
-from visioncal.errors import DataError
-from visioncal.files import read_bytes, write_atomically
 from visioncal.robot import Inertias, Robot
-from visioncal.types import FloatArray
 
 FILE = "dynamics.json"
 # A parameter is told to so many percent of itself, or worse, or not at all.

@@ -6,11 +6,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.base import random_motion
 from visioncal.dynamics.identified import NOT_TOLD, Identified, Validation
-from visioncal.figures import figure
-from visioncal.files import some_of
-from visioncal.types import FloatArray, Mask
 
 Status: TypeAlias = Literal["good", "check", "bad"]
 

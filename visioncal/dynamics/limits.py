@@ -6,13 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import Motion
-from visioncal.errors import DataError
-from visioncal.files import some_of
 from visioncal.robot import Inertias, Robot, joint_torques, moving
 from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.robot.collision import Collisions
-from visioncal.types import FloatArray
 
 
 @dataclass(frozen=True)

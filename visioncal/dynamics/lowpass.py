@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.types import FloatArray, Mask
+from visioncal.core.types import FloatArray, Mask
 
 # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
 _BETA, _SPAN = 5.65, 1.81

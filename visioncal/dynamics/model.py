@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.motion import Motion
 from visioncal.robot import PARAMETER_NAMES, Robot, torque_regressor
-from visioncal.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.condition import smooth_condition
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
-from visioncal.types import FloatArray
 
 # Samples for each of the highest harmonic's periods: torques hold products of few of them. Limits
 # and distances are looked at more often.

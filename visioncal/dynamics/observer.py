@@ -6,10 +6,10 @@ Sensorless robot collision detection and hybrid force/motion control).
 
 import numpy as np
 
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.motion import Measured
-from visioncal.errors import DataError
-from visioncal.types import FloatArray
 
 # How fast the residual follows: a push is seen to 63 % after the inverse of it [1/s].
 USUAL_GAIN = 25.0

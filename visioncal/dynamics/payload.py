@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.errors import DegenerateError
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.friction import FrictionTerms
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
-from visioncal.errors import DegenerateError
-from visioncal.figures import figure
 from visioncal.robot import Inertias, body_regressor, entries
-from visioncal.types import FloatArray
 
 # A mass that is known no better than to this share of itself is none [-].
 _WORST = 0.5

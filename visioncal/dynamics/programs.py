@@ -4,12 +4,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from visioncal.core.files import one_line
+from visioncal.core.types import FloatArray
+from visioncal.core.version import __version__
 from visioncal.dynamics.fourier import Series
 from visioncal.dynamics.sweeps import REST_S, Stroke, Sweeps
-from visioncal.files import one_line
 from visioncal.robot import Robot
-from visioncal.types import FloatArray
-from visioncal.version import __version__
 
 _UR_JOINTS = 6
 # To where a motion begins the arm drives slowly, and rests there before it begins [rad/s, rad/s^2].

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import qr, solve_triangular
 
-from visioncal.chance import chi2_limit
-from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, IntArray, Mask
 
 # Rows that are decomposed at a time, so that they stay in the processor's cache.
 _CHUNK = 2000

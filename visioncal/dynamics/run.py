@@ -6,19 +6,19 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import Identification, Options, identify
 from visioncal.dynamics.reading import Recorded, read_recorded
 from visioncal.dynamics.validate import Prediction, friction_of_known, predict, validate
-from visioncal.errors import DataError, DegenerateError
-from visioncal.files import did_you_mean
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
 from visioncal.session.choosing import ARM, Choice
 from visioncal.session.selecting import select
 from visioncal.session.single import check_one_of_each
-from visioncal.types import FloatArray
 
 # The share of a motion's end that is predicted where no other motion is named.
 HELD_OUT = 0.3

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.motion import Motion
-from visioncal.types import FloatArray, IntArray
 
 # A motion's band ends where the power of its accelerations stays under this share of its peak,
 # sought in parts of a quarter octave; it is told by joints that move at least this share of the

@@ -11,14 +11,14 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.chance import chi2_limit
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.friction import sign
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, Regression, regress
-from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import covariance, damped_step, gram
-from visioncal.types import FloatArray, IntArray
 
 # Where the search begins, and what it stays within [rad/s].
 _STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5

@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.fourier import even_times
-from visioncal.dynamics.kept import Kept, kept_limits
+from visioncal.dynamics.limit_check import Kept, kept_limits
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.motion import Motion
-from visioncal.errors import DataError, DegenerateError
-from visioncal.types import FloatArray
 
 # Ramps last at least, and constant speed is held at least [s].
 _SHORTEST_RAMP_S, _SHORTEST_HOLD_S = 0.15, 0.4

@@ -5,15 +5,15 @@ from functools import partial
 
 import numpy as np
 
+from visioncal.core.errors import DegenerateError
+from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Identified, Validation
 from visioncal.dynamics.identify import Identification
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.regression import Block, regress, rms_of, spread_of
-from visioncal.errors import DegenerateError
 from visioncal.robot import joint_torques
-from visioncal.types import FloatArray, Mask
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.version import __version__
 from visioncal.dynamics.condition import Condition
 from visioncal.dynamics.excitation import Excitation
-from visioncal.dynamics.kept import CHECK_HZ, Kept
+from visioncal.dynamics.limit_check import CHECK_HZ, Kept
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.motion import Motion
 from visioncal.dynamics.planned import MotionPlan
 from visioncal.dynamics.programs import excitation_program, is_programmed, sweeps_program
 from visioncal.dynamics.sweeps import Sweeps
-from visioncal.version import __version__
 
 SCHEMA = 1
 MOTION_FILES = ("sweeps.script", "sweeps.csv", "excitation.script", "excitation.csv")

@@ -15,14 +15,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import Knowledge
-from visioncal.targets import corner_positions
-from visioncal.types import Camera, FloatArray, IntArray, Mask, Target
+from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.targets import corner_positions
 
 # The effect's name in a problem.
 LENS_AND_BOARD = "lens and board"

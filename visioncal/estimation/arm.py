@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
@@ -23,8 +25,6 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.variance import LEAST_SIGMA, Components, Knowledge
 from visioncal.robot import Robot
-from visioncal.transforms import adjoint, invert
-from visioncal.types import FloatArray, IntArray, Mask
 
 # Arms are off by some 0.5 mm for each mrad.
 LEVER_M = 0.5

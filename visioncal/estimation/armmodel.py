@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, invert, log, mean_transform
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors
 from visioncal.robot import Loads, Robot, WeightFunctions, bent_joints
-from visioncal.transforms import adjoint, invert, log, mean_transform
-from visioncal.types import FloatArray, Mask
 
 # Columns of a joint's function (see `Robot.function_jacobian`) that a block changes.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}

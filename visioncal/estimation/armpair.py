@@ -4,12 +4,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, invert, skew
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.parts import Noise, Observations, State
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.robot import Loads
-from visioncal.transforms import adjoint, invert, skew
-from visioncal.types import FloatArray, IntArray, Mask
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.linalg import covariance_among
@@ -11,7 +12,6 @@ from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.solve import normal_equations, whitened
 from visioncal.estimation.variance import Knowledge
 from visioncal.robot import Loads
-from visioncal.types import FloatArray
 
 # A spring's bend is told by a stop where its torque is at least this, and this share of the
 # greatest [N m].

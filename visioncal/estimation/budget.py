@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from visioncal.chance import chi2_limit
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_among, gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.solve import fisher_information
-from visioncal.transforms import skew
-from visioncal.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

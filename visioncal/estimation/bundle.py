@@ -9,12 +9,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.core.transforms import exp
+from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack, Reprojection, reproject
-from visioncal.estimation.descend import Linearised, descend
+from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import covariance, damped_step
-from visioncal.transforms import exp
-from visioncal.types import Camera, FloatArray
+from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The intrinsics (4 + k,) and the poses (v, 4, 4).
 _State: TypeAlias = tuple[FloatArray, FloatArray]

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from visioncal.core.transforms import distances, invert, mean_transform
+from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.estimation.parts import ROBOT, Effect, FramePrior, Observations, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Branch, Tree
-from visioncal.transforms import distances, invert, mean_transform
-from visioncal.types import FloatArray, IntArray, Mount
 
 BASE, FLANGE = "base", "flange"
 

@@ -9,8 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.chance import f_limit
+from visioncal.core.quantiles import f_limit
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.chain import chain
+from visioncal.estimation.clock_correlation import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
@@ -20,10 +23,7 @@ from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, fisher_information, fit_problem
 from visioncal.estimation.trajectory import Trajectory
-from visioncal.estimation.turned import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
 from visioncal.estimation.variance import Knowledge
-from visioncal.threads import one_blas_thread
-from visioncal.types import Camera, FloatArray, IntArray, Mask
 
 # A start from more frames is no better; a fit of more takes long.
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4

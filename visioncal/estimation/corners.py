@@ -10,10 +10,10 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.camera import project_with_jacobian
-from visioncal.chance import chi2_limit
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.viewnoise import weights_by_view
-from visioncal.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.vision.camera import project_with_jacobian
 
 # Stated noise is contradicted by residuals that chance gives in one session of ten thousand, where
 # they are off by more than the rounding to the one digit that people state.

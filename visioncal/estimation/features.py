@@ -13,8 +13,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.errors import DataError, DegenerateError
-from visioncal.estimation.agreement import Agreement, agreeing_groups
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import some_of
+from visioncal.core.transforms import compose, exp, skew
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.group_outliers import Agreement, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
@@ -26,9 +29,6 @@ from visioncal.estimation.placing import (
     refuse_poor,
     worst_directions,
 )
-from visioncal.files import some_of
-from visioncal.transforms import compose, exp, skew
-from visioncal.types import FloatArray, IntArray
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 # Which of x, y, z in the fixture's frame are zero at a touch of each kind.

@@ -12,7 +12,8 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from visioncal.estimation.descend import Linearised, descend
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import covariance, damped_step, gram, spectrum
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
@@ -21,7 +22,6 @@ from visioncal.estimation.variance import (
     estimate_sigmas,
     profile_interval,
 )
-from visioncal.types import FloatArray, Mask
 
 State = TypeVar("State")
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.types import FloatArray
+from visioncal.core.types import FloatArray
 
 
 @dataclass(frozen=True)

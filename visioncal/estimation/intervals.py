@@ -6,11 +6,11 @@ from functools import partial
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import robot_levels, robot_likelihood, starting_noise
 from visioncal.estimation.variance import profile_interval
-from visioncal.types import FloatArray
 
 # The normal quantile that a 95 % interval reaches to.
 _TWO_SIDED_95 = 1.96

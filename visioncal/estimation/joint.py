@@ -11,8 +11,9 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from visioncal.chance import chi2_limit
-from visioncal.errors import ConvergenceError
+from visioncal.core.errors import ConvergenceError
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import Looks, Seen
@@ -27,7 +28,6 @@ from visioncal.estimation.solve import (
     normal_equations,
     score_gain,
 )
-from visioncal.types import FloatArray, IntArray, Mask
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
 _FALSE_ALARM = 1e-4

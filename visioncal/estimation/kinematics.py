@@ -12,12 +12,12 @@ from types import MappingProxyType
 
 import numpy as np
 
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import ArmErrors, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals, robot_levels
-from visioncal.types import FloatArray, Mask
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import eigh
 
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask
 
 _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 

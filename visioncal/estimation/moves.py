@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.chance import chi2_limit, f_limit
+from visioncal.core.quantiles import chi2_limit, f_limit
+from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance, spectrum
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
@@ -20,8 +22,6 @@ from visioncal.estimation.solve import (
     equations_from,
     fitted_covariance,
 )
-from visioncal.transforms import adjoint, exp, invert, log
-from visioncal.types import FloatArray, IntArray, Mask
 
 # A move must explain so many observations, of so many stops, more than they are explained now.
 _FEWEST = 3

@@ -13,10 +13,10 @@ from math import perm
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from visioncal.chance import f_limit
+from visioncal.core.quantiles import f_limit
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
 from visioncal.estimation.procrustes import align, apply, misfit
-from visioncal.types import FloatArray, IntArray
 
 # So many orders are all tried: seven points of seven.
 _EXHAUSTIVE = 5040

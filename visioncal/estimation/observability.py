@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DegenerateError
+from visioncal.core.errors import DegenerateError
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
 from visioncal.estimation.linalg import covariance_among, spectrum
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
-from visioncal.figures import figure
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray, Mount
 
 # Under this scaled eigenvalue ratio a direction is not determined by the motion at all.
 _NULL_RATIO = 1e-8

@@ -13,8 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.chance import f_limit
+from visioncal.core.quantiles import f_limit
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.moves import (
     Move,
     better_stop,
@@ -44,9 +47,6 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
-from visioncal.solvers import SOLVERS
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray, IntArray, Mask
 
 # A sound observation is lost in one session of a thousand.
 _FALSE_ALARM = 1e-3

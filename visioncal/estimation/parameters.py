@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.robot import FUNCTION_NAMES, DHTable
 from visioncal.robot.slopes import ROW_NAMES, number_slopes, table_moves
-from visioncal.transforms import adjoint, invert
-from visioncal.types import FloatArray
 
 _LENGTHS = ("d", "a")
 _ROW = len(ROW_NAMES)

@@ -7,9 +7,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from visioncal.core.transforms import exp, inverse_right_jacobian, log
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.variance import Knowledge
-from visioncal.transforms import exp, inverse_right_jacobian, log
-from visioncal.types import FloatArray, IntArray, Mask
 
 # Variances of a direction that a pose leaves open are above this [rad^2].
 _OPEN = 0.05

@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.chance import f_limit
-from visioncal.errors import DataError
-from visioncal.estimation.agreement import Agreement, agreeing_groups
+from visioncal.core.errors import DataError
+from visioncal.core.quantiles import f_limit
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.group_outliers import Agreement, agreeing_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
 from visioncal.estimation.turning import CARELESS_M, check_counts, check_turning
-from visioncal.threads import one_blas_thread
-from visioncal.types import FloatArray, Mask
 
 # A touch that errs fits another point by chance in one of a thousand.
 _FALSE_ALARM = 1e-3

@@ -4,7 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from visioncal.errors import DegenerateError
+from visioncal.core.errors import DegenerateError
+from visioncal.core.files import some_of
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.groups import GroupFit, State
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.observability import (
@@ -13,9 +16,6 @@ from visioncal.estimation.observability import (
     Direction,
     axis_words,
 )
-from visioncal.files import some_of
-from visioncal.transforms import skew
-from visioncal.types import FloatArray, Mask
 
 # No instrument of a cell is better [m]: exact coordinates would otherwise be judged by rounding.
 LEAST_NOISE_M = 1e-6

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visioncal.camera import normalise
+from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.corners import CornerStack
-from visioncal.types import Camera, FloatArray, Mask
+from visioncal.vision.camera import normalise
 
 # A homography takes four points. Nearer to a line than this share of the target is on it.
 _FEWEST, _ON_LINE = 4, 1e-6

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.chance import t_chance
-from visioncal.errors import DataError
-from visioncal.estimation.agreement import Agreement, agreeing_groups
+from visioncal.core.errors import DataError
+from visioncal.core.quantiles import t_chance
+from visioncal.core.transforms import exp, skew
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.group_outliers import Agreement, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups, fit_groups
 from visioncal.estimation.numbering import Numbering, find_numbering
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
@@ -26,8 +28,6 @@ from visioncal.estimation.pointpairs import (
 )
 from visioncal.estimation.procrustes import align, apply, misfit, scale_between, spreads
 from visioncal.estimation.robust import small_sets
-from visioncal.transforms import exp, skew
-from visioncal.types import FloatArray, IntArray, Mask
 
 # A scale is called different from one in one sound set of a thousand.
 _FALSE_ALARM = 1e-3

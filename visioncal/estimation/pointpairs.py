@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.chance import f_limit
-from visioncal.conventions import UNITS_M
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.conventions import UNITS_M
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import some_of
+from visioncal.core.quantiles import f_limit
+from visioncal.core.types import FloatArray
 from visioncal.estimation.numbering import Numbering
 from visioncal.estimation.observability import axis_words
 from visioncal.estimation.placing import LEAST_NOISE_M, LEAST_RATIO
 from visioncal.estimation.procrustes import mirrored, misfit, spreads
-from visioncal.files import some_of
-from visioncal.types import FloatArray
 
 FEWEST_POINTS = 3
 # A ratio of lengths this near to that of two units is no chance: no part is off by so much.

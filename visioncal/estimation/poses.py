@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.transforms import exp
+from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack, Reprojection, reproject
 from visioncal.estimation.linalg import damped_step
-from visioncal.transforms import exp
-from visioncal.types import Camera, FloatArray
 
 _ITERATIONS = 30
 # A step [rad or m] so small that the next, some hundred times smaller, is nothing beside any noise.

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.descend import Linearised, descend
+from visioncal.core.transforms import exp, invert, skew
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import damped_step
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
-from visioncal.transforms import exp, invert, skew
-from visioncal.types import FloatArray, IntArray, Mask
 
 # Variance about each axis of a rotation that is not told [rad^2].
 UNTOLD = 1.0

@@ -20,12 +20,12 @@ from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parts import Effect, FramePrior, Noise, Observations, State
 from visioncal.estimation.tree import Step, Tree
 from visioncal.estimation.variance import Knowledge
-from visioncal.transforms import adjoint, exp, inverse_right_jacobian, invert, log
-from visioncal.types import FloatArray, IntArray, Mask
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
 _NOT_MEASURED = 1.0

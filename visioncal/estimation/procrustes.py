@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from visioncal.transforms import compose, nearest_rotation
-from visioncal.types import FloatArray
+from visioncal.core.transforms import compose, nearest_rotation
+from visioncal.core.types import FloatArray
 
 # One reflection: with a rotation behind it, it is any other.
 _MIRROR = np.array([-1.0, 1.0, 1.0])

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray
 from visioncal.estimation.touching import Touches, linear_tip
-from visioncal.transforms import compose, invert
-from visioncal.types import FloatArray
 
 # Touches that were read wrongly close so much better when they are read right, and this well [m].
 _MUCH_BETTER, _CLOSED_M = 20.0, 2e-3

@@ -14,8 +14,8 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from visioncal.chance import chi2_limit
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import FloatArray, IntArray, Mask
 
 Fit = TypeVar("Fit")
 State = TypeVar("State")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Target
 from visioncal.estimation.appearance import (
     BOARD_NAMES,
     Compressed,
@@ -14,8 +15,7 @@ from visioncal.estimation.appearance import (
     shape_slices,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.targets import first_corners, numbered_positions
-from visioncal.types import Camera, Corners, FloatArray, IntArray, Target
+from visioncal.vision.targets import first_corners, numbered_positions
 
 # The frame of the only camera, where there is one.
 ONLY_CAMERA = "cam"

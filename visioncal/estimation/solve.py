@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.estimation.descend import Linearised, descend
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.levenberg_marquardt import Linearised, descend
 from visioncal.estimation.linalg import (
     covariance,
     covariance_among,
@@ -23,7 +24,6 @@ from visioncal.estimation.variance import (
     RatioPrior,
     estimate_sigmas,
 )
-from visioncal.types import FloatArray, Mask
 
 _ROUNDS, _SETTLED = 20, 1e-10
 # Noise levels that change by less have settled, far below what is known of them.

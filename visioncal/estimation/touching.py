@@ -17,11 +17,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from visioncal.core.transforms import compose, exp, invert, nearest_rotation, skew
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.groups import Groups
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.placing import LEAST_NOISE_M
-from visioncal.transforms import compose, exp, invert, nearest_rotation, skew
-from visioncal.types import FloatArray, IntArray, Mask
 
 TouchKind: TypeAlias = Literal["point", "z", "xz"]
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.transforms import exp, invert, log
-from visioncal.types import FloatArray, IntArray, Mask
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import FloatArray, IntArray, Mask
 
 # Samples farther apart than so many times the usual, and than so much [s], have others missing
 # between them; across the longest gap a robot can go anywhere.

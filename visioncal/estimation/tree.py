@@ -7,7 +7,7 @@ parts are one body: what stands in the cell, and what each flange carries.
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from visioncal.types import FloatArray
+from visioncal.core.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
 from visioncal.estimation.groups import GroupFit
 from visioncal.estimation.linalg import covariance, spectrum
 from visioncal.estimation.observability import (
@@ -15,8 +17,6 @@ from visioncal.estimation.observability import (
 from visioncal.estimation.placing import LEAST_NOISE_M
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
-from visioncal.transforms import invert
-from visioncal.types import FloatArray
 
 # Under this scaled eigenvalue ratio the touches do not determine a direction at all.
 _NULL_RATIO = 1e-8

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.linalg import covariance_root, gram
-from visioncal.types import FloatArray, Mask
 
 # Standard deviations stay within these, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2

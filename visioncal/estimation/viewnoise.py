@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
-from visioncal.chance import chi2_limit
-from visioncal.types import FloatArray
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import FloatArray
 
 # Views of one noise are taken for views of several in one session of ten thousand.
 _FALSE_ALARM = 1e-4

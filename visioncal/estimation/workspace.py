@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.robot import Robot
-from visioncal.types import FloatArray
 
 # Postures that stand for the workspace, and how far a joint without limits turns.
 _POSTURES, _TURN_RAD = 400, np.pi

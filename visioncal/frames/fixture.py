@@ -1,16 +1,16 @@
 """A fixture from touches: where the tip was, the fit, and what it rests on."""
 
-from visioncal.calibration import Calibration, Frame
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
 from visioncal.estimation.features import FEATURE_KINDS
-from visioncal.files import some_of
-from visioncal.frames.drawn import drawn_fixture
-from visioncal.frames.featured import featured_fixture
-from visioncal.frames.fitted import FixtureOptions, Setting
+from visioncal.frames.drawing_points import NominalPoints
+from visioncal.frames.fixture_fit import FixtureOptions, Setting
+from visioncal.frames.fixture_from_drawing import drawn_fixture
+from visioncal.frames.fixture_from_features import featured_fixture
 from visioncal.frames.measured import Tool, touched_points
-from visioncal.frames.nominal import NominalPoints
 from visioncal.frames.touches import TouchRows, robot_noise
 from visioncal.frames.verdicts import Doubt
+from visioncal.results import Calibration, Frame
 from visioncal.robot import Robot
 
 

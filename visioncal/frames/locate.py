@@ -4,16 +4,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from visioncal.calibration import Calibration
-from visioncal.camera import normalise, project_with_jacobian
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
-from visioncal.frames.chain import Eye, Pose, Stop, checked_point, point_slope
+from visioncal.frames.camera_chain import Eye, Pose, Stop, checked_point, point_slope
 from visioncal.frames.located import Located
-from visioncal.frames.look import SeenTarget, see
 from visioncal.frames.plane import Plane
+from visioncal.frames.target_in_image import SeenTarget, see
+from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice
-from visioncal.types import Corners, FloatArray, Image, Target
+from visioncal.vision.camera import normalise, project_with_jacobian
 
 # A ray within this angle of a plane [rad] does not meet it at any place that could be told.
 _PARALLEL = 1e-6

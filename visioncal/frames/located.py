@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.chance import f_limit
-from visioncal.types import FloatArray
+from visioncal.core.quantiles import f_limit
+from visioncal.core.types import FloatArray
 
 # A direction with less than this share of the largest variance is exact: the normal of a declared
 # plane. A point is as far off it as rounding takes it [m].

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.calibration import Calibration, Edge, Frame, Verdict
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise
-from visioncal.files import did_you_mean, some_of
 from visioncal.frames.touches import TouchRows, check_lengths, flange_poses, refuse_copies
+from visioncal.results import Calibration, Edge, Frame, Verdict
 from visioncal.robot import Robot
-from visioncal.transforms import skew
-from visioncal.types import FloatArray
 
 NO_TOOL = (
     "Find the tip with visioncal tcp first, and name its file with --tool; or say --tool none, "

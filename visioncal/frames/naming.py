@@ -3,7 +3,7 @@
 import re
 from typing import Literal, TypeAlias
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 
 FrameKind: TypeAlias = Literal["tool", "fixture"]
 

@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from visioncal.calibration import Calibration, picked
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, Progress
 from visioncal.frames.locate import locate_target
 from visioncal.frames.located import Located
-from visioncal.frames.sighting import nothing_fits, sighting, without_label
+from visioncal.frames.session_observations import nothing_fits, sighting, without_label
+from visioncal.results import Calibration, picked
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
-from visioncal.types import FloatArray, Progress
 
 _ORIGIN = (0.0, 0.0, 0.0)
 

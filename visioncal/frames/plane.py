@@ -5,11 +5,11 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration import Edge
-from visioncal.errors import DataError
-from visioncal.frames.chain import FAR_M
-from visioncal.transforms import skew
-from visioncal.types import FloatArray
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray
+from visioncal.frames.camera_chain import FAR_M
+from visioncal.results import Edge
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from visioncal.calibration import Calibration, Edge, Frame, Observation
-from visioncal.errors import DataError, DegenerateError, VisioncalError
+from visioncal.core.errors import DataError, DegenerateError, VisioncalError
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import FloatArray
 from visioncal.estimation.pivot import PivotFit, fit_pivot
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
-from visioncal.figures import figure
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
@@ -30,9 +31,8 @@ from visioncal.frames.verdicts import (
     verdict_of,
     weak_directions,
 )
+from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray
 
 TOUCH_KINDS = ("point", "z", "xz")
 

@@ -5,18 +5,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration import Calibration
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.parts import Noise
-from visioncal.files import did_you_mean, some_of
 from visioncal.frames.verdicts import Doubt
+from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.choosing import ARM, Choice
 from visioncal.session.selecting import select
 from visioncal.session.single import check_one_of_each
-from visioncal.transforms import invert, rotation_angle
-from visioncal.types import FloatArray, Mask
 
 # No arm reaches this far [m], and no joint of one turns this far [rad].
 _FAR_M, _WIDE_RAD = 20.0, 4 * np.pi

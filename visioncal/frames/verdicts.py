@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration import Verdict, VerdictStatus
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.types import Mask
 from visioncal.estimation.observability import Direction
-from visioncal.figures import figure
-from visioncal.files import some_of
-from visioncal.types import Mask
+from visioncal.results import Verdict, VerdictStatus
 
 
 @dataclass(frozen=True)

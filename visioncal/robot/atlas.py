@@ -4,10 +4,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.robot.inverse import Inverse
 from visioncal.robot.model import Robot
-from visioncal.transforms import invert
-from visioncal.types import FloatArray, IntArray, Mask
 
 # So many postures leave no hole in which a reachable pose is far from all of them.
 _POSTURES = 60_000

@@ -6,9 +6,9 @@ Joints stand at their effective positions here (`Chain.effective`).
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain
-from visioncal.transforms import skew
-from visioncal.types import FloatArray, Mask
 
 # Steps to a pose from near to it: an error squares from step to step.
 _STEPS = 8

@@ -6,11 +6,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import Table
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table
+from visioncal.core.transforms import compose
+from visioncal.core.types import FloatArray
 from visioncal.robot.model import BODY_KEYS, Robot
-from visioncal.transforms import compose
-from visioncal.types import FloatArray
 
 Shape: TypeAlias = Literal["capsule", "cylinder", "box"]
 

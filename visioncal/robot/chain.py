@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import Table
-from visioncal.transforms import exp
-from visioncal.types import FloatArray, Mask
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table
+from visioncal.core.transforms import exp
+from visioncal.core.types import FloatArray, Mask
 
 # Columns of a joint's function: offset, ratio, sine, cosine.
 FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")

@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot.bodies import Body, body_name
 from visioncal.robot.model import Robot
-from visioncal.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     import coal

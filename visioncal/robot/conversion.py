@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.transforms import compose, invert, skew
+from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, chain_document
 from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import (
@@ -22,8 +24,6 @@ from visioncal.robot.tables import (
     table_document,
     table_from_document,
 )
-from visioncal.transforms import compose, invert, skew
-from visioncal.types import FloatArray, Mask
 
 # Consecutive axes closer than this to parallel get Hayati's beta [rad]. Their common normal lies
 # at a distance of their offset over the angle, and so do the errors of d grow against those of a.

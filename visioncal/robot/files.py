@@ -7,9 +7,9 @@ from typing import Any
 
 import tomli_w
 
-from visioncal.documents.jsons import parse_json
-from visioncal.errors import DataError
-from visioncal.files import find_described, read_text, read_toml
+from visioncal.core.documents.jsons import parse_json
+from visioncal.core.errors import DataError
+from visioncal.core.files import find_described, read_text, read_toml
 from visioncal.robot.model import Robot
 
 # Far above any arm's URDF; a larger file is something else.
@@ -20,7 +20,7 @@ ROBOT_SUFFIXES = (".toml", ".urdf", ".json")
 
 def _shipped() -> dict[str, Path]:
     """The robots that come with visioncal, by name."""
-    folder = Path(__file__).resolve().parents[1] / "robots"
+    folder = Path(__file__).resolve().parent / "models"
     return {path.stem: path for path in folder.glob("*.toml")}
 
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.files import Table
+from visioncal.core.files import Table
+from visioncal.core.transforms import skew
+from visioncal.core.types import FloatArray
 from visioncal.robot.chain import number_list
 from visioncal.robot.loads import MASS_KEYS, Masses
-from visioncal.transforms import skew
-from visioncal.types import FloatArray
 
 # What a joint's table says of its link's inertia, beside its mass.
 INERTIA_KEY = "inertia_kg_m2"

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.batch import reached_from
 from visioncal.robot.model import Robot
-from visioncal.types import FloatArray, Mask
 
 if TYPE_CHECKING:
     import pinocchio as pin

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import Table, did_you_mean
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table, did_you_mean
+from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.loads import Masses
 from visioncal.robot.rates import Rates
-from visioncal.types import FloatArray
 
 if TYPE_CHECKING:
     import pinocchio as pin

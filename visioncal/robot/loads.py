@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import Table
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.robot.chain import number_list
-from visioncal.types import FloatArray, IntArray, Mask
 
 if TYPE_CHECKING:
     from visioncal.robot.model import Robot

@@ -11,9 +11,9 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.robot.inertia import Inertias, parameters_of, pseudo_inertias
-from visioncal.types import FloatArray
 
 # A body without extent in some direction gets this share of its largest [-].
 _THIN = 1e-6

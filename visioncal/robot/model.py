@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import Table
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table
+from visioncal.core.transforms import exp
+from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
 from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
 from visioncal.robot.kinematics import (
@@ -33,8 +35,6 @@ from visioncal.robot.loads import (
 )
 from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
-from visioncal.transforms import exp
-from visioncal.types import FloatArray
 
 if TYPE_CHECKING:
     import pinocchio as pin

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
 from visioncal.robot.torques import effective_states
-from visioncal.types import FloatArray
 
 if TYPE_CHECKING:
     import pinocchio as pin

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.files import Table
-from visioncal.types import FloatArray
+from visioncal.core.files import Table
+from visioncal.core.types import FloatArray
 
 # What a joint's table says of its drive.
 RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")

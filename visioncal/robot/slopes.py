@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, exp, invert
+from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document
 from visioncal.robot.conversion import EXACTLY, swing
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, about_x, chain_of_table
-from visioncal.transforms import adjoint, exp, invert
-from visioncal.types import FloatArray
 
 # The numbers of a row, in the order of the last axis of what is returned here.
 ROW_NAMES = ("theta", "d", "a", "alpha", "beta")

@@ -7,12 +7,12 @@ from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 
-from visioncal.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
-from visioncal.errors import DataError
-from visioncal.files import Table
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table
+from visioncal.core.transforms import compose
+from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, joint_function, joint_tables, number_list, subtable
-from visioncal.transforms import compose
-from visioncal.types import FloatArray, Mask
 
 Convention: TypeAlias = Literal["standard", "modified", "hayati"]
 CONVENTIONS: tuple[Convention, ...] = ("standard", "modified", "hayati")

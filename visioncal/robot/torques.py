@@ -6,11 +6,11 @@ friction, and gravity as the robot's description has it.
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot.inertia import Inertias, moving
 from visioncal.robot.kinematics import regressors
 from visioncal.robot.model import Robot
-from visioncal.types import FloatArray, IntArray
 
 
 def torque_regressor(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
 from visioncal.robot.writing import comment_lines, inertial_lines

@@ -8,12 +8,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from visioncal.conventions import ROTATION_FORMS
-from visioncal.errors import DataError
+from visioncal.core.conventions import ROTATION_FORMS
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray
 from visioncal.robot.model import Robot
 from visioncal.robot.writing import comment_lines, numbers_text
-from visioncal.transforms import compose, invert
-from visioncal.types import FloatArray
 
 _TAG = re.compile(rb"""<[^\s/>]+(\s+[^\s=]+\s*=\s*("[^"]*"|'[^']*'))*\s*(/?)>""")
 

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
 from visioncal.robot.chain import chain_document
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import row_frames, table_from_document
-from visioncal.transforms import invert
-from visioncal.types import FloatArray
 
 
 def with_inertias(robot: Robot, inertias: Inertias) -> Robot:

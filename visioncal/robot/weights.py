@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.robot.model import Robot
-from visioncal.types import FloatArray
 
 # Postures that stand for all, and from where on a function is another's multiple.
 _POSTURES, _RANK = 200, 1e-8

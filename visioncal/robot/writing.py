@@ -8,14 +8,14 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import tomli_w
 
-from visioncal.conventions import POSE_FORMS, write_pose
-from visioncal.errors import DataError
-from visioncal.files import one_line
+from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.core.errors import DataError
+from visioncal.core.files import one_line
+from visioncal.core.types import FloatArray
 from visioncal.robot.chain import FUNCTION_NAMES, IDENTITY_FUNCTION, chain_document
 from visioncal.robot.conversion import parallel_axes, table_of
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, table_document
-from visioncal.types import FloatArray
 
 # The links of ur_description in its file of kinematics, in order.
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

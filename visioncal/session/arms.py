@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.robot import Robot, read_robot_document
 from visioncal.session.document import Declaration
 from visioncal.session.outside import outside_file, without_content

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import Target
 from visioncal.session.document import Declaration
 from visioncal.session.outside import without_content
-from visioncal.targets import load_target, target_from_document
-from visioncal.types import Target
+from visioncal.vision.targets import load_target, target_from_document
 
 # The column of views.csv that names the target of a row.
 COLUMN = "target"

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
 from visioncal.session import columns as known
 from visioncal.session.document import Declaration
 from visioncal.session.table import View

@@ -4,10 +4,10 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean, some_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.types import Mount
 from visioncal.session.frames import frame_name, frames_of_kind, robots_between, thing_name
-from visioncal.types import Mount
 
 Part: TypeAlias = Literal["camera", "robot", "target"]
 PARTS: tuple[Part, ...] = get_args(Part)

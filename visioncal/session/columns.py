@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean
-from visioncal.types import FloatArray
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import FloatArray
 
 POSITION = ("x_m", "y_m", "z_m")
 QUATERNION = ("qx", "qy", "qz", "qw")

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean, read_text_inside, sha256
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, read_text_inside, sha256
+from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.session.boards import COLUMN
 from visioncal.session.document import Declaration
 from visioncal.session.kinds import name_of
 from visioncal.session.streams import numbered_rows
 from visioncal.session.table import Problem, View, problems_error, read_integer, read_number
-from visioncal.targets import point_numbers
-from visioncal.types import Corners, FloatArray, IntArray, Target
+from visioncal.vision.targets import point_numbers
 
 FILE = "corners.csv"
 _NEEDED = ("view", "point", "u_px", "v_px")

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from datetime import date, time
 
-from visioncal.files import sha256
+from visioncal.core.files import sha256
 from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore

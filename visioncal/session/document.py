@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal, TypeAlias, cast
 
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import CameraMount
 from visioncal.session.tables import (
     CameraTable,
     ClockTable,
@@ -18,7 +19,6 @@ from visioncal.session.tables import (
     TableModel,
     TargetTable,
 )
-from visioncal.types import CameraMount
 
 Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
 KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean, some_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
 from visioncal.session.document import Declaration, Kind
 from visioncal.session.kinds import is_read, is_seen, name_of, tells_robot
 from visioncal.session.table import View

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from visioncal.errors import DataError
-from visioncal.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes
+from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 

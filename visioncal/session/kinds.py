@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
-from visioncal.errors import DataError
-from visioncal.files import did_you_mean, some_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
 from visioncal.session.columns import POSITION
 from visioncal.session.document import KINDS, Declaration, Kind
 from visioncal.session.table import View

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.robot import Loads
-from visioncal.types import FloatArray
 
 _CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
 _FORCE = tuple(f"force_{axis}_n" for axis in "xyz")

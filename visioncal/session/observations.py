@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.transforms import pose_difference
 from visioncal.session.columns import LOAD, POSE, joint_columns
 from visioncal.session.document import Declaration
 from visioncal.session.frames import observed, robots_between
 from visioncal.session.kinds import name_of, tells_robot
 from visioncal.session.table import View
-from visioncal.transforms import pose_difference
 
 # Reports of one robot at one stop that are farther apart are of two poses [mm, deg, rad].
 _APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.1, 2e-3

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from visioncal.errors import DataError
-from visioncal.files import absence, is_inside
+from visioncal.core.errors import DataError
+from visioncal.core.files import absence, is_inside
 from visioncal.robot import ROBOT_SUFFIXES
 from visioncal.session.document import Declaration, Kind
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import tomli_w
 
-from visioncal.asides import aside_folder
-from visioncal.errors import DataError
-from visioncal.files import write_atomically
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.core.temporary_files import aside_folder
 from visioncal.robot import robot_file
 from visioncal.session.digest import is_file
 from visioncal.session.document import Declaration
 from visioncal.session.images import ImageStore, inside_path
-from visioncal.targets import rig_csv
+from visioncal.vision.targets import rig_csv
 
 
 def write_folder(

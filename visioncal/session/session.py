@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from visioncal.errors import DataError
-from visioncal.files import MOST_TOML_BYTES, parse_toml, read_text_inside
+from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
+from visioncal.core.types import Camera, Corners, Mount, Need, Target
 from visioncal.session import columns as known
 from visioncal.session.arms import read_robots
 from visioncal.session.boards import COLUMN, read_targets
@@ -44,7 +45,6 @@ from visioncal.session.streams import (
 )
 from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
-from visioncal.types import Camera, Corners, Mount, Need, Target
 
 # The columns of a session without views.
 ALONE = ("view",)
@@ -101,7 +101,7 @@ class Session:
         path = Path(path)
         if path.suffix.lower() == ".rrd":
             # Recordings are built on sessions; only this one call goes the other way.
-            from visioncal.recording import read_session
+            from visioncal.present.recording import read_session
 
             return read_session(path)
         if not path.is_dir():

@@ -1,7 +1,7 @@
 """Whether a session is of one camera and one robot, or of a whole cell."""
 
-from visioncal.errors import DataError
-from visioncal.files import some_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
 from visioncal.session.choosing import Choice
 from visioncal.session.document import KINDS
 from visioncal.session.frames import frame_name

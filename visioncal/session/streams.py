@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.errors import DataError
-from visioncal.files import named_errors, read_text_inside, sha256, some_of, write_atomically
+from visioncal.core.errors import DataError
+from visioncal.core.files import named_errors, read_text_inside, sha256, some_of, write_atomically
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.session import columns as known
-from visioncal.types import FloatArray, IntArray, Mask
 
 FOLDER, STAMP = "streams", "stamp_s"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)

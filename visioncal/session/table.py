@@ -11,11 +11,11 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.session import columns as known
 from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
-from visioncal.types import FloatArray
 
 # Two days of a stop every ten seconds, which a calibration refuses within 2 GB of memory; and more
 # columns than any log has.

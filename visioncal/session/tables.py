@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from visioncal.types import Camera, CameraKind, Need
+from visioncal.core.types import Camera, CameraKind, Need
 
 # Squares and products of larger numbers leave what floats hold; no field of a cell has such.
 _LARGEST = 1e15

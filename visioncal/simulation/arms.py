@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.errors import DataError
-from visioncal.types import FloatArray
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 
 _HALF_TURN = np.pi
 # A strain-wave gear of ratio 100 ripples twice a turn of its wave generator.

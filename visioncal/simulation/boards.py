@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.types import FloatArray, Target
+from visioncal.core.types import FloatArray, Target
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,9 @@ from enum import IntEnum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.simulation.arms import (
     Arm,
     ArmErrors,
@@ -24,8 +26,6 @@ from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
 from visioncal.simulation.sag import Payload, giving_of, sagging
 from visioncal.simulation.second import Shown, chains, sheets_of, shown_at, with_second
-from visioncal.transforms import compose, exp, invert
-from visioncal.types import Camera, Corners, FloatArray
 
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
 LEAST_DEXTERITY = 0.04

@@ -8,8 +8,9 @@ from dataclasses import MISSING, Field, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
-from visioncal.errors import DataError
-from visioncal.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.core.types import Camera, Target
 from visioncal.session.document import NAME
 from visioncal.simulation.arms import ARMS
 from visioncal.simulation.layout import (
@@ -25,7 +26,6 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.optics import CAMERAS
 from visioncal.simulation.options import TARGETS
-from visioncal.types import Camera, Target
 
 Thing: TypeAlias = (
     RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | Swept | NetworkOptions

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import Arm, link_frames, ur_arm
-from visioncal.types import FloatArray
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
 # Mass [kg], its centre [m] and the main moments of inertia about that [kg m^2], in the frames of

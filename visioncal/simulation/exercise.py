@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.session import Session, Stream
 from visioncal.simulation.dynamics import Body, DynamicArm, drive_torques, real_dynamics
 from visioncal.simulation.records import write_truth
-from visioncal.types import FloatArray
 
 _HARMONICS = 5
 

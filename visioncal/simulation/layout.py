@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import Camera, Target
 from visioncal.simulation.optics import fine_camera, wide_camera
 from visioncal.simulation.options import charuco_target, checkerboard_target
-from visioncal.types import Camera, Target
 
 # Where robots meet [m].
 MIDDLE_M = (0.0, 0.0, 0.4)

@@ -3,7 +3,9 @@
 import cv2
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert, rotation_angle
+from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import centre_m, corners_m, outline_m
 from visioncal.simulation.cell import Cell, Stream, before_camera, stream
@@ -11,8 +13,6 @@ from visioncal.simulation.optics import project, rays
 from visioncal.simulation.rasters import Float32Array, Patch, between, trace
 from visioncal.simulation.render import developed, light_on, prepare_scene
 from visioncal.simulation.textures import margin_m
-from visioncal.transforms import compose, invert, rotation_angle
-from visioncal.types import FloatArray, Image
 
 # No corner can be found so well that it tells such a shift [px].
 _STILL_PX = 0.003

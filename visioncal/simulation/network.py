@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.session import frame_name
 from visioncal.simulation.arms import ArmErrors, arm_named, disturb, forward
 from visioncal.simulation.boards import Sheet, corners_m
@@ -26,8 +28,6 @@ from visioncal.simulation.seen import (
 from visioncal.simulation.standing import Stream, mounted, parents_of, postures, sheet_of, stream
 from visioncal.simulation.swept import sweep_network
 from visioncal.simulation.warmup import Heat, heated_poses, warm_up
-from visioncal.transforms import exp, invert
-from visioncal.types import Corners, FloatArray, IntArray, Target
 
 # A corner nearer to the image's edge is not detected [px].
 _EDGE_PX = 2.0

@@ -7,7 +7,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import Cell
@@ -28,7 +29,6 @@ from visioncal.simulation.second import Shown
 from visioncal.simulation.seen import Network, Sight, board_named, camera_named, sheet_named
 from visioncal.simulation.standing import Stream, stream
 from visioncal.simulation.touching import Touching, write_touches
-from visioncal.types import FloatArray
 
 # What rows have of what was seen: rendered images, the names of images that are not there, or the
 # board's pose as it was measured.

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.errors import DataError
-from visioncal.types import Camera, FloatArray
+from visioncal.core.errors import DataError
+from visioncal.core.types import Camera, FloatArray
 
 
 def wide_camera() -> Camera:

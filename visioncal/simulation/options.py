@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import Camera, Mount, Target
 from visioncal.simulation.optics import wide_camera
 from visioncal.simulation.sag import Payload
-from visioncal.types import Camera, Mount, Target
 
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 

@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import compose
+from visioncal.core.types import FloatArray
 from visioncal.simulation.boards import (
     Sheet,
     centre_m,
@@ -13,8 +15,6 @@ from visioncal.simulation.boards import (
 )
 from visioncal.simulation.optics import rays, sees
 from visioncal.simulation.options import CellOptions
-from visioncal.transforms import compose
-from visioncal.types import FloatArray
 
 # The print stays this far from the image's edge in views that show it whole [px].
 _MARGIN_PX = 12.0

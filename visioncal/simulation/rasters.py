@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
+from visioncal.core.types import Camera, FloatArray
 from visioncal.simulation.optics import rays
-from visioncal.types import Camera, FloatArray
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 

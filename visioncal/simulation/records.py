@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
-from visioncal.files import decode_text, read_bytes, write_atomically
+from visioncal.core.errors import DataError
+from visioncal.core.files import decode_text, read_bytes, write_atomically
+from visioncal.core.transforms import exp
+from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
@@ -21,8 +23,6 @@ from visioncal.simulation.render import encode, prepare_scene, render
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.second import BOARDS
 from visioncal.simulation.sweep import Sweep
-from visioncal.transforms import exp
-from visioncal.types import Camera, FloatArray, Target
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # An operator's pace: a stop every so many seconds [s].

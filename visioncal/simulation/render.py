@@ -5,7 +5,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.boards import bow_depth_m, outline_m, unit_m
 from visioncal.simulation.cell import Cell, Stream, stream
 from visioncal.simulation.optics import project, sees
@@ -19,9 +22,6 @@ from visioncal.simulation.textures import (
     draw_wall,
     margin_m,
 )
-from visioncal.threads import one_blas_thread
-from visioncal.transforms import compose, invert
-from visioncal.types import FloatArray, Image
 
 # Sub-pixels along a pixel's side.
 _SAMPLES = 3

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import Arm, link_frames
-from visioncal.types import FloatArray
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
 # Yielding changes the levers by a hundredth, and the torques as much: enough to be exact.

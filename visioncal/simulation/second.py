@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import compose
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.simulation.boards import Sheet, centre_m, corners_m, found_in_part
 from visioncal.simulation.optics import sees
 from visioncal.simulation.options import CellOptions, Second
-from visioncal.transforms import compose
-from visioncal.types import Camera, FloatArray, IntArray, Mask
 
 # What a session calls the boards where there are two.
 BOARDS = ("first", "second")

@@ -5,15 +5,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.core.types import Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm
 from visioncal.simulation.boards import Sheet
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions
 from visioncal.simulation.standing import Stream, sheet_of, stream
-from visioncal.transforms import invert
-from visioncal.types import Corners, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

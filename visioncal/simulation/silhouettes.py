@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.simulation.arms import Arm, link_frames, reach_m
 from visioncal.simulation.optics import project
-from visioncal.types import Camera, FloatArray, Image
 
 # Parts nearer than this to the camera's plane are not drawn [m].
 _NEAREST_M = 0.15

@@ -7,7 +7,9 @@ from enum import IntEnum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm, arm_named, forward, inverse
 from visioncal.simulation.boards import Sheet, centre_m
@@ -15,8 +17,6 @@ from visioncal.simulation.cell import LEAST_DEXTERITY, home_posture, looking_at,
 from visioncal.simulation.layout import CELL, MIDDLE_M, BoardAt, CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.poses import draw_views, mean_view
-from visioncal.transforms import compose, invert
-from visioncal.types import FloatArray, IntArray
 
 # No link comes lower over its own base than this [m].
 _LEAST_HEIGHT_M = 0.02

@@ -12,7 +12,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import corners_m
@@ -28,8 +30,6 @@ from visioncal.simulation.cell import (
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.second import Shown, chains
-from visioncal.transforms import invert
-from visioncal.types import FloatArray
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # A frame that shows less of the board gives no pose.

@@ -5,7 +5,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.core.types import Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.simulation.arms import forward
@@ -15,8 +17,6 @@ from visioncal.simulation.optics import project, sees
 from visioncal.simulation.seen import Network, Sight, camera_named, sheet_named
 from visioncal.simulation.standing import Stream, stream
 from visioncal.simulation.sweep import SweepOptions, in_turn, recorded
-from visioncal.transforms import exp, invert
-from visioncal.types import Corners, FloatArray
 
 # A frame that shows less of the board, or shows it more askew, is not recorded.
 _FEWEST_CORNERS, _FACING, _EDGE_PX = 12, 0.5, 2.0

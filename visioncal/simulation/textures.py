@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, Image, Mask, Target
 from visioncal.simulation.boards import circles_m, pattern_box, tags_m, unit_m
-from visioncal.types import FloatArray, Image, Mask, Target
 
 _Canvas: TypeAlias = npt.NDArray[np.float32]
 

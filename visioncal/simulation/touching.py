@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.errors import DataError
-from visioncal.files import write_atomically
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
 from visioncal.simulation import standing
 from visioncal.simulation.arms import Arm, forward, inverse, reach_m
@@ -26,8 +28,6 @@ from visioncal.simulation.cell import (
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import pose_row
 from visioncal.simulation.seen import Network
-from visioncal.transforms import compose, exp, invert
-from visioncal.types import FloatArray, Mask
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75

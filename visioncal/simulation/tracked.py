@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
 from visioncal.simulation.records import POSE, load_row, pose_row, write_truth
 from visioncal.simulation.sag import Payload, giving_of, sagging
-from visioncal.transforms import compose, exp, invert
-from visioncal.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.errors import DataError
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.session import Stream as Recorded
 from visioncal.simulation.arms import Arm, forward
@@ -20,8 +22,6 @@ from visioncal.simulation.cell import Cell, before_camera, detected, seen_by, si
 from visioncal.simulation.options import CellOptions
 from visioncal.simulation.records import pairs_session, truth_of, write_truth
 from visioncal.simulation.second import chains
-from visioncal.transforms import invert
-from visioncal.types import FloatArray
 
 _JOINTS = 6
 # What a metre of steel and of aluminium grows by for a kelvin.

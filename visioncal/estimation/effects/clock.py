@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import ROBOT, Effect
 from visioncal.estimation.variance import Knowledge
-from visioncal.types import FloatArray
 
 
 def clock_effect(

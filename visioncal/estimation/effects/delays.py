@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint, exp, invert
+from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.appearance import Compressed, compress_points
 from visioncal.estimation.corners import CornerStack
-from visioncal.transforms import adjoint, exp, invert
-from visioncal.types import Camera, FloatArray, Mount
 
 
 @dataclass(frozen=True)

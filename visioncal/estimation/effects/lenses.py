@@ -10,14 +10,14 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.camera import intrinsics, with_intrinsics
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.linalg import covariance
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.variance import Knowledge
-from visioncal.types import Camera, FloatArray, IntArray, Mask
+from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The effect's name in a problem.
 LENSES = "lenses and boards"

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from visioncal.core.types import FloatArray
 from visioncal.estimation.effects.delays import Delay
-from visioncal.types import FloatArray
 
 # Sensors read an image out within some tens of milliseconds [s].
 _READOUT_SIGMA_S = 0.02

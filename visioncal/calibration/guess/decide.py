@@ -1,0 +1,242 @@
+"""Whether a reading stands out, and under which mount."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.guess.chain import by_chain, is_half_turned
+from visioncal.calibration.guess.fit import is_about_one_axis
+from visioncal.calibration.guess.given import (
+    CLOSING_SCORE,
+    FEWEST_ROWS,
+    SCORE_FLOOR,
+    STANDS_OUT,
+    Recording,
+    Scored,
+    is_likely_unit,
+)
+from visioncal.calibration.guess.likeness import flange_and_cell_m, is_far_likelier, likeness
+from visioncal.calibration.guess.messages import notes, sentence
+from visioncal.calibration.guess.result import Candidate, Guess
+from visioncal.calibration.guess.row_exchange import exchanged
+from visioncal.calibration.guess.search import search
+from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import MOUNTS, FloatArray, Mount
+
+# Readings this near to the best are as good; of them, the one with the fewest changes is meant.
+_ALIKE = 2.0
+# A rival as simple as the best leaves the matter open while it is this near.
+_RIVALS = 1.5
+# Views beyond this many typical distances do not agree with the others.
+_AGREES = 5.0
+_LISTED = 12
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the search finds under one mount: the declared reading first, and the best."""
+
+    recording: Recording
+    scored: tuple[Scored, ...]
+    best: Scored
+
+
+def guess_reading(
+    robot: PoseNumbers,
+    camera: PoseNumbers,
+    mount: Mount | None,
+    *,
+    chain: FloatArray | None = None,
+    is_measured: bool = False,
+) -> Guess:
+    """Tries every plausible reading of the poses and says which closes the chain.
+
+    Args:
+        robot: `base_from_flange` of n rows, with the reading that is declared.
+        camera: `cam_from_target` of the same rows, likewise; NaN where the target was not seen.
+        mount: The declared mount; None where it is not known: it then is the one of the likelier
+            cell.
+        chain: (n, 4, 4) `base_from_flange` through a robot's model at the recorded joints, NaN in
+            rows without; it tells what no camera can.
+        is_measured: Whether the camera's poses were measured from images by visioncal, so that
+            only the board's stated size can be wrong about them.
+
+    Returns:
+        The readings, and whether one stands out.
+
+    Raises:
+        DataError: The rows do not match, a rotation has not as many numbers as its form, or
+            nothing tells which mount it is.
+        DegenerateError: Too few rows have both poses.
+    """
+    mounts = MOUNTS if mount is None else (mount,)
+    recordings = [Recording(robot, camera, it, is_measured) for it in mounts]
+    _check(recordings[0])
+    with one_blas_thread():
+        found = [_found(it, chain) for it in recordings]
+        if mount is not None:
+            return _guess(found[0], chain)
+        chosen = _of_likelier_mount(found[0], found[1], chain)
+        return _guess(chosen, chain, _mount_note(chosen))
+
+
+def _found(recording: Recording, chain: FloatArray | None) -> _Found:
+    declared, *others = search(recording)
+    if chain is not None:
+        others = [_by_chain(it, recording, chain) for it in others]
+    scored = [declared, *others]
+    best = _decided(recording, scored)
+    swapped = exchanged(recording, best, is_poor=_is_poor(recording, best))
+    if swapped is not None:
+        best = swapped
+        scored.append(best)
+    if chain is not None and is_half_turned(best.hypothesis, recording.robot, chain):
+        taken = replace(best.hypothesis.robot, half_turned=True)
+        turned = replace(best.hypothesis, robot=taken)
+        best = replace(best, hypothesis=turned, labels=())
+        scored.append(best)
+    return _Found(recording, tuple(scored), best)
+
+
+def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) -> _Found:
+    """Chooses the mount: by residuals, by the joints, by what cells look like, by the changes.
+
+    An inverse of the poses closes the chain under the wrong mount as poses as they are do under
+    the right one, so that the number of changes alone says nothing.
+    """
+    better, worse = sorted((first, second), key=lambda it: it.best.score)
+    if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
+        return better
+    both = {it.best.hypothesis: it for it in (first, second)}
+    by_joints = None if chain is None else by_chain(tuple(both), first.recording.robot, chain)
+    if by_joints is not None:
+        return both[by_joints]
+    other, likelier = sorted(
+        (first, second),
+        key=lambda it: (likeness(it.recording, it.best), -it.recording.cost(it.best.hypothesis)),
+    )
+    is_same = other.best.hypothesis.mount == likelier.best.hypothesis.mount
+    is_clear = is_far_likelier(likelier.recording, likelier.best, other.best)
+    if is_same or (is_clear and not _is_poor(likelier.recording, likelier.best)):
+        return likelier
+    readings = " and ".join(
+        f"{it.best.hypothesis.mount} ({_candidate(it.recording, it.best).words})"
+        for it in (first, second)
+    )
+    raise DataError(
+        f"The mount is not given, and the poses fit both ways of mounting: {readings}.",
+        next_step="Say where the camera is with --mount.",
+    )
+
+
+def _mount_note(chosen: _Found) -> str:
+    if chosen.best.score > CLOSING_SCORE:
+        return ""
+    on_flange_m, at_base_m = flange_and_cell_m(chosen.best)
+    return (
+        f"The mount was not given and is taken for {chosen.best.hypothesis.mount}: what sits on "
+        f"the flange then is {1e3 * on_flange_m:.0f} mm from it, and what stands at the base "
+        f"{1e3 * at_base_m:.0f} mm. --mount says another."
+    )
+
+
+def _check(recording: Recording) -> None:
+    """Makes sure that the numbers can be paired and looked at."""
+    robot, camera = recording.robot, recording.camera
+    if len(robot) != len(camera):
+        raise DataError(
+            f"guess: {len(robot)} poses of the robot and {len(camera)} of the camera cannot be "
+            "paired row by row.",
+            next_step="Give both the same rows, empty where a pose is missing.",
+        )
+    for numbers in (robot, camera):
+        form = ROTATION_FORMS[numbers.reading.rotation]
+        if numbers.rotations.shape[1] != form.size:
+            raise DataError(
+                f"guess: a rotation has {numbers.rotations.shape[1]} numbers, but {form.words}, "
+                f"as declared, has {form.size}.",
+                culprits=list(numbers.places[:1]),
+                next_step="Declare a form of rotation with as many numbers; which of them it is, "
+                "will be found.",
+            )
+    common = len(recording.common_rows())
+    if common < FEWEST_ROWS:
+        raise DegenerateError(
+            f"guess: {common} rows have a pose of the robot and one of the camera; "
+            f"{FEWEST_ROWS} or more are needed to tell readings apart.",
+            next_step="Add views, tilted about different axes.",
+        )
+
+
+def _by_chain(scored: Scored, recording: Recording, chain: FloatArray) -> Scored:
+    """Lets the joints choose among readings that the camera cannot tell apart."""
+    chosen = by_chain(scored.labels, recording.robot, chain)
+    return scored if chosen is None else replace(scored, hypothesis=chosen)
+
+
+def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
+    """The reading that stands out from the declared one and from its rivals; else the declared."""
+    declared, *others = scored
+    if not others:
+        return declared
+    least = min(it.score for it in others)
+    alike = [it for it in others if it.score <= _ALIKE * least]
+    alike.sort(key=lambda it: (it.cost, it.score))
+    best, rivals = alike[0], alike[1:]
+    if best.score > CLOSING_SCORE:
+        return declared
+    # Declared in units in which no camera could see the target, the chain may close as well.
+    is_likely = is_likely_unit(recording, declared.hypothesis.camera.unit)
+    if is_likely and declared.score <= STANDS_OUT * best.score:
+        return declared
+    is_open = any(it.cost == best.cost and it.score < _RIVALS * best.score for it in rivals)
+    return declared if is_open or _is_poor(recording, best) else best
+
+
+def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Guess:
+    recording, best = found.recording, found.best
+    candidates = {id(it): _candidate(recording, it) for it in found.scored}
+    declared, chosen = candidates[id(found.scored[0])], candidates[id(best)]
+    ranked = sorted(candidates.values(), key=lambda it: (it is not chosen, it.score))[:_LISTED]
+    if declared not in ranked:
+        ranked[-1] = declared
+    is_poor = _is_poor(recording, best)
+    is_other = chosen is not declared
+    told = notes(
+        recording, best, has_chain=chain is not None, is_declared=not is_other, is_poor=is_poor
+    )
+    return Guess(
+        declared,
+        tuple(ranked),
+        chosen,
+        is_other,
+        sentence(declared, chosen, ranked, is_poor=is_poor),
+        ((mount_note,) if mount_note else ()) + tuple(told),
+    )
+
+
+def _candidate(recording: Recording, scored: Scored) -> Candidate:
+    fit = scored.fit
+    shift, angle = fit.rms
+    return Candidate(
+        hypothesis=scored.hypothesis,
+        declared=recording.declared,
+        differences=recording.changes(scored.hypothesis),
+        rms_mm=1e3 * shift,
+        rms_deg=float(np.rad2deg(angle)),
+        score=scored.score,
+        agreeing=int((fit.away <= _AGREES * max(fit.score, SCORE_FLOOR)).sum()),
+        rows=len(fit.away),
+        is_board=recording.is_measured,
+    )
+
+
+def _is_poor(recording: Recording, best: Scored) -> bool:
+    """Whether the views turn about one axis at most, by the camera's account."""
+    if not best.is_readable:
+        return False
+    _, camera = best.hypothesis.chain(recording.robot, recording.camera)
+    return is_about_one_axis(camera[best.rows[best.fit.kept], :3, :3])

@@ -1,0 +1,236 @@
+"""One way to take the numbers of a recording, and what it changes of what was declared."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount
+
+# `mirror`: the whole frame is left-handed. A letter: that coordinate alone has the wrong sign.
+Signs: TypeAlias = Literal["", "mirror", "x", "y", "z"]
+SIGNS: tuple[Signs, ...] = ("", "mirror", "x", "y", "z")
+
+# Mirroring any one axis is the same up to half turns of both frames; y is taken.
+_MIRROR = np.array([1.0, -1.0, 1.0])
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+# The orders of turns that makers of robots and libraries use, about moving and about fixed axes.
+_ORDERS = {
+    it.rotation.split("-")[1].upper()
+    for it in POSE_FORMS.values()
+    if it.rotation.startswith("euler-")
+}
+
+
+@dataclass(frozen=True)
+class Turns:
+    """How the numbers of a rotation are read.
+
+    Attributes:
+        form: A name among `ROTATION_FORMS`.
+        written: Where the numbers at hand were made by misreading others: the form in which those
+            were taken by mistake. They are got back by writing in it, and are read as `form`.
+    """
+
+    form: str
+    written: str = ""
+
+    def numbers(self, numbers: PoseNumbers) -> FloatArray:
+        """(n, k) the numbers that `form` reads."""
+        if not self.written:
+            return numbers.rotations
+        rotations = ROTATION_FORMS[numbers.reading.rotation].read(numbers.rotations)
+        there: Mask = np.asarray(np.isfinite(rotations).all(axis=(1, 2)))
+        written = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
+        written[there] = ROTATION_FORMS[self.written].write(rotations[there])
+        return written
+
+    def rotations(self, numbers: PoseNumbers) -> FloatArray:
+        """(n, 3, 3) rotations; NaN where the numbers are none."""
+        return ROTATION_FORMS[self.form].read(self.numbers(numbers))
+
+
+@dataclass(frozen=True)
+class Taken:
+    """How one side's numbers, the robot's or the camera's, are taken.
+
+    Attributes:
+        turns: How rotations are read.
+        unit: The positions' unit, a name among `UNITS_M`.
+        inverse: Whether the inverse of the wanted pose is given.
+        transposed: Whether rotations are transposed while positions are not those of an inverse.
+        signs: Whether an axis has the wrong sign.
+        half_turned: Whether the base is to be turned by half a turn about its z.
+    """
+
+    turns: Turns
+    unit: str
+    inverse: bool = False
+    transposed: bool = False
+    signs: Signs = ""
+    half_turned: bool = False
+
+    @classmethod
+    def as_declared(cls, reading: Reading) -> "Taken":
+        """What a reading says."""
+        return cls(Turns(reading.rotation), reading.unit, reading.inverse)
+
+    @property
+    def reading(self) -> Reading | None:
+        """The same as a reading of the numbers as they stand; None where it takes more."""
+        form = self.turns.form
+        if self.transposed and form in ("matrix", "matrix-transposed"):
+            form = "matrix" if form == "matrix-transposed" else "matrix-transposed"
+        elif self.transposed:
+            return None
+        if self.turns.written or self.signs or self.half_turned:
+            return None
+        return Reading(form, self.unit, self.inverse)
+
+    def poses(self, numbers: PoseNumbers) -> FloatArray:
+        """(n, 4, 4) transforms [m]; NaN in a row without one."""
+        rotations = self.turns.rotations(numbers)
+        positions = UNITS_M[self.unit] * numbers.positions
+        if self.signs == "mirror":
+            rotations = rotations * np.outer(_MIRROR, _MIRROR)
+            positions = positions * _MIRROR
+        elif self.signs:
+            positions = positions * np.where(np.arange(3) == "xyz".index(self.signs), -1.0, 1.0)
+        if self.transposed:
+            rotations = np.swapaxes(rotations, 1, 2)
+        there = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(positions).all(axis=1)
+        poses = compose(rotations, positions)
+        poses[~there] = np.nan
+        poses = invert(poses) if self.inverse else poses
+        return HALF_TURN @ poses if self.half_turned else poses
+
+    def corrected(self, numbers: PoseNumbers) -> PoseNumbers:
+        """Returns numbers whose `poses()` are right, as they stand where a reading suffices."""
+        if self.reading is not None:
+            return numbers.read_as(self.reading)
+        poses = self.poses(numbers)
+        return replace(
+            numbers,
+            positions=poses[:, :3, 3],
+            rotations=poses[:, :3, :3].reshape(-1, 9),
+            reading=Reading("matrix", "m"),
+        )
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way to take a whole recording.
+
+    Attributes:
+        robot: How the robot's numbers are taken.
+        camera: How the camera's are.
+        mount: How the camera is mounted.
+        shift: The robot's row `i + shift` belongs to the camera's row `i`.
+        swap: Two of the robot's rows that are exchanged; empty for none.
+    """
+
+    robot: Taken
+    camera: Taken
+    mount: Mount
+    shift: int = 0
+    swap: tuple[int, ...] = ()
+
+    def rows(self, count: int) -> IntArray:
+        """(n,) which of `count` rows of the robot belongs to each of the camera's; -1 for none."""
+        rows = np.arange(count) + self.shift
+        rows[(rows < 0) | (rows >= count)] = -1
+        if self.swap:
+            first, second = self.swap
+            at_first, at_second = rows == first, rows == second
+            rows[at_first], rows[at_second] = second, first
+        return rows
+
+    def robot_numbers(self, robot: PoseNumbers) -> PoseNumbers:
+        """The robot's numbers, corrected and in the order of the camera's rows."""
+        rows = self.rows(len(robot))
+        there = (rows >= 0)[:, None]
+        ordered = self.robot.corrected(robot).rows(np.maximum(rows, 0))
+        return replace(
+            ordered,
+            positions=np.where(there, ordered.positions, np.nan),
+            rotations=np.where(there, ordered.rotations, np.nan),
+        )
+
+    def camera_numbers(self, camera: PoseNumbers) -> PoseNumbers:
+        """The camera's numbers, corrected."""
+        return self.camera.corrected(camera)
+
+    def chain(self, robot: PoseNumbers, camera: PoseNumbers) -> tuple[FloatArray, FloatArray]:
+        """(n, 4, 4) the robot's part of the chain and `cam_from_target`; NaN where one lacks."""
+        base_from_flange = self.robot.poses(robot)
+        rows = self.rows(len(robot))
+        part = base_from_flange if self.mount == "eye-in-hand" else invert(base_from_flange)
+        return np.where((rows >= 0)[:, None, None], part[rows], np.nan), self.camera.poses(camera)
+
+
+def differences(
+    tried: Hypothesis, declared: Hypothesis, places: tuple[str, ...], *, is_board: bool
+) -> tuple[str, ...]:
+    """Words for each thing in which a hypothesis departs from what was declared.
+
+    Args:
+        tried: The hypothesis.
+        declared: What was declared.
+        places: Where the robot's rows stand.
+        is_board: Whether the camera's poses were measured from images of a board of stated size.
+    """
+    return tuple(_differences(tried, declared, places, is_board=is_board))
+
+
+def _differences(
+    tried: Hypothesis, declared: Hypothesis, places: tuple[str, ...], *, is_board: bool
+) -> Iterator[str]:
+    yield from _of_side("the robot's", tried.robot, declared.robot)
+    if is_board and tried.camera.unit != declared.camera.unit:
+        yield f"the board's size in {tried.camera.unit}"
+    elif not is_board:
+        yield from _of_side("the camera's", tried.camera, declared.camera)
+    if tried.mount != declared.mount:
+        yield f"the camera mounted {tried.mount}"
+    if tried.shift:
+        where = "after" if tried.shift > 0 else "before"
+        count = "one row" if abs(tried.shift) == 1 else f"{abs(tried.shift)} rows"
+        yield f"the robot's pose of a view {count} {where} it"
+    if tried.swap:
+        first, second = (places[row] for row in tried.swap)
+        yield f"the robot's poses of {first} and {second} exchanged"
+
+
+def _of_side(whose: str, tried: Taken, declared: Taken) -> Iterator[str]:
+    if tried.unit != declared.unit:
+        yield f"{whose} positions in {tried.unit}"
+    if tried.turns != declared.turns:
+        words = ROTATION_FORMS[tried.turns.form].words
+        if tried.turns.written:
+            mistaken = ROTATION_FORMS[tried.turns.written].words
+            yield f"{whose} rotations as {words}, which were taken for {mistaken}"
+        else:
+            yield f"{whose} rotations as {words}"
+    if tried.inverse != declared.inverse:
+        yield f"{whose} poses {'inverse' if tried.inverse else 'as given, not inverse'}"
+    if tried.transposed != declared.transposed:
+        yield f"{whose} rotations transposed"
+    if tried.signs == "mirror":
+        yield f"{whose} poses in a left-handed frame (one axis mirrored)"
+    elif tried.signs:
+        yield f"{whose} positions with {tried.signs} negated"
+    if tried.half_turned:
+        yield f"{whose} base turned by 180 deg about z (base and base_link taken for each other)"
+
+
+def strangeness(turns: Turns) -> float:
+    """What makes a form less likely than another: angles once misread, orders that nobody uses."""
+    names = [it.split("-") for it in (turns.form, turns.written) if it.startswith("euler-")]
+    orders = [order for _, order, _ in names]
+    unused = any(order.upper() not in _ORDERS for order in orders)
+    # Degrees taken for radians are one slip; in another order besides they are two.
+    one_slip = len(orders) == 2 and orders[0] == orders[1]
+    return (0.25 if one_slip else 0.5) * bool(turns.written) + 0.25 * unused

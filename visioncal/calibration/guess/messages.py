@@ -1,0 +1,102 @@
+"""What a guess found, in sentences."""
+
+from collections.abc import Iterator, Sequence
+
+from visioncal.calibration.guess.given import STANDS_OUT, Recording, Scored
+from visioncal.calibration.guess.result import Candidate
+
+
+def sentence(
+    declared: Candidate, best: Candidate, ranked: Sequence[Candidate], *, is_poor: bool
+) -> str:
+    """Says what was found, with its figures.
+
+    Args:
+        declared: The reading that was declared.
+        best: The one that stands out; the declared one where none does.
+        ranked: All that come near, the best first.
+        is_poor: Whether the views turn about one axis at most.
+    """
+    if best is not declared:
+        return _found(declared, best)
+    if not declared.is_readable:
+        return (
+            "As declared, the rotations of the robot or of the camera are none, and no other "
+            "reading of the numbers stands out."
+        )
+    rivals = [it for it in ranked if it is not declared]
+    others = f"the next, {rivals[0].words}, to {_figures(rivals[0])}" if rivals else ""
+    if is_poor:
+        return (
+            "The motion cannot tell readings apart: all views turn about one axis at most. As "
+            f"declared, the chain closes to {_figures(declared)}{others and f'; {others}'}. Add "
+            "views tilted about different axes."
+        )
+    if not declared.closes or any(_is_far_better(it, declared) for it in rivals):
+        return (
+            "No reading that was tried stands out: as declared, the chain closes to "
+            f"{_figures(declared)}{others and f'; {others}'}."
+        )
+    return (
+        f"The poses fit as declared: the chain closes to {_figures(declared)}; "
+        f"{others or 'no other reading comes near'}."
+    )
+
+
+def _is_far_better(it: Candidate, declared: Candidate) -> bool:
+    return STANDS_OUT * it.score < declared.score
+
+
+def _found(declared: Candidate, best: Candidate) -> str:
+    closes = f"With {best.words}, the chain closes to {_figures(best)}"
+    if not declared.is_readable:
+        return f"{closes}; as declared, the numbers are no rotations."
+    if best.hypothesis.robot.half_turned:
+        return (
+            f"{closes}, and the poses are those of the joint angles; as declared, the chain closes "
+            f"to {_figures(declared)}."
+        )
+    if best.hypothesis.swap and best.changes == 1:
+        return f"{closes}; as declared, {declared.agreeing} of {declared.rows} views agree."
+    return f"{closes} instead of {_figures(declared)}."
+
+
+def _figures(it: Candidate) -> str:
+    views = "" if it.agreeing == it.rows else f" in {it.agreeing} of {it.rows} views"
+    return f"{it.figures}{views}"
+
+
+def notes(
+    recording: Recording, best: Scored, *, has_chain: bool, is_declared: bool, is_poor: bool
+) -> Iterator[str]:
+    """Says what residuals cannot tell here.
+
+    Args:
+        recording: What was recorded.
+        best: The reading that is taken.
+        has_chain: Whether the joints were compared.
+        is_declared: Whether it is the declared one.
+        is_poor: Whether the views turn about one axis at most.
+    """
+    others = [it for it in best.labels if it != best.hypothesis]
+    also = " or with ".join("; ".join(recording.changes(it)) for it in others)
+    if also and not is_declared:
+        yield (
+            f"The views close the chain in the same way with {also}. It was chosen by what lies "
+            "nearer to the flange, or by the joints."
+        )
+    elif also and not is_poor:
+        yield (
+            f"The views close the chain in the same way with {also}, which is likelier: as "
+            "declared, what sits on the flange is far from it, or the target behind the camera."
+        )
+    if best.hypothesis.robot.signs == "mirror":
+        yield (
+            "Which axis is mirrored cannot be told from the views: another one turns the base and "
+            "the flange by half a turn. y was taken."
+        )
+    if not has_chain:
+        yield (
+            "A base turned about its z (base_link for base) does not show without joint angles "
+            "and the robot's model."
+        )

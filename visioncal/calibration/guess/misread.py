@@ -1,0 +1,208 @@
+"""Whether joint angles belong to poses, and by which mistake they do not.
+
+Poses that were reported, and those that a camera sees, are `base_from_model @ FK(q) @
+flange_from_reported` with two constant transforms, whatever they are: frames of world and tool, or
+the unknown edges of the chain. A reading of the joints is right where this holds for most rows.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from visioncal.calibration.guess.fit import Fit, distances, is_about_one_axis, robust_fit
+from visioncal.calibration.guess.given import SCORE_FLOOR, STANDS_OUT
+from visioncal.calibration.guess.joints import (
+    JointReading,
+    declared_reading,
+    joint_readings,
+    with_zero,
+)
+from visioncal.calibration.guess.search import thinned
+from visioncal.core.number_format import figure
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.robot import Robot
+
+# Two constant transforms and a zero have thirteen unknowns; fewer rows fit anything.
+FEWEST_JOINT_ROWS = 5
+# What an arm may depart from its model, a share of its reach and an angle [rad]: 2 mm and 3 mrad a
+# link add up to half of it. Another arm of the same shape is off by as much again.
+_CLOSES = 0.03
+# Under this there is nothing to be explained: controllers print their poses more finely. Cameras do
+# not see better, and what most mistakes leave is more, unless they change nothing.
+_FITS, FITS_SEEN = 3.0 * SCORE_FLOOR, 2e-3
+# Readings this near to the best are as good; of them the one with the fewest mistakes is meant, and
+# of several as simple, the matter stays open between those that are nearer still.
+_ALIKE, _RIVALS = 2.0, 1.5
+_STARTS, _REFINED = 12, 6
+# The scatter over a joint's zero falls from afar: it halves only some 30 degrees from its least.
+# Where most of it is gone as told, the zero is nearer than that. A half turn looks like an opposite
+# sign of the joint before it, or behind it, and is not meant.
+_STEP_RAD, _FARTHEST_RAD = 0.25, 2.75
+# Rows that are looked at first, and the share of what is left as told that is worth a second look.
+_SCREENED, _WORTH = 16, 0.6
+# Rows beyond this many times the typical distance do not belong to the others.
+_OUT = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class FittedJoints:
+    """A reading of the joints, and how well it explains the poses.
+
+    Attributes:
+        reading: The reading.
+        fit: Both constants, and how far every row is from them.
+    """
+
+    reading: JointReading
+    fit: Fit
+
+    @property
+    def score(self) -> float:
+        """The fit's score, not under what makes no difference."""
+        return max(self.fit.score, SCORE_FLOOR)
+
+    @property
+    def base_from_model(self) -> FloatArray:
+        """(4, 4) the model's base in the base of the poses."""
+        return self.fit.x
+
+    @property
+    def flange_from_reported(self) -> FloatArray:
+        """(4, 4) the frame of the poses in the model's flange."""
+        return invert(self.fit.z)
+
+    @property
+    def figures(self) -> str:
+        """How well the rows that agree best are explained, in words."""
+        shift, angle = self.fit.rms
+        return f"{figure(1e3 * shift)} mm and {figure(np.rad2deg(angle))} deg"
+
+    @property
+    def out(self) -> IntArray:
+        """Rows that do not belong to the others."""
+        return np.flatnonzero(self.fit.away > _OUT * self.score)
+
+
+@dataclass(frozen=True, eq=False)
+class JointGuess:
+    """How the joints are to be taken.
+
+    Attributes:
+        declared: The joints as they are told.
+        best: The reading that explains the poses; the declared one where none stands out.
+        rivals: Other readings that explain them as well and are as simple.
+    """
+
+    declared: FittedJoints
+    best: FittedJoints
+    rivals: tuple[JointReading, ...] = ()
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether another reading than the declared one is clearly right."""
+        return self.best is not self.declared
+
+    @property
+    def zero(self) -> JointReading | None:
+        """The reading in which one joint's zero is off; None where something else may be wrong.
+
+        Of joints with parallel axes it is the likelier: whose zero it is takes a fit of all.
+        """
+        lost = all(it.is_zero for it in (self.best.reading, *self.rivals))
+        return self.best.reading if lost else None
+
+    def sentence(self, what: str) -> str:
+        """Says what was found: `what` is what the joints are compared with."""
+        readings = [self.best.reading, *self.rivals]
+        words = " or with ".join(it.words for it in readings)
+        fit = self.best.fit
+        agreeing = len(fit.away) - len(self.best.out)
+        rows = "" if agreeing == len(fit.away) else f" in {agreeing} of {len(fit.away)} views"
+        return (
+            f"With {words}, they fit {what} to {self.best.figures}{rows}; as told, to "
+            f"{self.declared.figures}."
+        )
+
+    @property
+    def fix(self) -> str:
+        """What the user can do about it."""
+        return " Or: ".join(it.fix for it in (self.best.reading, *self.rivals))
+
+
+def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _FITS) -> JointGuess:
+    """Tries the common mistakes with joint angles and says which explains the poses.
+
+    Args:
+        robot: The model that is declared.
+        q: (m, n) joint angles as they are told [rad], of `FEWEST_JOINT_ROWS` rows or more.
+        poses: (m, 4, 4) `base_from_flange` that belong to them, up to a constant on either side.
+        fits: The score under which the declared reading is right without a look at others.
+
+    Returns:
+        The reading, and how well it does; the declared one where it is right, where no other is
+        clearly better, or where the poses turn about one axis at most and tell nothing.
+    """
+    declared = declared_reading(robot)
+    with one_blas_thread():
+        told = _fitted(declared, q, poses, _STARTS)
+        if told.score <= fits or is_about_one_axis(poses[:, :3, :3]):
+            return JointGuess(told, told)
+        few = thinned(np.arange(len(q)), _SCREENED)
+        screened = _screened(told, q[few], poses[few])
+        best = [_fitted(it, q, poses, _STARTS) for it in screened]
+    return _decided(told, best) if best else JointGuess(told, told)
+
+
+def _screened(told: FittedJoints, q: FloatArray, poses: FloatArray) -> list[JointReading]:
+    """The readings that may explain a few rows far better than the declared one."""
+    declared = told.reading
+    tried = [_fitted(it, q, poses, 0) for it in joint_readings(declared.robot)]
+    tried.sort(key=lambda it: it.score * (1.0 + it.reading.cost))
+    best = [*tried[:_REFINED], *_with_zeros(told, q, poses)]
+    limit = _WORTH * _fitted(declared, q, poses, 0).score
+    return [it.reading for it in best if it.score < limit]
+
+
+def _decided(told: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
+    least = min(it.score for it in tried)
+    alike = [it for it in tried if it.score <= _ALIKE * least]
+    alike.sort(key=lambda it: (it.reading.cost, it.score))
+    best, others = alike[0], alike[1:]
+    if best.score > _CLOSES or told.score <= STANDS_OUT * best.score:
+        return JointGuess(told, told)
+    rivals = tuple(
+        it.reading
+        for it in others
+        if it.reading.cost == best.reading.cost and it.score < _RIVALS * best.score
+    )
+    return JointGuess(told, best, rivals)
+
+
+def _with_zeros(told: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterator[FittedJoints]:
+    """The best zero of each joint between the first and the last, whose zeros hide in constants."""
+    declared = told.reading
+    turns = ~declared.robot.chain.prismatic
+    farthest = 2.0 * _STEP_RAD if told.score < _CLOSES else _FARTHEST_RAD
+    for joint in np.flatnonzero(turns[1:-1]) + 1:
+
+        def score(zero: float, joint: int = int(joint)) -> float:
+            return _fitted(with_zero(declared, joint, zero), q, poses, 0).fit.score
+
+        start = min(np.arange(-farthest, farthest + _STEP_RAD, _STEP_RAD), key=score)
+        reach = start - _STEP_RAD, start + _STEP_RAD
+        least = minimize_scalar(score, bounds=reach, method="bounded", options={"xatol": 1e-6})
+        yield _fitted(with_zero(declared, int(joint), float(least.x)), q, poses, 0)
+
+
+def _fitted(reading: JointReading, q: FloatArray, poses: FloatArray, starts: int) -> FittedJoints:
+    """Fits both constants by some rows, and measures all."""
+    rows = thinned(np.arange(len(q)))
+    of_poses, of_joints = invert(poses), reading.poses(q)
+    fit = robust_fit(of_poses[rows], of_joints[rows], starts)
+    if len(rows) < len(q):
+        fit = distances(of_poses, of_joints, fit.lever, (fit.x, fit.z))
+    return FittedJoints(reading, fit)

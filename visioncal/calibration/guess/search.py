@@ -1,0 +1,207 @@
+"""The search: from all ways to take the numbers to the few that close the chain.
+
+What is cheap and independent goes first: relative angles (forms, shifted rows), then rotations
+(inverse or not), then positions (units, signs), each leaving a handful to the next; the handful at
+the end is fitted in full.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from visioncal.calibration.guess.forms import (
+    SHIFTS,
+    Forms,
+    Pairing,
+    camera_forms,
+    robot_forms,
+    screen,
+)
+from visioncal.calibration.guess.given import SCORE_FLOOR, Recording, Scored, fitted, is_likely_unit
+from visioncal.calibration.guess.hypothesis import Hypothesis, Taken, strangeness
+from visioncal.calibration.guess.likeness import is_far_likelier, likeness
+from visioncal.calibration.guess.positions import UNITS, Turned, Variant, score_variants, solve_turn
+from visioncal.core.conventions import UNITS_M
+from visioncal.core.types import MOUNTS, IntArray
+
+# Rows looked at: more would add time and no certainty.
+_MOST_ROWS = 40
+# A stage hands on what is within this many times of its best, and at most so many.
+_REACH, _PAIRINGS, _TURNED, _LABELLED, _FITTED = 3.0, 32, 24, 80, 12
+# The half of a degree that noisy poses of few views add to any bound.
+_SLACK_RAD = 5e-3
+# By how much a change makes a reading less likely than one that does without.
+_PRICE = 0.3
+_STARTS = 12
+
+
+def thinned(rows: IntArray, most: int = _MOST_ROWS) -> IntArray:
+    """At most so many rows as are worth their time, evenly spread."""
+    if len(rows) <= most:
+        return rows
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
+
+
+def search(recording: Recording) -> list[Scored]:
+    """Finds the readings that close the chain best.
+
+    Returns:
+        The declared reading first; then the others, the best first, one for each class of readings
+        that residuals can tell apart.
+    """
+    kept = thinned(recording.common_rows())
+    looked_at = _with_neighbours(kept, len(recording.robot))
+    part, rows = recording.part(looked_at), np.searchsorted(looked_at, kept)
+    robot = robot_forms(part.robot)
+    camera = camera_forms(part.camera, is_measured=part.is_measured)
+    pairings = _plausible(robot, camera, screen(robot, camera, rows))
+    turned = _turned(part, robot, camera, pairings, rows)
+    own, classes = _closing(part, robot, camera, turned)
+    declared = _with_likelier(part, fitted(part, part.declared, rows, _STARTS), own, rows)
+    others = [_best_label(part, labels, rows) for labels in classes]
+    others.sort(key=lambda it: it.score)
+    return [replace(it, rows=looked_at[it.rows]) for it in (declared, *others)]
+
+
+def _with_neighbours(rows: IntArray, count: int) -> IntArray:
+    """Rows and those that shifts pair them with: next to each other among these as among all."""
+    near = np.unique(np.add.outer(rows, SHIFTS))
+    return np.asarray(near[(near >= 0) & (near < count)])
+
+
+def _closing(
+    recording: Recording, robot: Forms, camera: Forms, turned: Sequence[Turned]
+) -> tuple[list[Hypothesis], list[list[Hypothesis]]]:
+    """The declared reading's class, and the others worth fitting, as their simplest readings."""
+    scored = [
+        (float(score), turn, variant)
+        for turn in turned
+        for score, variant in score_variants(recording, turn)
+    ]
+    best = min((score for score, *_ in scored), default=0.0)
+    close = [it for it in scored if it[0] <= _REACH * best + _SLACK_RAD]
+    close.sort(key=lambda it: _priced(it[0], _cheap_cost(robot, camera, it[1], it[2])))
+    own: list[Hypothesis] = []
+    classes = []
+    for score, turn, variant in close[:_LABELLED]:
+        labels = list(_labels(recording, robot, camera, turn, variant))
+        if recording.declared in labels:
+            own = labels
+            continue
+        costs = [recording.cost(it) for it in labels]
+        least = min(costs)
+        simplest = [it for it, cost in zip(labels, costs, strict=True) if cost == least]
+        classes.append((_priced(score, least), simplest))
+    classes.sort(key=lambda it: it[0])
+    return own, [labels for _, labels in classes[:_FITTED]]
+
+
+def _priced(score: float, cost: float) -> float:
+    """A score by which simple readings come before others that are as good."""
+    return (score + SCORE_FLOOR) * (1.0 + _PRICE * cost)
+
+
+def _cheap_cost(robot: Forms, camera: Forms, turned: Turned, variant: Variant) -> float:
+    """About `Recording.cost` of the simplest reading of a class, without building it."""
+    transposed = (turned.transposed[0] != variant.carried) + turned.transposed[1]
+    return _pairing_cost(robot, camera, turned.pairing) + variant.changes + transposed
+
+
+def _pairing_cost(robot: Forms, camera: Forms, it: Pairing) -> float:
+    """About `Recording.cost` of a pairing alone."""
+    of_robot = 1.0 + strangeness(robot.turns[it.robot]) if it.robot else 0.0
+    of_camera = 1.0 + strangeness(camera.turns[it.camera]) if it.camera else 0.0
+    return of_robot + of_camera + (it.shift != 0)
+
+
+def _labels(
+    recording: Recording, robot: Forms, camera: Forms, turned: Turned, variant: Variant
+) -> Iterator[Hypothesis]:
+    """All readings that give the same chain.
+
+    An inverse of the robot's poses, one of the camera's and another mount are the same change;
+    units go in pairs.
+    """
+    pairing = turned.pairing
+    transposed = turned.transposed[0] != variant.carried, turned.transposed[1]
+    pairs = [
+        (a, b)
+        for a, b in product(UNITS, UNITS)
+        if np.isclose(UNITS_M[a] / UNITS_M[b], variant.ratio, rtol=1e-6)
+    ]
+    likely = [it for it in pairs if is_likely_unit(recording, it[1])]
+    inverses = (False,) if recording.is_measured else (False, True)
+    for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
+        yield Hypothesis(
+            Taken(
+                robot.turns[pairing.robot],
+                unit,
+                variant.carried != ((mount == "eye-to-hand") != inverse),
+                transposed[0],
+                variant.signs,
+            ),
+            Taken(camera.turns[pairing.camera], camera_unit, inverse, transposed[1]),
+            mount,
+            pairing.shift,
+        )
+
+
+def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArray) -> Scored:
+    """Chooses among readings of one class by what cells look like.
+
+    The target is before the camera, and what sits on the flange is near it.
+    """
+    scored = [fitted(recording, it, rows, _STARTS) for it in labels]
+    chosen = max(
+        scored,
+        key=lambda it: (likeness(recording, it), it.hypothesis.mount == recording.mount),
+    )
+    cost = recording.cost(chosen.hypothesis)
+    return replace(chosen, labels=tuple(labels), cost=cost)
+
+
+def _with_likelier(
+    recording: Recording, declared: Scored, own: Sequence[Hypothesis], rows: IntArray
+) -> Scored:
+    """Tells of the simplest readings of the declared one's class that make a likelier cell."""
+    unit = declared.hypothesis.robot.unit
+    scored = [fitted(recording, it, rows, _STARTS) for it in own if it.robot.unit == unit]
+    likelier = [it.hypothesis for it in scored if is_far_likelier(recording, it, declared)]
+    least = min((recording.cost(it) for it in likelier), default=0.0)
+    return replace(declared, labels=tuple(it for it in likelier if recording.cost(it) == least))
+
+
+def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list[Pairing]:
+    """The pairings with the best mismatch, simple ones first, and the declared one."""
+    best = min(it.mismatch_rad for it in pairings)
+    bound = _REACH * best + _SLACK_RAD
+    near = [it for it in pairings[1:] if it.mismatch_rad <= bound]
+    near.sort(key=lambda it: _priced(it.mismatch_rad, _pairing_cost(robot, camera, it)))
+    return [pairings[0], *near[: _PAIRINGS - 1]]
+
+
+def _turned(
+    recording: Recording,
+    robot: Forms,
+    camera: Forms,
+    pairings: Sequence[Pairing],
+    rows: IntArray,
+) -> list[Turned]:
+    """Solves for the rotations of each pairing, with each side as given and transposed."""
+    solved = []
+    cameras = (False,) if recording.is_measured else (False, True)
+    for pairing in pairings:
+        turns = robot.rotations[pairing.robot], camera.rotations[pairing.camera]
+        inside = rows[(rows + pairing.shift >= 0) & (rows + pairing.shift < turns[0].shape[0])]
+        there = np.isfinite(turns[0][inside + pairing.shift]).all(axis=(1, 2))
+        inside = inside[there & np.isfinite(turns[1][inside]).all(axis=(1, 2))]
+        if len(inside) < 3:
+            continue
+        sides = turns[0][inside + pairing.shift], turns[1][inside]
+        solved += [solve_turn(pairing, it, inside, sides) for it in product((False, True), cameras)]
+    best = min((it.score for it in solved), default=0.0)
+    near = [it for it in solved if it.score <= _REACH * best + _SLACK_RAD]
+    near.sort(key=lambda it: _priced(it.score, _pairing_cost(robot, camera, it.pairing)))
+    return near[:_TURNED]

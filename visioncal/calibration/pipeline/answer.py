@@ -1,0 +1,281 @@
+"""The answer: a fit with its covariance, and what speaks for and against it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.calibration.pipeline.arm_results import covariance_beside_noise
+from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
+from visioncal.calibration.pipeline.fault_messages import (
+    PoseFault,
+    Version,
+    movements,
+    pose_faults,
+    reasons,
+    residuals,
+    versions,
+)
+from visioncal.calibration.pipeline.holdout import held_sights
+from visioncal.calibration.pipeline.solving import Solved, sensors_of
+from visioncal.calibration.stages.arms import ArmFound
+from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.clock import Pair
+from visioncal.calibration.stages.diagnose import Misfit, misfits
+from visioncal.calibration.stages.image_delays import FoundDelay
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.offset import Clock
+from visioncal.calibration.stages.validate import HeldOut
+from visioncal.core.types import FloatArray
+from visioncal.estimation.chain import scatter
+from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import Solution, covariance_of, fit_problem
+from visioncal.results import Edge, Moved, Sight
+from visioncal.robot import Convention
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A fit with its covariance, and what speaks for and against it.
+
+    Attributes:
+        solved: The fit.
+        problem: The observations in it.
+        covariance: (p, p) of its unknowns, with all that counts beside noise.
+        beside: (p, p) what that is, by its source.
+        misfits: What the residuals of each robot's stops show beyond noise.
+        arms: What the stops tell of the arms, by robot.
+        held_out: Residuals of observations that were left out of the fit in turn.
+        moved: What moved, in the order of time.
+        faults: What wrong poses of robots explain.
+        sights: What became of each observation.
+        sigmas: Estimated standard deviations, by frame or robot and by name.
+    """
+
+    solved: Solved
+    problem: Problem
+    covariance: FloatArray
+    beside: Mapping[str, FloatArray]
+    misfits: Mapping[str, Misfit]
+    arms: Mapping[str, ArmFound]
+    held_out: HeldOut
+    moved: tuple[Moved, ...]
+    faults: tuple[PoseFault, ...]
+    sights: tuple[Sight, ...]
+    sigmas: Mapping[str, Mapping[str, float]]
+
+    @property
+    def fit(self) -> Solution:
+        """The unknowns and the noise."""
+        return self.solved.agreed.fit
+
+    @property
+    def state(self) -> State:
+        """The unknowns."""
+        return self.fit.state
+
+    @property
+    def noise(self) -> Noise:
+        """The levels of robots and sensors."""
+        return self.fit.noise
+
+    @cached_property
+    def versions(self) -> dict[str, Version]:
+        """All unknown frames over time, by their names in the problem."""
+        return versions(self.solved)
+
+    @cached_property
+    def edges(self) -> dict[str, Edge]:
+        """The estimated transforms by the frames that they place, as the result names these."""
+        found, edges = {}, self.state.edges
+        for key, at in self.problem.unknown.items():
+            block = self.covariance[6 * at : 6 * at + 6, 6 * at : 6 * at + 6]
+            found[self.versions[key].name] = Edge(edges[at], block)
+        return found
+
+    @property
+    def last_edges(self) -> dict[str, Edge]:
+        """Those of frames where they stood last."""
+        named = self.versions.values()
+        return {it.frame: self.edges[it.frame] for it in named if it.name == it.frame}
+
+    def clocks(self, looked: Observed) -> dict[Pair, Clock]:
+        """The clocks as the fit has them, where it estimates them."""
+        return {pair: self._fitted_clock(pair, it.clock) for pair, it in looked.clocks.items()}
+
+    def _fitted_clock(self, pair: Pair, clock: Clock) -> Clock:
+        found = self._fitted_time(pair.effect)
+        if found is None:
+            return clock
+        late_s, sigma_s = found
+        return replace(
+            clock,
+            camera_minus_robot_s=clock.camera_minus_robot_s + late_s,
+            sigma_s=sigma_s,
+            delays=tuple(self._fitted_delay(pair, it) for it in clock.delays),
+        )
+
+    def _fitted_delay(self, pair: Pair, delay: FoundDelay) -> FoundDelay:
+        found = self._fitted_time(pair.delay(delay.of))
+        if found is None:
+            return delay
+        late_s, sigma_s = found
+        return replace(delay, time_s=delay.time_s + late_s, sigma_s=sigma_s)
+
+    def _fitted_time(self, effect: str) -> tuple[float, float] | None:
+        """By how much a time is later in the fit, and its sigma [s]; None where it is not in it."""
+        columns = self.problem.effect_columns.get(effect)
+        if columns is None:
+            return None
+        (late_s,) = self.problem.values_of(effect, self.state)
+        return float(late_s), float(np.sqrt(self.covariance[columns.start, columns.start]))
+
+    @cached_property
+    def budget_mm(self) -> dict[str, dict[str, float]]:
+        """Sigmas of each frame's place in its parent, by the frame and by source [mm]."""
+        found = budget_mm(self.solved, self.beside)
+        return {self.versions[key].name: it for key, it in found.items()}
+
+    @cached_property
+    def intervals(self) -> FloatArray:
+        """(r, 2, 2) 95 % intervals of the robots' noise; see `noise_intervals`."""
+        return noise_intervals(self.problem, self.state, self.noise)
+
+
+def answer_of(
+    cell: Cell, looked: Observed, solved: Solved, convention: Convention | None
+) -> Answer:
+    """Examines a fit.
+
+    Args:
+        cell: The cell as it was read.
+        looked: What was observed in it.
+        solved: The fit of what of it is tied.
+        convention: Of the joint table in which calibrated arms' numbers are told.
+    """
+    part, fit = solved.part, solved.agreed.fit
+    # A closed form is not at rest, and that would pass for a misfit.
+    found = misfits(part, fit if solved.solver == "joint" else fit_problem(part, fit.state))
+    beside = covariance_beside_noise(part, fit, solved.arms, found, is_fit=solved.solver == "joint")
+    spread = sum(beside.values(), covariance_of(part, fit))
+    faults, held_out = pose_faults(solved), left_out(solved)
+    return Answer(
+        solved,
+        part,
+        spread,
+        beside,
+        found,
+        _arms_found(solved, spread, convention),
+        held_out,
+        movements(solved),
+        faults,
+        _sights(looked, cell, solved, held_out, faults),
+        _sigmas(solved),
+    )
+
+
+def _arms_found(
+    solved: Solved, spread: FloatArray, convention: Convention | None
+) -> dict[str, ArmFound]:
+    """What the stops tell of the arms, by robot."""
+    agreed, middles = solved.agreed, middles_of(solved.cell)
+    part = solved.part
+    return {
+        name: arm.found(part, agreed.fit, spread, middles, convention)
+        for name, arm in solved.arms.items()
+    }
+
+
+def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
+    """Estimated standard deviations: of robots by name, of cameras and instruments by frame."""
+    fit, problem = solved.agreed.fit, solved.agreed.problem
+    found = {
+        robot: {
+            "translation_mm": 1e3 * float(sigma_m),
+            "rotation_deg": float(np.rad2deg(sigma_rad)),
+        }
+        for robot, (sigma_rad, sigma_m) in zip(problem.robots, fit.noise.robots, strict=True)
+    }
+    if solved.seen is not None:
+        pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
+        found |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
+    sensors = dict.fromkeys(
+        (*sensors_of(solved.cell, solved.poses), *(it.seer for it in solved.cell.rows))
+    )
+    for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=False):
+        found[frame] = {**found.get(frame, {}), "level": level}
+    return found
+
+
+def _intervals(solved: Solved) -> dict[str, dict[str, list[float]]]:
+    """95 % intervals of the levels of robots, as `_noise` names them."""
+    agreed = solved.agreed
+    part = agreed.problem.subset(agreed.used)
+    found = noise_intervals(part, agreed.fit.state, agreed.fit.noise)
+    return {
+        robot: {
+            "translation_mm": (1e3 * shift_m).tolist(),
+            "rotation_deg": np.rad2deg(turn_rad).tolist(),
+        }
+        for robot, (turn_rad, shift_m) in zip(part.robots, found, strict=True)
+    }
+
+
+def _sights(
+    looked: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
+) -> tuple[Sight, ...]:
+    """What became of each observation, in the order of the session's rows."""
+    rows, used = solved.cell.rows, solved.agreed.used
+    away, why = _away(solved), reasons(solved, faults)
+    rms_px = solved.chain_px(np.arange(len(rows)), solved.agreed.fit.state)
+    unseen = np.full((len(rows), 3), np.nan)
+    unseen[used] = np.stack(
+        [1e3 * held_out.away_m, np.rad2deg(held_out.away_rad), held_out.rms_px], axis=1
+    )
+    found = {}
+    for at, row in enumerate(rows):
+        mm, deg, px = _known(np.append(away[at], rms_px[at]))
+        corners = solved.poses[at].corners
+        found[row.view] = Sight(
+            row.view,
+            solved.cell.stops[row.station],
+            row.seer,
+            row.seen,
+            bool(used[at]),
+            why.get(row.view, ""),
+            mm,
+            deg,
+            None if corners is None else len(corners.ids),
+            px,
+            *_known(unseen[at]),
+        )
+    found |= held_sights(solved, looked)
+    lost = solved.cell.reasons
+    for it in cell.session.observations:
+        number = it.view.number
+        if number not in found and not it.view.is_of_lens:
+            stop = cell.stops[it.station] if it.station < len(cell.stops) else number
+            found[number] = Sight(number, stop, it.seer, it.seen, False, lost.get(number, ""))
+    return tuple(found[it] for it in (view.number for view in cell.session.views) if it in found)
+
+
+def _known(figures: FloatArray) -> list[float | None]:
+    """Figures, None in the place of those that are not known."""
+    return [it if np.isfinite(it) else None for it in figures.tolist()]
+
+
+def _away(solved: Solved) -> FloatArray:
+    """(n, 2) residuals of the observations [mm], [deg].
+
+    Of one camera and one robot it is how far each places its target from where those that are used
+    do on average; of a whole cell, how far it is from what the rest predicts.
+    """
+    if solved.cell.mount is None:
+        return residuals(solved)
+    problem = solved.agreed.problem
+    away_m, away_rad = scatter(problem, solved.part, solved.agreed.fit.state)
+    turned = problem.observations.has_rotation
+    return np.stack([1e3 * away_m, np.where(turned, np.rad2deg(away_rad), np.nan)], axis=1)

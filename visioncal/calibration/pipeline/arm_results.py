@@ -1,0 +1,141 @@
+"""The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from visioncal.calibration.stages import thermal
+from visioncal.calibration.stages.arms import ArmFound, RobotArm
+from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.calibration.stages.diagnose import Misfit, misfit_words
+from visioncal.calibration.stages.kinematics import doubts, findings
+from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import covariance_of_size, misfit_covariance
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.residual_tests import inflation
+from visioncal.estimation.solve import Solution, covariance_of, held_shift
+
+
+def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
+    """Reads the arms of a cell, as they are stated."""
+    found, session = {}, cell.session
+    for name, it in robots.items():
+        key = robot_key(name)
+        if key in cell.poses:
+            rows = {it.station: it.robots[name] for it in session.observations if name in it.robots}
+            stood = np.flatnonzero(np.isfinite(cell.poses[key][:, 0, 0])).tolist()
+            views = [rows[it] for it in stood]
+            found[key] = RobotArm.of(key, cell.poses[key], views, it.matched, (session, name))
+    return found
+
+
+def covariance_beside_noise(
+    problem: Problem,
+    fit: Solution,
+    arms: Mapping[str, RobotArm],
+    found: Mapping[str, Misfit],
+    *,
+    is_fit: bool = True,
+) -> dict[str, FloatArray]:
+    """Covariances (p, p) that a fit has of what is no noise, by their source.
+
+    Args:
+        problem: The observations that agree.
+        fit: Their fit.
+        arms: The arms; errors that are no unknowns count, and how well the size of others is known.
+        found: What their residuals show.
+        is_fit: Whether it is at rest: a closed form is pulled by more than what is held.
+    """
+    parts, shift = {}, held_shift(problem, fit) * float(is_fit)
+    if shift.any():
+        parts["held_values"] = np.outer(shift, shift)
+    for robot, arm in arms.items():
+        if arm.errors is not None and not arm.errors.is_estimated:
+            errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
+            parts[f"arm{_of(arms, robot)}"] = errors
+        elif arm.errors is not None:
+            spread = covariance_of(problem, fit)
+            parts[f"size of arm errors{_of(arms, robot)}"] = covariance_of_size(
+                problem, spread, robot, arm.errors
+            )
+    for robot, it in found.items():
+        if it.alike.is_significant:
+            more = inflation(problem, fit.state, fit.noise, robot, it.alike.factor)
+            parts[f"misfit{_of(arms, robot)}"] = more
+    return parts
+
+
+def _of(arms: Mapping[str, RobotArm], robot: str) -> str:
+    """Names, of several robots, the one that a source is of."""
+    return "" if len(arms) == 1 else f" of robot {robot}"
+
+
+def doubts_of_arms(
+    arms: Mapping[str, RobotArm],
+    found: Mapping[str, Misfit],
+    told: Mapping[str, ArmFound],
+    asked: str,
+) -> Iterator[str]:
+    """Words what speaks against the robots."""
+    for robot, arm in arms.items():
+        for words in (*_doubts(arm, found.get(robot), asked), *told[robot].doubts()):
+            yield _of_robot(arms, robot, words)
+
+
+def notes_on_arms(arms: Mapping[str, RobotArm], told: Mapping[str, ArmFound]) -> Iterator[str]:
+    """Words what was found of the arms and is no reason for doubt."""
+    for robot, arm in arms.items():
+        drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
+        chosen = () if arm.kinematics is None else findings(arm.kinematics)
+        for words in (*drifts, *chosen, *told[robot].notes()):
+            yield _of_robot(arms, robot, words)
+
+
+def _doubts(arm: RobotArm, found: Misfit | None, asked: str) -> Iterator[str]:
+    if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
+        yield "It stays as it reports itself: its errors take joint angles and a known model."
+    elif arm.thermal is None and asked == thermal.LEVEL:
+        yield "Nothing tells how it drifts with its temperature: that stays in its noise."
+    if arm.kinematics is not None:
+        yield from doubts(arm.kinematics)
+    if found is not None:
+        calibrated = arm.model is not None
+        yield from misfit_words(found, arm.errors, calibrated=calibrated)
+
+
+def _of_robot(arms: Mapping[str, RobotArm], robot: str, words: str) -> str:
+    """Names, of several robots, the one that a sentence is of."""
+    return words if len(arms) == 1 else f"Robot {robot}: {words[0].lower()}{words[1:]}"
+
+
+def with_drifts(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, asked: str
+) -> dict[str, RobotArm]:
+    """Looks for drift with temperature, one arm after the other, beside the errors of the others.
+
+    Raises:
+        DataError: It is asked for, and no arm has what it takes.
+        DegenerateError: Likewise, and all was observed about equally warm.
+    """
+    found, refused = dict(arms), []
+    for name, arm in arms.items():
+        bare = arm.without_errors(problem)
+        start = State(fit.state.edges, bare.start_values)
+        try:
+            found[name] = arm.with_drift(bare, start, asked)
+        except (DataError, DegenerateError) as error:
+            refused.append(error.within(f"robot {name}"))
+        problem = found[name].put_into(problem)
+    if refused and len(refused) == len(found):
+        raise refused[0]
+    return found
+
+
+def with_errors(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
+) -> dict[str, RobotArm]:
+    """Looks for errors of each arm that follow its posture, the others being as stated."""
+    return {name: arm.with_errors(problem, fit) for name, arm in arms.items()}

@@ -1,0 +1,140 @@
+"""Calibrating with corners by all pixels around them, kept only where unseen views agree."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.pipeline.running import Run, run
+from visioncal.calibration.stages.dense import Dense, explained
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.number_format import figure
+from visioncal.core.types import Progress, SolverName
+from visioncal.results import Calibration, Rms
+from visioncal.robot import Convention
+from visioncal.session import Session
+from visioncal.vision.dense.library import chosen_device
+
+# What is worse by less standard errors is chance.
+_CHANCE = 2.0
+
+
+def _is_worse(before: Run, after: Run) -> bool:
+    """Whether views that were left out are predicted worse, in pixels or in millimetres.
+
+    That is so where their squared errors grow in the mean, by more than chance explains.
+    """
+    views = sorted(before.left_out.keys() & after.left_out.keys())
+    growth = np.array(
+        [np.square(after.left_out[it]) - np.square(before.left_out[it]) for it in views]
+    )
+    growth = growth[np.isfinite(growth).all(axis=1)]
+    if len(growth) < 2:
+        return True
+    chance = _CHANCE * growth.std(axis=0, ddof=1) / np.sqrt(len(growth))
+    return bool(np.any(growth.mean(axis=0) > chance))
+
+
+def _words(before: Rms, after: Rms, *, kept: bool) -> str:
+    """What both predict, in a sentence."""
+    return (
+        f"Dense corners are {'kept' if kept else 'not kept'}: with them, views that were left out "
+        f"are predicted to {_figures(after)}, with those of the template to {_figures(before)}."
+    )
+
+
+def _figures(rms: Rms) -> str:
+    px = "" if rms.px is None else f"{figure(rms.px)} px and "
+    return f"{px}{figure(rms.mm)} mm"
+
+
+def run_dense(
+    session: Session,
+    *,
+    device: str = "auto",
+    solver: SolverName = "joint",
+    level: str = "auto",
+    convention: Convention | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """Calibrates a session by the template's corners and by dense ones; see `calibrate`.
+
+    Args:
+        session: The session.
+        device: What torch works on: `auto` for a GPU where there is one, `cpu` or `cuda`.
+        solver: See `calibrate`.
+        level: Likewise.
+        convention: Likewise.
+        progress: Likewise.
+
+    Returns:
+        The one with dense corners, unless it predicts views that were left out worse than the
+        other, by more than chance. Either says what both predict.
+
+    Raises:
+        DataError: torch or kornia is missing, there are no images of boards, or as `calibrate`.
+    """
+    on = chosen_device(device)
+    if not any(it.kind in ("charuco", "checkerboard") for it in session.boards.values()):
+        raise DataError(
+            "--dense needs images of a checkerboard or a ChArUco board; this session has none.",
+            culprits=["--dense"],
+            next_step="Leave it out.",
+        )
+
+    def calibrated(dense: Dense | None) -> Run:
+        return run(
+            session,
+            solver=solver,
+            level=level,
+            convention=convention,
+            progress=progress,
+            dense=dense,
+        )
+
+    plain = calibrated(None)
+    try:
+        found = calibrated(Dense(on))
+    except VisioncalError as error:
+        return _telling(plain, {}, [f"Dense corners are not kept: {error.message}"])
+    if found.dense is None or not found.dense.fits:
+        return _telling(plain, {}, ["Dense corners are not kept: no image could be fitted."])
+    both = [it.calibration.validation.held_out for it in (plain, found)]
+    kept = not _is_worse(plain, found)
+    document = {
+        "kept": kept,
+        "held_out": {
+            name: {"mm": it.mm, "px": it.px}
+            for name, it in zip(("template", "dense"), both, strict=True)
+        },
+        "images": list(_images(found.dense)),
+    }
+    words = [_words(*both, kept=kept), *found.dense.notes()]
+    chosen = found if kept else plain
+    if chosen.calibration.camera is not None:
+        camera = chosen.calibration.camera.camera
+        evidence = explained(session, chosen.evidence, found.dense, camera)
+        chosen = replace(chosen, evidence=evidence)
+    return _telling(chosen, document, words)
+
+
+def _images(dense: Dense) -> Iterator[dict[str, Any]]:
+    for view, it in dense.fits.items():
+        yield {
+            "view": view,
+            "sigma_px": it.blur.sigma_px,
+            "disc_px": it.blur.disc_px,
+            "motion_px": it.blur.length_px,
+            "motion_deg": it.blur.direction_deg,
+            "tone": it.tone,
+            "pixel_noise": it.noise,
+        }
+
+
+def _telling(found: Run, document: dict[str, Any], words: list[str]) -> Run:
+    """The result with what is said of dense corners."""
+    calibration: Calibration = found.calibration
+    verdict = replace(calibration.verdict, reasons=(*calibration.verdict.reasons, *words))
+    stages = {**calibration.stages, **({"dense": document} if document else {})}
+    return replace(found, calibration=replace(calibration, verdict=verdict, stages=stages))

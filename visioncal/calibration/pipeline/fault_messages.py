@@ -1,0 +1,340 @@
+"""What is wrong with observations that disagree, and what moved, for people."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
+from visioncal.calibration.stages.validate import apart
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import distances, mean_transform, pose_difference
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.problem import Problem
+from visioncal.results import Moved
+
+# A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
+_FEWEST_STOPS, _ALIKE = 3, 0.5
+# A robot's pose is wrong where so many observations of its stop say so.
+_FEWEST = 2
+
+
+# So many views of a fault are named, and so many stops that an observation fits.
+_LISTED, _NAMED = 8, 3
+
+
+@dataclass(frozen=True)
+class PoseFault:
+    """What is wrong with the poses of a robot.
+
+    Attributes:
+        words: What it is, in sentences.
+        rows: The observations that it explains.
+        short: The same as a clause, for each of these; empty where the sentences are enough.
+    """
+
+    words: str
+    rows: tuple[int, ...]
+    short: str = ""
+
+
+@dataclass(frozen=True)
+class Version:
+    """A frame over a part of the time.
+
+    Attributes:
+        key: Its name in the problem.
+        frame: The frame that it is.
+        name: Its name in the result: the frame's own for the last.
+        start: The first station of it; -1 for the first version.
+    """
+
+    key: str
+    frame: str
+    name: str
+    start: int
+
+
+def versions(solved: Solved) -> dict[str, Version]:
+    """All unknown frames over time, by their names in the problem."""
+    moves = {it.twin: it for it in solved.agreed.moves}
+    parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
+    for key in solved.agreed.problem.unknown:
+        start = moves[key].stop if key in moves else -1
+        parts[key.partition("@")[0]].append((start, key))
+    found = {}
+    for frame, mine in parts.items():
+        ordered = sorted(mine)
+        for at, (start, key) in enumerate(ordered):
+            name = frame
+            if at + 1 < len(ordered):
+                last = _last_seen(solved, ordered[at + 1][1])
+                name = f"{frame}_until_stop_{last}"
+            found[key] = Version(key, frame, name, start)
+    return found
+
+
+def _last_seen(solved: Solved, twin: str) -> int:
+    """The last stop at which a frame was seen before it moved."""
+    move = next(it for it in solved.agreed.moves if it.twin == twin)
+    return _stops_of(solved, move.frame)[-1]
+
+
+def _stops_of(solved: Solved, key: str) -> list[int]:
+    """The stops at which a frame, as the problem knows it, is in what is used; in order of time."""
+    problem = solved.agreed.problem
+    rows = problem.observations.involves(key)
+    some = rows & solved.agreed.used
+    stations = problem.observations.stops[some if some.any() else rows]
+    return [solved.cell.stops[it] for it in np.unique(stations).tolist()]
+
+
+def movements(solved: Solved) -> tuple[Moved, ...]:
+    """What moved, in the order of time."""
+    found, names = [], versions(solved)
+    edges = dict(zip(solved.agreed.problem.unknown, solved.agreed.fit.state.edges, strict=True))
+    for move in sorted(solved.agreed.moves, key=lambda it: it.stop):
+        after = names[move.twin]
+        earlier = [
+            it for it in names.values() if it.frame == after.frame and it.start < after.start
+        ]
+        before = max(earlier, key=lambda it: it.start)
+        mm, deg = pose_difference(edges[before.key], edges[after.key])
+        rivals = tuple(dict.fromkeys(it.partition("@")[0] for it in move.rivals))
+        found.append(
+            Moved(
+                after.frame,
+                before.name,
+                _last_seen(solved, move.twin),
+                _stops_of(solved, move.twin)[0],
+                mm,
+                deg,
+                tuple(it for it in rivals if it != after.frame),
+            )
+        )
+    return tuple(found)
+
+
+def moved_words(moved: Moved) -> str:
+    """Says that something moved."""
+    what = "was bumped" if moved.frame.startswith("cam") else "moved"
+    rivals = (
+        f" (or {' or '.join(moved.rivals)} did: this session cannot tell)" if moved.rivals else ""
+    )
+    return (
+        f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
+        f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}; the result has it "
+        f"where it stood last, and as {moved.before} where it stood before."
+    )
+
+
+def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
+    """Robots that were pushed, and poses of theirs that are exchanged or wrong."""
+    out = np.flatnonzero(~solved.agreed.used)
+    if not len(out):
+        return ()
+    mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
+    if solved.cell.mount is not None:
+        return tuple(_exchanged_views(solved, mutual))
+    found = _pushed_bases(solved)
+    found += _exchanged(solved, mutual)
+    explained = {row for it in found for row in it.rows}
+    return (*found, *_wrong_poses(solved, explained))
+
+
+def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+    """Pairs of views of one camera, each of which fits the pose of the other."""
+    rows = solved.cell.rows
+    for first, second in sorted(mutual.items()):
+        if first < second:
+            words = (
+                f"Views {rows[first].view} and {rows[second].view} are exchanged: the image of "
+                "each fits the pose in the other's row. They were left out: exchange them in "
+                "views.csv, and calibrate again."
+            )
+            yield PoseFault(words, (first, second))
+
+
+def by_way_of(problem: Problem, robot: str) -> Mask:
+    """(n,) the observations between whose frames a robot is."""
+    found = np.zeros(len(problem), dtype=bool)
+    for group in problem.groups:
+        found[group.rows] = any(step.robot == robot for step in group.path)
+    return found
+
+
+def _views(solved: Solved, rows: Sequence[int]) -> str:
+    views = [str(solved.cell.rows[it].view) for it in rows]
+    return f"views {some_of(views, _LISTED)}"
+
+
+def _pushed_bases(solved: Solved) -> list[PoseFault]:
+    """Robots whose observations all disagree from some stop on, as one other place explains.
+
+    Such observations are left out, and the base is where it stood before: a base is no frame that
+    may be two, because all that its robot carries hangs on it.
+    """
+    problem, used = solved.agreed.problem, solved.agreed.used
+    stops, found = problem.observations.stops, []
+    for flange, branch in problem.tree.branches.items():
+        if not branch.robot:
+            continue
+        mine = by_way_of(problem, branch.robot)
+        first = int(stops[mine & used].max(initial=-1)) + 1
+        after = np.flatnonzero(mine & ~used & (stops >= first))
+        if len(np.unique(stops[after])) < _FEWEST_STOPS:
+            continue
+        moved = _moved_by(solved, branch.parent, after)
+        as_if = f", as if {branch.parent} had been pushed by {moved}" if moved else ""
+        words = (
+            f"All {len(after)} views by way of {flange} from stop "
+            f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
+            f"{branch.parent} is where it stood before. Align the stops from there on alone."
+        )
+        found.append(PoseFault(words, tuple(after.tolist())))
+    return found
+
+
+def _moved_by(solved: Solved, base: str, rows: IntArray) -> str:
+    """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
+    asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
+    mean = mean_transform(asked)
+    shift_mm, turn_deg = pose_difference(np.eye(4), mean)
+    scatter_mm = 1e3 * float(np.median(distances(asked, mean)[0]))
+    return f"{figure(shift_mm)} mm and {figure(turn_deg)} deg" * (scatter_mm < _ALIKE * shift_mm)
+
+
+def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
+    """Stops at which all that was seen by way of a robot asks for it to stand elsewhere."""
+    problem, used = solved.agreed.problem, solved.agreed.used
+    stops = problem.observations.stops
+    for branch in problem.tree.branches.values():
+        if not branch.robot:
+            continue
+        mine = by_way_of(problem, branch.robot)
+        for stop in np.unique(stops[mine & ~used]).tolist():
+            rows = np.flatnonzero(mine & (stops == stop))
+            if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
+                continue
+            moved = _moved_by(solved, branch.parent, rows)
+            if moved:
+                words = (
+                    f"Robot {branch.robot} did not stand at stop {solved.cell.stops[stop]} where "
+                    f"its pose says: all {len(rows)} views by way of it disagree with the others, "
+                    f"as if it had been moved by {moved}, and were left out "
+                    f"({_views(solved, rows.tolist())}). Correct its pose there, or leave the stop "
+                    "out."
+                )
+                short = (
+                    f"the pose of robot {branch.robot} at stop {solved.cell.stops[stop]} is wrong"
+                )
+                yield PoseFault(words, tuple(rows.tolist()), short)
+
+
+def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
+    """Why observations that disagree are left out, by view, with what they fit instead."""
+    agreed, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
+    out = np.flatnonzero(~agreed.used)
+    if not len(out):
+        return {}
+    away = residuals(solved)[out]
+    counted = np.maximum(agreed.distances.directions, 1)
+    times, limit = (
+        np.sqrt(it / counted) for it in (agreed.distances.squares, agreed.distances.limit)
+    )
+    fitting = _fitting(solved, out)
+    mutual = exchanged(problem, fitting)
+    robots = {row: it.short for it in faults if it.short for row in it.rows}
+    rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
+    found = {}
+    for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
+        turned = f" and {figure(deg)} deg" if problem.observations.has_rotation[at] else ""
+        cause = _cause(solved, at)
+        if at in robots:
+            cause = robots[at]
+        elif at in mutual:
+            other = rows[mutual[at]]
+            cause = (
+                f"it fits stop {_stop(solved, mutual[at])}, and view {other.view} fits stop "
+                f"{_stop(solved, at)}: these two rows are exchanged"
+            )
+        elif at in fitting:
+            stops = [str(solved.cell.stops[it]) for it in fitting[at][:_NAMED]]
+            one = "stop" if len(stops) == 1 else "another stop, as"
+            cause = f"its image is of {one} {', '.join(stops)}; {cause}"
+        found[rows[at].view] = (
+            f"disagrees with {rest}: it places {_called(solved, rows[at].seen)} {figure(mm)} mm"
+            f"{turned} away, {figure(times[at])} times the noise (limit {figure(limit[at])}); "
+            f"{cause}"
+        )
+    return found
+
+
+def _called(solved: Solved, frame: str) -> str:
+    """A target or point in words."""
+    if solved.cell.mount is None:
+        return frame.partition("@")[0]
+    is_probe = frame.startswith("point") and frame not in solved.agreed.problem.points
+    return "the probe" if is_probe else f"the {frame.partition('_')[0]}"
+
+
+def _cause(solved: Solved, at: int) -> str:
+    """What is wrong with an observation, by those of its stop and its target that agree."""
+    rows, used, problem = solved.cell.rows, solved.agreed.used, solved.agreed.problem
+    seen = np.array(problem.observations.observed)
+    of_its_target = np.flatnonzero((seen == seen[at]) & used)
+    reading = "reading" if rows[at].seer.startswith("instrument") else "image"
+    if len(of_its_target) == 1 and len(set(seen.tolist())) > 1:
+        other = rows[of_its_target[0]].view
+        return f"it and view {other} alone show this target, and either may be wrong"
+    stops = problem.observations.stops
+    mates = np.flatnonzero((stops == stops[at]) & used)
+    if len(mates):
+        return (
+            f"view {rows[mates[0]].view} of the same stop agrees: the {reading} is wrong, or "
+            "something moved in between"
+        )
+    return f"its pose or its {reading} is wrong, or something had moved"
+
+
+def _stop(solved: Solved, row: int) -> int:
+    return solved.cell.stops[solved.cell.rows[row].station]
+
+
+def residuals(solved: Solved) -> FloatArray:
+    """Distance (n, 2) of each observation from what is predicted [mm], [deg]."""
+    away_m, away_rad = apart(solved.agreed.problem, solved.agreed.fit.state)
+    return np.stack([1e3 * away_m, np.rad2deg(away_rad)], axis=1)
+
+
+def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
+    """The other stations that observations fit; see `other_stops`."""
+    agreed = solved.agreed
+    return other_stops(agreed.problem, agreed.used, agreed.fit, out, agreed.moves)
+
+
+def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
+    """Pairs of poses of one robot that are exchanged."""
+    rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
+    found = []
+    for robot in problem.robots:
+        mine = np.flatnonzero(by_way_of(problem, robot)).tolist()
+        pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
+        for at in mine:
+            if at in mutual:
+                both = sorted((rows[at].station, rows[mutual[at]].station))
+                pairs[both[0], both[1]].append(at)
+        for stations, members in pairs.items():
+            at_both = [at for at in mine if rows[at].station in stations]
+            if len(members) >= 2 * _FEWEST and not used[at_both].any():
+                first, second = (solved.cell.stops[it] for it in stations)
+                short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
+                words = (
+                    f"{short[0].upper()}{short[1:]}: {_views(solved, at_both)} were left out. Each "
+                    "pose is right at the other's stop."
+                )
+                found.append(PoseFault(words, tuple(at_both), short))
+    return found

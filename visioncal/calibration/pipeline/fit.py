@@ -1,0 +1,120 @@
+"""What a later look at the same cell has to know of the joint fit, as calibration.json has it."""
+
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import misfit_slopes
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.effects.lenses import LENSES
+from visioncal.session import frame_name
+from visioncal.vision.targets import target_document
+
+# Columns of views.csv that say under which conditions a view was taken.
+CONDITIONS = ("ambient_c", "payload_kg")
+
+
+def fit_document(known: Known) -> dict[str, Any] | None:
+    """Writes all unknowns of the fit with their covariance; None where an instrument read them.
+
+    The unknowns are, in this order: both edges of the chain, lens and board as far as something is
+    open about them, where further boards lie from the first, and the arm's errors. What is open
+    about clocks and about drift with temperature counts in their covariance.
+    """
+    if known.mount == "instrument":
+        return None
+    boards, seen = known.session.boards, known.fitted.seen
+    placed = known.solved.problem.unknown
+    names = [it for it in boards if len(boards) < 2 or frame_name("target", it) in placed]
+    arm = _arm(known)
+    return {
+        "targets": {name: target_document(it) for name, it in boards.items()},
+        "boards": names or [""],
+        "looks": [] if seen is None else seen.free.tolist(),
+        **({} if arm is None else {"arm": arm}),
+        "covariance": _covariance(known).tolist(),
+    }
+
+
+def conditions_document(known: Known) -> dict[str, float]:
+    """The mean conditions of the used views; those that a used view does not say are left out."""
+    views = [it for it in known.session.views if it.number in known.used]
+    return {
+        name: float(np.mean([it.numbers[name] for it in views]))
+        for name in CONDITIONS
+        if views and all(name in it.numbers for it in views)
+    }
+
+
+def _arm(known: Known) -> dict[str, Any] | None:
+    """What the arm's errors are of, and what they were found to be beside the arm that is told."""
+    arm = known.robot_arm
+    model, errors = arm.model, arm.errors
+    if errors is None:
+        return None
+    count = errors.basis.shape[2]
+    # Errors that only count are where they were stated; those of a model are in its arm already.
+    problem, name = known.solved.problem, f"arm of {arm.robot}"
+    linearised = problem.start({it: np.eye(4) for it in problem.unknown})
+    values = problem.values_of(name, known.solved.state) - problem.values_of(name, linearised)
+    values = values if errors.is_estimated else np.zeros(count)
+    if model is None:
+        of = "links" if arm.is_modelled else "poses"
+        return {"of": of, "values": values.tolist()}
+    return {
+        "of": "model",
+        "values": values.tolist(),
+        "weights": dict(model.weights),
+        "flange_from_reported": model.flange_from_reported.tolist(),
+        **_by_stop(model),
+    }
+
+
+def _by_stop(model: ArmModel) -> dict[str, Any]:
+    """What of the arm's errors is not in its geometry, as it goes by the loads of a stop."""
+    if not model.values_by_stop.any():
+        return {}
+    document: dict[str, Any] = {
+        "by_stop": model.values_by_stop.tolist(),
+        "torque_nm": model.torque_nm,
+    }
+    if model.yielding is not None:
+        document["yielding"] = model.yielding.tolist()
+    if model.functions is not None:
+        document["weight_functions"] = [it.tolist() for it in model.functions.parts]
+    return document
+
+
+def _covariance(known: Known) -> FloatArray:
+    """The fit's own, and beside it what it has in common with errors that only count in it."""
+    answer, arm, written = known.solved, known.robot_arm, _written(known)
+    own = written @ answer.covariance @ written.T
+    if arm.errors is None or arm.errors.is_estimated:
+        return own
+    slopes = written @ misfit_slopes(
+        answer.problem, answer.state, answer.noise, arm.robot, arm.errors
+    )
+    size, variance = slopes.shape[1], arm.errors.sigma**2
+    # The fit is off by its slopes times the errors; the truth is off from the fit the other way.
+    between = -variance * slopes
+    return np.block([[own, between], [between.T, variance * np.eye(size)]])
+
+
+def _written(known: Known) -> FloatArray:
+    """(w, p) how what is written moves with the fit's unknowns.
+
+    Further boards are written relative to the first; clocks and drift are left out.
+    """
+    problem, rows = known.solved.problem, np.eye(known.solved.problem.size)
+    placed = known.solved.state.edges[1:]
+    # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k
+    further = [
+        rows[6:12] - adjoint(invert(placed[0]) @ placed[at]) @ rows[6 * at + 6 : 6 * at + 12]
+        for at in range(1, len(placed))
+    ]
+    nothing, arm = slice(0, 0), f"arm of {known.robot_arm.robot}"
+    looks, errors = (problem.effect_columns.get(it, nothing) for it in (LENSES, arm))
+    return np.concatenate([rows[:12], rows[looks], *further, rows[errors]])

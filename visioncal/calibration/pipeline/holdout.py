@@ -1,0 +1,125 @@
+"""Observations that a session keeps from every fit (`role = holdout`), beside the answer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.pipeline.solving import Solved, problem_of, targets_of
+from visioncal.calibration.stages.cell import Row
+from visioncal.calibration.stages.clocks import clock_effects
+from visioncal.calibration.stages.kinematics import unseen_rows
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
+from visioncal.calibration.stages.validate import apart, chain_rms_px
+from visioncal.estimation.chain import scatter
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.poses import fit_poses
+from visioncal.estimation.problem import Problem
+from visioncal.results import HELD_BACK, Sight
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """The observations that are held back, as the lenses and boards of the fit have them.
+
+    Attributes:
+        rows: The h observations.
+        views: Their poses.
+        problem: What they measured, with the unknowns of the fit.
+    """
+
+    rows: tuple[Row, ...]
+    views: tuple[ViewPoses, ...]
+    problem: Problem
+
+
+def held_back(solved: Solved, looked: Observed) -> Held | None:
+    """What is held back and can be compared with the fit; None for nothing."""
+    cell, state, placed = solved.cell, solved.agreed.fit.state, solved.cell.tree.branches.keys()
+    rows = [it for it in cell.held if it.view in looked.poses and {it.seer, it.seen} <= placed]
+    if not rows:
+        return None
+    solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
+    views = [looked.poses[it.view] for it in rows]
+    predicted = _problem(solved, looked, [chosen(it, 0, None) for it in views]).predicted(state)
+    targets = targets_of(cell)
+    views = [
+        choose_by(view, pose, targets.get(row.seen))
+        for view, pose, row in zip(views, predicted, rows, strict=True)
+    ]
+    looks = solved.looks
+    lenses = {} if looks is None else {it: looks.camera(it) for it in looks.problems}
+    positions = np.zeros((0, 3)) if looks is None else np.concatenate(looks.corners)
+    for at, (view, row) in enumerate(zip(views, rows, strict=True)):
+        camera = lenses.get(row.seer)
+        if view.corners is not None and camera is not None:
+            stack = CornerStack.of({view.view: view.corners}, positions)
+            poses = fit_poses(stack, camera, view.cam_from_target).cam_from_target
+            views[at] = replace(view, cam_from_target=poses)
+    return Held(tuple(rows), tuple(views), _problem(solved, looked, views))
+
+
+def held_sights(solved: Solved, looked: Observed) -> dict[int, Sight]:
+    """How far such observations are from what the rest of the cell predicts, by view."""
+    held = held_back(solved, looked)
+    if held is None:
+        return {}
+    state, looks, problem = solved.agreed.fit.state, solved.looks, held.problem
+    lenses = {} if looks is None else {it: looks.camera(it) for it in looks.problems}
+    positions = np.zeros((0, 3)) if looks is None else np.concatenate(looks.corners)
+    away_m, away_rad = apart(problem, state)
+    if solved.cell.mount is not None:
+        among = set(solved.part.observations.observed)
+        known = np.array([it in among for it in problem.observations.observed])
+        from_mean = scatter(problem.subset(known), solved.part, state)
+        away_m[known] = from_mean[0]
+        away_rad[known] = np.where(np.isnan(away_rad[known]), np.nan, from_mean[1])
+    cameras = [lenses.get(it.seer) for it in held.rows]
+    corners = [it.corners for it in held.views]
+    rms_px = chain_rms_px(corners, problem.predicted(state), cameras, positions)
+    figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
+    found = {}
+    for row, seen, each in zip(held.rows, corners, figures.tolist(), strict=True):
+        mm, deg, px = (it if np.isfinite(it) else None for it in each)
+        stop, count = solved.cell.stops[row.station], None if seen is None else len(seen.ids)
+        found[row.view] = Sight(
+            row.view, stop, row.seer, row.seen, False, HELD_BACK, mm, deg, count, px
+        )
+    return found
+
+
+def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> list[dict[str, Any]]:
+    """How far what is held back is off by a robot's nominal arm with its own fit, and by ours."""
+    arm, held = solved.arms[robot], held_back(solved, looked)
+    if held is None or arm.kinematics is None:
+        return []
+    stated = arm.without_errors(held.problem)
+    stated = arm.stated(stated) or stated
+    was, now = (
+        np.stack(apart(problem, state)[::-1], axis=1)
+        for problem, state in (
+            (stated, arm.kinematics.fits[0].fit.state),
+            (held.problem, solved.agreed.fit.state),
+        )
+    )
+    views = [it.view for it in held.rows]
+    return list(unseen_rows(views, was, now, np.isfinite(now[:, 0])))
+
+
+def _problem(solved: Solved, looked: Observed, views: Sequence[ViewPoses]) -> Problem:
+    """The problem of a cell's rows, with the unknowns of the fit."""
+    fitted = solved.agreed.problem
+    problem = replace(problem_of(solved.cell, views), tree=fitted.tree, poses=fitted.poses)
+    seen, none = problem.observations, np.zeros(len(problem), dtype=bool)
+    for move in solved.agreed.moves:
+        seen = seen.renamed(move.frame, move.twin, seen.stops >= move.stop)
+    late = {it.name: it for it in clock_effects(solved.cell, looked.clocks)}
+    effects = [
+        late.get(it.name)
+        or replace(it, by_sensor=None, concerned=None if it.concerned is None else none)
+        for it in fitted.effects
+    ]
+    return replace(problem, observations=seen, points=fitted.points).with_effects(effects)

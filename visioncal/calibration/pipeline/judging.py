@@ -1,0 +1,328 @@
+"""What a session is judged by: its cameras, robots and targets, and its weakest link."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from visioncal.calibration.pipeline.answer import Answer
+from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
+from visioncal.calibration.pipeline.budget import columns_of_boards, middles_of
+from visioncal.calibration.pipeline.fault_messages import by_way_of, moved_words
+from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.judge import Arm, Findings, Pair, Place, Sensor
+from visioncal.calibration.stages.need import Fitted, picks_of
+from visioncal.calibration.stages.priors import prior_words
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.types import Mask, Mount, Rejection
+from visioncal.estimation.arm import stops_of
+from visioncal.estimation.budget import radius95
+from visioncal.estimation.intervals import freedom_of
+from visioncal.estimation.observability import (
+    Direction,
+    Scene,
+    check_determined,
+    check_observability,
+    directions,
+    edge_directions,
+)
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.tree import Tree
+from visioncal.results import HELD_BACK, Edge, Sight
+from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
+
+
+def findings_of(known: Known) -> Findings:
+    """Puts together what a session is judged by."""
+    answer, solved = known.solved, known.fitted
+    tree = solved.cell.tree
+    tied = [it for it in answer.sights if {it.seer, it.seen} <= tree.branches.keys()]
+    explained = {solved.cell.rows[row].view for it in answer.faults for row in it.rows}
+    worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
+    of_rest = [
+        *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
+        *solved.found_of_looks(),
+    ]
+    return Findings(
+        _pairs(tied, explained, alone=known.mount is not None),
+        _sensors(tied, answer.sigmas, known.spared.keys() | known.held_back),
+        _arms(answer),
+        worst,
+        places,
+        (
+            *(it.words for it in answer.faults),
+            *doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked),
+            *known.warnings,
+            *(words for words, is_doubt in of_rest if is_doubt),
+            *warnings,
+            *_untied(known),
+        ),
+        (
+            *known.notes,
+            *_clock_words(known),
+            *notes_on_arms(solved.arms, answer.arms),
+            *(words for words, is_doubt in of_rest if not is_doubt),
+        ),
+        known.mount or _mount(tied),
+        known.session.need,
+        picks_of(_pickable(known), known.session.need),
+    )
+
+
+def _pickable(known: Known) -> Fitted:
+    """What picks are predicted from."""
+    answer, solved = known.solved, known.fitted
+    freedom = [freedom_of(it.tolist()) for it in answer.intervals]
+    return Fitted(
+        answer.problem,
+        answer.state,
+        answer.noise,
+        answer.covariance,
+        answer.held_out,
+        middles_of(solved.cell),
+        dict(zip(answer.problem.robots, freedom, strict=True)),
+        solved.arms,
+        columns_of_boards(solved),
+        answer.problem,
+    )
+
+
+def _untied(known: Known) -> Iterator[str]:
+    for frame in known.fitted.untied:
+        if known.mount is not None and frame.startswith("target"):
+            yield f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
+        else:
+            yield f"{frame} is tied to nothing. {untied_words(known.cell, frame)}"
+
+
+_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[Place], Sequence[str]]
+
+
+def _of_pair(known: Known) -> _Parts:
+    """The worst directions and the place of work of one camera and one robot."""
+    answer, work = known.solved, known.work
+    budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
+    place = Place("Where the views look, a point", budget, work.radius95_mm)
+    mount = known.session.mount
+    return directions(answer.problem, answer.state, answer.covariance, mount), [place], ()
+
+
+def _of_cell(known: Known) -> _Parts:
+    """The worst directions and the frames of a whole cell, and what moved in it."""
+    answer, solved = known.solved, known.fitted
+    edges, budget = answer.last_edges, answer.budget_mm
+    worst = [it for frame, edge in edges.items() for it in _directions(solved.cell, frame, edge)]
+    return (
+        sorted(worst, key=lambda it: (it.is_rotation, -it.sigma)),
+        [
+            Place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
+            for frame, edge in edges.items()
+        ],
+        [moved_words(it) for it in answer.moved],
+    )
+
+
+def _mount(sights: Sequence[Sight]) -> Mount:
+    is_read = all(it.seer.startswith("instrument") for it in sights)
+    return "instrument" if is_read else "eye-to-hand"
+
+
+def _clock_words(known: Known) -> Iterator[str]:
+    """Says what the fit makes of clocks that the motion told."""
+    for pair, clock in known.solved.clocks(known).items():
+        if known.mount is None and clock is not known.clocks[pair].clock:
+            yield (
+                f"{pair.words}: the fit of the whole cell has the camera's clock "
+                f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
+                f"{1e3 * clock.sigma_s:.2g} ms)."
+            )
+
+
+def _pairs(sights: Sequence[Sight], explained: Collection[int], *, alone: bool) -> list[Pair]:
+    """What each camera saw of each target; of one camera and one robot, all that there is."""
+    rows: dict[tuple[str, str], list[Sight]] = {}
+    for it in sights:
+        rows.setdefault(("", "") if alone else (it.seer, it.seen), []).append(it)
+    return [
+        Pair(
+            view_results(mine),
+            rms_of(mine),
+            left_out_rms(mine),
+            holdout_rms(mine),
+            disagreeing=[
+                Rejection(it.view, it.reason)
+                for it in mine
+                if _disagrees(it) and it.view not in explained
+            ],
+            name=f"{seer} of {seen}" if len(rows) > 1 else "",
+        )
+        for (seer, seen), mine in rows.items()
+    ]
+
+
+def _disagrees(sight: Sight) -> bool:
+    """Whether an observation was left out although its chain could be closed."""
+    return not sight.used and sight.residual_mm is not None and sight.reason != HELD_BACK
+
+
+def _sensors(
+    sights: Sequence[Sight], noise: Mapping[str, Mapping[str, float]], spared: Collection[int]
+) -> list[Sensor]:
+    seers = dict.fromkeys(it.seer for it in sights)
+    found = []
+    for seer in seers:
+        mine = [it for it in sights if it.seer == seer]
+        lost = [
+            Rejection(it.view, it.reason) for it in mine if not it.used and it.view not in spared
+        ]
+        levels = noise.get(seer, {})
+        found.append(
+            Sensor(
+                sum(it.used for it in mine),
+                lost,
+                [it.view for it in mine if _disagrees(it)],
+                levels.get("pixel_px"),
+                levels.get("level", 1.0),
+                seer if len(seers) > 1 else "",
+            )
+        )
+    return found
+
+
+def _arms(answer: Answer) -> list[Arm]:
+    problem, solved = answer.problem, answer.solved
+    modelled = {name or "robot" for name in solved.cell.session.robot_documents}
+    found = []
+    for robot in problem.robots:
+        noise, telling = answer.sigmas[robot], answer.arms[robot].telling
+        known = not problem.is_combined
+        found.append(
+            Arm(
+                len(stops_of(problem, robot)),
+                noise["translation_mm"] if known else None,
+                noise["rotation_deg"] if known else None,
+                errs=solved.arms[robot].errors is not None,
+                workspace_mm=None if telling is None else 1e3 * float(np.median(telling.sigmas_m)),
+                modelled=robot in modelled,
+                name=robot if len(problem.robots) > 1 else "",
+            )
+        )
+    return found
+
+
+def check_answer(known: Known) -> None:
+    """Refuses motion that does not determine a frame well enough for anybody.
+
+    Raises:
+        DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
+            over the limit.
+    """
+    agreed, cell = known.fitted.agreed, known.fitted.cell
+    part, fit = known.fitted.part, agreed.fit
+    looks = known.fitted.seen is not None and any(it.estimated for it in known.scenes.values())
+    if known.mount is not None:
+        check_observability(part, fit.state, fit.noise, known.mount, looks=looks)
+        return
+    names = {it: _names(part.tree, it) for it in part.unknown}
+    lost = agreed.problem.subset(~agreed.used)
+
+    def motion(frame: str) -> str:
+        if not _of_frame(part, frame).any() and (count := int(_of_frame(lost, frame).sum())):
+            return f"all {count} observations of it disagree with the rest of the cell"
+        return _motion(cell, part, frame)
+
+    def advice(frame: str, _: str) -> str:
+        if _of_frame(part, frame).any() or not len(lost):
+            return _more(cell, frame)
+        return (
+            "Look whether the board that ties it has the stated size, and whether images and poses "
+            "belong together."
+        )
+
+    scene = Scene("align", names, motion, advice)
+    check_determined(part, fit.state, fit.noise, scene, looks=looks)
+
+
+def _names(tree: Tree, frame: str) -> tuple[str, str]:
+    """A frame's name in words, and that of the frame that it hangs on."""
+    parent = tree.branches[frame].parent
+    return frame.partition("@")[0], "the cell" if parent == tree.root else parent
+
+
+def _of_frame(problem: Problem, frame: str) -> Mask:
+    """(n,) the observations on whose way an edge is."""
+    rows = np.zeros(len(problem), dtype=bool)
+    for group in problem.groups:
+        rows[group.rows] = any(step.frame == frame for step in group.path)
+    return rows
+
+
+def _motion(cell: Cell, part: Problem, frame: str) -> str:
+    """Says how the robots stood by way of which a frame was observed."""
+    rows, told = _of_frame(part, frame), []
+    for branch in part.tree.branches.values():
+        if branch.robot:
+            stops = np.unique(part.observations.stops[rows & by_way_of(part, branch.robot)])
+            told += [robot_motion(cell, branch.parent, stops)] if len(stops) > 1 else []
+    return "; ".join(told) or f"{int(rows.sum())} observations are too few or too poor"
+
+
+def worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
+    """The direction of a frame that is known worst, in the axes of the frame that it hangs on."""
+    found = _directions(cell, frame, edge)
+    return max(found, key=lambda it: it.sigma / it.limit)
+
+
+def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
+    """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
+    found = edge_directions(edge.matrix, edge.covariance, *_names(cell.tree, frame))
+    return [it for it in found if edge.oriented or not it.is_rotation]
+
+
+def _more(cell: Cell, frame: str) -> str:
+    """What would determine a frame better."""
+    frame = frame.partition("@")[0]
+    rows = [it for it in cell.rows if frame in (it.seer, it.seen)]
+    others = sorted({it.seen if it.seer == frame else it.seer for it in rows})
+    if not others:
+        return "Add stops at which its robot turns about two axes or more."
+    if frame.startswith("target") and len(others) == 1 and frame not in _carried(cell):
+        return (
+            f"Let another camera than {others[0]} see {frame}, too, or measure its squares and "
+            "state square_sigma_m."
+        )
+    return (
+        f"Add stops with {some_of(others)} and {frame}, turned by 30 degrees or more about two "
+        "axes."
+    )
+
+
+def _carried(cell: Cell) -> set[str]:
+    """The frames that robots carry."""
+    return {it for it in cell.tree.branches if cell.tree.body(it) != cell.tree.root}
+
+
+def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
+    """Names the link of the cell that is known worst, and what it rests on."""
+    if not edges:
+        return ""
+    name, edge = max(edges.items(), key=lambda it: it[1].sigma_mm)
+    worst = worst_direction(cell, name, edge)
+    return (
+        f"The weakest link is {name}: sigma {figure(edge.sigma_mm)} mm and "
+        f"{figure(edge.sigma_deg)} deg, most of it in {worst.words}. {_resting(cell, name)}"
+    )
+
+
+def _resting(cell: Cell, frame: str) -> str:
+    rows = [it for it in cell.rows if frame in cell.tree.above(it.seer)]
+    rows += [it for it in cell.rows if frame in cell.tree.above(it.seen)]
+    pairs: dict[str, int] = {}
+    for it in rows:
+        key = f"{it.seer} of {it.seen}"
+        pairs[key] = pairs.get(key, 0) + 1
+    least = sorted(pairs.items(), key=lambda it: it[1])
+    return f"It rests on {some_of([f'{count} views by {key}' for key, count in least], 4)}."

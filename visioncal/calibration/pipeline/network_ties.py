@@ -1,0 +1,142 @@
+"""What ties the frames of a cell together, and in words what would where nothing does."""
+
+from collections.abc import Collection, Iterator, Sequence
+
+import numpy as np
+
+from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.core.errors import DegenerateError
+from visioncal.core.files import some_of
+from visioncal.core.transforms import invert
+from visioncal.core.types import IntArray
+from visioncal.estimation.observability import motion_words, open_offset
+
+
+def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
+    """Refuses a cell in which a robot is tied to nothing.
+
+    Args:
+        cell: The cell.
+        lost: The frames that are tied to nothing.
+        seen: Whether there are observations that would tie them, were they enough.
+
+    Raises:
+        DegenerateError: A robot's base is among the frames that are lost.
+    """
+    branches = cell.tree.branches
+    # Where no row is left, the robot whose base stands for the cell is tied to nothing, too.
+    none_left = seen and all(it.seer in lost or it.seen in lost for it in cell.rows)
+    flanges = [
+        it for it in branches if branches[it].robot and (branches[it].parent in lost or none_left)
+    ]
+    if not flanges:
+        return
+    bases = [branches[it].parent for it in flanges]
+    untied = [it for it in bases if it in lost] or [it for it in lost if not branches[it].robot]
+    words = [untied_words(cell, it) for it in bases]
+    robots = "this robot" if len(bases) == 1 else "these robots"
+    why = f"no observation links {robots} to the rest of the cell"
+    parts = []
+    if seen:
+        told = [robot_motion(cell, it, _stations(cell, it)) for it in bases]
+        why = (
+            f"the observations that link {robots} to the rest of the cell are too few, too much "
+            f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(told)}"
+        )
+        parts = [part for it in bases if it in lost and (part := _open_part(cell, it))]
+        if parts:
+            why += f", which does not determine {' and '.join(parts)}"
+            words = [
+                f"Add 3 or more stops in which {it} is tilted by 20 to 40 degrees about different "
+                "axes, not only about one."
+                for it in flanges
+            ]
+    raise DegenerateError(
+        f"align: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
+        culprits=parts or untied,
+        next_step=" ".join(words),
+    )
+
+
+def _open_part(cell: Cell, base: str) -> str:
+    """What the motion of the robot on a base leaves open, where it turns about one axis alone."""
+    stations = _stations(cell, base)
+    if len(stations) < 2:
+        return ""
+    return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
+
+
+def _robot_on(cell: Cell, base: str) -> str:
+    branches = cell.tree.branches.values()
+    return next(it.robot for it in branches if it.robot and it.parent == base)
+
+
+def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
+    """Says how a robot stood at some stations, and what of it determines little."""
+    robot = _robot_on(cell, base)
+    poses, who = cell.poses[robot][stations], f"robot {robot}"
+    if robot == robot_key(""):
+        who = "the robot"
+    if len(stations) < 2:
+        return f"{who} was observed at {len(stations)} stop{'s' * (len(stations) != 1)}"
+    return motion_words(invert(poses), poses, f"{len(stations)} stops of {who}", base)
+
+
+def _stations(cell: Cell, base: str) -> IntArray:
+    """The stations at which something was observed by way of the robot on a base."""
+    found = {
+        row.station
+        for row in cell.rows
+        for step in cell.tree.path(row.seer, row.seen)
+        if step.robot and cell.tree.branches[step.frame].parent == base
+    }
+    return np.array(sorted(found), dtype=np.int64)
+
+
+def untied_words(cell: Cell, frame: str) -> str:
+    """What would tie a frame to the rest, in a sentence."""
+    carried = [*_carried(cell, frame)]
+    cameras = [it for it in carried if it.startswith("cam")]
+    boards = [it for it in carried if it.startswith("target")]
+    others = [it for it in cell.tied() if it not in carried]
+    seeing = [it for it in others if it.startswith("cam")]
+    lying = [it for it in others if it.startswith("target")]
+    ways = []
+    if boards and seeing:
+        ways.append(f"let {some_of(seeing)} see {some_of(boards)} at 5 stops or more")
+    if cameras and lying:
+        ways.append(f"let {some_of(cameras)} see {some_of(lying)} at 5 stops or more")
+    flange = next(
+        (it for it, up in cell.tree.branches.items() if up.parent == frame and up.robot), ""
+    )
+    if not ways and flange and seeing:
+        ways.append(f"put a board on {flange} and let {some_of(seeing)} see it at 5 stops or more")
+    if not ways and flange and lying:
+        ways.append(f"put a camera on {flange} that sees {some_of(lying)} at 5 stops or more")
+    if frame.startswith(("instrument", "point")):
+        ways = [
+            "let an instrument read points on a robot's flange at 5 stops or more, or three points "
+            "that an instrument reads which is tied"
+        ]
+    if not ways:
+        ways.append("let a camera that is tied see a board that hangs on it")
+    return f"To tie {frame}: {', or '.join(ways)}."
+
+
+def _carried(cell: Cell, frame: str) -> Iterator[str]:
+    """A frame and all that hangs on it."""
+    for name in cell.tree.branches:
+        if frame in cell.tree.above(name):
+            yield name
+
+
+def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
+    """Words that frames are tied by boards alone that look the same when turned."""
+    boards = sorted({it.seen for it in cell.rows if it.seer in frames or it.seen in frames})
+    return DegenerateError(
+        f"align: {some_of(frames)} may be in two places: {some_of(boards)} looks the same after "
+        "half a turn, and no other observation tells which way round it was seen.",
+        culprits=list(frames),
+        next_step=f"Let {some_of(frames)} see a second board as well, or use a ChArUco board or a "
+        "checkerboard with an odd and an even number of corners.",
+    )

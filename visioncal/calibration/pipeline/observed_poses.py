@@ -1,0 +1,158 @@
+"""A session of one camera and one robot, seen with a lens, boards and an arm that are known."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.refine import remade
+from visioncal.core.types import Corners, FloatArray, IntArray
+from visioncal.estimation.appearance import Free
+from visioncal.estimation.chain import chain, edge_names
+from visioncal.estimation.parts import ROBOT
+from visioncal.estimation.problem import Problem
+from visioncal.session import frame_name
+
+
+@dataclass(frozen=True, eq=False)
+class Looked(Observed):
+    """What was observed, and what it is seen with; nothing of that is estimated here.
+
+    Attributes:
+        boards: Which of the session's boards the chain holds: the one it ends at, and others.
+        frames: (4, 4) where the camera and the boards are, by the frame.
+        used: The views in the problem, in the session's order.
+        free: Lens and board, and what is open about them; None without corners.
+        calibrated: The robot's arm, as far as it was calibrated; None for not at all.
+    """
+
+    boards: tuple[int, ...] = (0,)
+    frames: Mapping[str, FloatArray] = field(default_factory=dict)
+    used: tuple[int, ...] = ()
+    free: Free | None = None
+    calibrated: RobotArm | None = None
+
+    @classmethod
+    def of(cls, seen: Observed) -> Self:
+        """What was observed, not seen with anything yet."""
+        return cls(**{it.name: getattr(seen, it.name) for it in fields(Observed)})
+
+    def posed(self, poses: Iterable[ViewPoses]) -> Self:
+        """Takes over poses, made anew by lens and board where their view has just one."""
+        given = {it.view: it for it in poses}
+        if self.free is not None and self.pixel_px is not None:
+            single = [
+                it
+                for it in given.values()
+                if it.corners is not None and len(it.cam_from_target) == 1
+            ]
+            given |= {it.view: it for it in remade(single, self.free, self.pixel_px)}
+        return replace(self, poses={**self.poses, **given})
+
+    @cached_property
+    def robot_arm(self) -> RobotArm:
+        """The robot's arm; its stops are all views with a pose, in their order."""
+        if self.calibrated is not None:
+            return self.calibrated
+        rows = {it.number: it for it in self.session.views}
+        return RobotArm.of(
+            ROBOT,
+            np.array([*self.base_from_flange.values()]).reshape(-1, 4, 4),
+            [rows[it] for it in self.base_from_flange],
+            self.reported.matched,
+            (self.session, next(iter(self.robots), "")),
+        )
+
+    def arm_at(self, views: Sequence[int]) -> RobotArm:
+        """The robot's arm at some views."""
+        return self.robot_arm.at(np.array([self._places[it] for it in views], dtype=np.int64))
+
+    @property
+    def arm_at_stops(self) -> RobotArm:
+        """The robot's arm at the stops of the used views, by the first view of each."""
+        return self.arm_at(self.first_of_stops(self.used))
+
+    @cached_property
+    def _places(self) -> Mapping[int, int]:
+        return {view: at for at, view in enumerate(self.base_from_flange)}
+
+    def problem(self, views: Sequence[int]) -> Problem:
+        """What some views measured, each with its first or chosen pose."""
+        poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
+        covariance, effects = None, []
+        from_corners = all(it.corners is not None for it in poses)
+        if self.free is not None:
+            # Poses that others have measured do not move with lens and board.
+            shift = np.zeros((len(poses), 6, len(self.free.columns)))
+            if from_corners:
+                shift = np.array([it.by_shared[0] for it in poses]).reshape(shift.shape)
+            effects = [self.free.effect(shift)]
+        if from_corners:
+            covariance = np.array([it.covariance[0] for it in poses]).reshape(-1, 6, 6)
+        effects += self.arm_at(first).effects()
+        return chain(
+            self.session.mount,
+            self.arm_at(first).poses,
+            np.array([it.cam_from_target[0] for it in poses]).reshape(-1, 4, 4),
+            covariance,
+            stops=self.stops_of(views),
+            targets=self.targets(views),
+            order=[self.frame_of(it) for it in self.boards],
+            # What is shared counts from where it is.
+            effects=[replace(it, values=np.zeros(len(it))) for it in effects],
+        )
+
+    def targets(self, views: Sequence[int]) -> tuple[str, ...]:
+        """(m,) the frame of the target that each view shows."""
+        return tuple(self.frame_of(self.poses[view].board) for view in views)
+
+    def frame_of(self, board: int) -> str:
+        """The frame of one of the session's boards."""
+        if len(self.session.boards) < 2:
+            return edge_names(self.session.mount)[1].partition("_from_")[2]
+        return frame_name("target", tuple(self.session.boards)[board])
+
+    def framed(self, edges: FloatArray) -> dict[str, FloatArray]:
+        """Where frames are, by (1 + b, 4, 4) edges of the camera and the chain's boards."""
+        frames = (self.camera_frame, *map(self.frame_of, self.boards))
+        return dict(zip(frames, edges, strict=True))
+
+    @property
+    def camera_frame(self) -> str:
+        """The frame of the camera, or of the instrument."""
+        return edge_names(self.session.mount)[0].partition("_from_")[2]
+
+    def first_of_stops(self, views: Sequence[int]) -> list[int]:
+        """(s,) the first view of each stop."""
+        first = np.unique(self.stops_of(views), return_index=True)[1]
+        return [views[it] for it in first.tolist()]
+
+    @property
+    def stops(self) -> IntArray:
+        """(m,) which stop of the robot each used view was taken at; see `stops_of`."""
+        return self.stops_of(self.used)
+
+    def stops_of(self, views: Sequence[int]) -> IntArray:
+        """(m,) which stop of the robot each view was taken at, numbered from 0.
+
+        Views of one stop share the robot's error. Poses that were measured by others are not told
+        apart from the robot's: of several boards, each has stops of its own then.
+        """
+        own = len(self.boards) > 1 and any(self.poses[view].corners is None for view in views)
+        keys: dict[tuple[int, int], int] = {}
+        boards = (self.poses[view].board if own else 0 for view in views)
+        both = zip((self._stations[view] for view in views), boards, strict=True)
+        return np.array([keys.setdefault(it, len(keys)) for it in both], dtype=np.int64)
+
+    @cached_property
+    def _stations(self) -> Mapping[int, int]:
+        return {it.view.number: it.station for it in self.timed.observations}
+
+    def seen(self, views: Sequence[int]) -> list[Corners | None]:
+        """The corners of some views that their poses were made from."""
+        return [self.poses[view].corners for view in views]

@@ -1,0 +1,128 @@
+"""What is known of a session so far; every step of the way adds to it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from visioncal.calibration.pipeline.answer import Answer
+from visioncal.calibration.pipeline.budget import Work, work_of
+from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.stages.arms import ArmFound, RobotArm
+from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.judge import Findings
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.offset import Clock
+from visioncal.calibration.stages.readings import Readings
+from visioncal.core.types import Corners, Mount, SolverName
+from visioncal.results import Verdict
+from visioncal.robot import Convention, Loads
+from visioncal.session.loads import loads_of
+from visioncal.session.single import is_whole_cell
+
+
+@dataclass(frozen=True, eq=False)
+class Known(Observed):
+    """Everything that is known of a session at some point of the way.
+
+    Attributes:
+        solver: The solver asked for, where there are one robot and one camera.
+        level: How far to go: a key of `stages.kinematics.ASKED`.
+        convention: Of the joint table in which arms are told; None for the stated one.
+        found_before: The corners in the images by view, where they were found before.
+        readings: What an instrument read, where that is all that was observed.
+        read: The cell as the session tells it.
+        fit: Its fit.
+        answer: The fit with its covariance, and what speaks against it.
+        findings: What the verdict is made of.
+        verdict: Whether to trust it all.
+    """
+
+    solver: SolverName = "joint"
+    level: str = "auto"
+    convention: Convention | None = None
+    found_before: Mapping[int, Corners] | None = None
+    readings: Readings | None = None
+    read: Cell | None = None
+    fit: Solved | None = None
+    answer: Answer | None = None
+    findings: Findings | None = None
+    verdict: Verdict | None = None
+
+    @property
+    def mount(self) -> Mount | None:
+        """Where the camera of one camera and one robot is; None of a whole cell."""
+        return None if is_whole_cell(self.session) else self.session.mount
+
+    def loads(self, views: Sequence[int]) -> Loads:
+        """What the flange carried at some views, and from which side the joints came."""
+        rows = {view.number: view for view in self.session.views}
+        return loads_of(
+            [rows[view].numbers for view in views],
+            [rows[view].text.get("approach", "") for view in views],
+        )
+
+    @property
+    def cell(self) -> Cell:
+        """The cell as the session tells it.
+
+        Raises:
+            RuntimeError: A step asks for it before it was read: the order is wrong.
+        """
+        if self.read is None:
+            raise RuntimeError("a step that needs the cell comes before it is read")
+        return self.read
+
+    @property
+    def fitted(self) -> Solved:
+        """The fit.
+
+        Raises:
+            RuntimeError: A step asks for it before it was made: the order is wrong.
+        """
+        if self.fit is None:
+            raise RuntimeError("a step that needs the fit comes before it")
+        return self.fit
+
+    @property
+    def solved(self) -> Answer:
+        """The answer.
+
+        Raises:
+            RuntimeError: A step asks for it before it was made: the order is wrong.
+        """
+        if self.answer is None:
+            raise RuntimeError("a step that needs the answer comes before it")
+        return self.answer
+
+    @cached_property
+    def work(self) -> Work:
+        """How well one camera and one robot place what they look at."""
+        return work_of(self.fitted, self.solved.beside, self.solved.covariance)
+
+    @property
+    def robot_arm(self) -> RobotArm:
+        """The only robot's arm, as far as it is calibrated."""
+        return next(iter(self.fitted.arms.values()))
+
+    @property
+    def clock(self) -> Clock | None:
+        """How the clocks of the only pair go together, by the motion that both have seen."""
+        return next((it.clock for it in self.clocks.values()), None)
+
+    @property
+    def pixel_px(self) -> float | None:
+        """Noise of a coordinate of the only camera's corners, as the fit has it [px]."""
+        if self.fit is not None and self.fit.seen is not None:
+            return self.fit.seen.sigmas_px[0]
+        return super().pixel_px
+
+    @property
+    def arm_found(self) -> ArmFound:
+        """What the stops tell of the only robot's arm."""
+        return next(iter(self.solved.arms.values()))
+
+    @property
+    def used(self) -> tuple[int, ...]:
+        """The views in the fit, in the session's order."""
+        rows, used = self.fitted.cell.rows, self.fitted.agreed.used.tolist()
+        return tuple(row.view for row, mine in zip(rows, used, strict=True) if mine)

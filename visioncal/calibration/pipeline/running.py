@@ -1,0 +1,153 @@
+"""Taking a session of any cell, of one camera and one robot or of many, through all steps."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from visioncal.calibration.pipeline.guess_inputs import is_suspect, reading_hint
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.view_evidence import view_evidence
+from visioncal.calibration.stages.causes import with_misread
+from visioncal.calibration.stages.dense import Dense
+from visioncal.calibration.stages.handeye import SOLVER_NAMES
+from visioncal.calibration.stages.kinematics import check_level
+from visioncal.calibration.stages.next_views_hint import with_proposal
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Progress, SolverName
+from visioncal.results import Calibration
+from visioncal.results.evidence import ViewEvidence
+from visioncal.robot import CONVENTIONS, Convention
+from visioncal.session import Session
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A calibration with what was seen and computed on the way to it.
+
+    Attributes:
+        calibration: The result.
+        evidence: One entry for each view of the session.
+        dense: What all pixels have of the images, where they were asked for.
+        left_out: By view, how far it is predicted off by a fit without it [m], [px].
+    """
+
+    calibration: Calibration
+    evidence: tuple[ViewEvidence, ...]
+    dense: Dense | None = None
+    left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+
+
+def run(
+    session: Session | Path | str,
+    *,
+    solver: SolverName = "joint",
+    level: str = "auto",
+    convention: Convention | None = None,
+    progress: Progress | None = None,
+    dense: Dense | None = None,
+) -> Run:
+    """Calibrates a session and keeps the evidence; see `calibrate`."""
+    first = known_at_first(session, progress, solver=solver, level=level, convention=convention)
+    known = run_steps(replace(first, dense=dense))
+    held = known.solved.held_out
+    pairs = zip(held.away_m.tolist(), held.rms_px.tolist(), strict=True)
+    left_out = dict(zip(known.used, pairs, strict=True))
+    return Run(result_of(known), view_evidence(known), known.dense, left_out)
+
+
+def known_at_first(
+    session: Session | Path | str,
+    progress: Progress | None,
+    *,
+    solver: SolverName = "joint",
+    level: str,
+    convention: Convention | None,
+) -> Known:
+    """What is known at the start, checked."""
+    if solver not in SOLVER_NAMES:
+        raise DataError(f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.")
+    check_level(level)
+    if convention is not None and convention not in CONVENTIONS:
+        raise DataError(f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}.")
+    loaded = session if isinstance(session, Session) else Session.load(session)
+    known = Known(loaded, progress, solver=solver, level=level, convention=convention)
+    check_solver(known)
+    return known
+
+
+def check_solver(known: Known) -> None:
+    """Refuses a closed form for a whole cell.
+
+    Raises:
+        DataError: It is asked for.
+    """
+    if known.mount is None and known.solver != "joint":
+        raise DataError(
+            f"solver {known.solver} cannot be asked of a whole cell: it has the joint solver.",
+            culprits=["--solver"],
+            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
+        )
+
+
+def check_dense(known: Known) -> None:
+    """Refuses dense corners for a whole cell.
+
+    Raises:
+        DataError: It is one.
+    """
+    if known.mount is None:
+        raise DataError(
+            "dense corners cannot be asked of a whole cell.",
+            culprits=["--dense"],
+            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
+        )
+
+
+def run_steps(known: Known) -> Known:
+    """Takes a session through all steps."""
+    progress = known.progress
+    seen: Known | None = None
+    with one_blas_thread():
+        for at, stage in enumerate(STAGES):
+            if progress is not None:
+                progress(stage.name, at, len(STAGES))
+            try:
+                known = stage.run(known)
+            except VisioncalError as error:
+                if known.mount is None:
+                    raise
+                # Views that are out of the game are often why the rest does not suffice.
+                more = [it for it in known.lost_views if it not in error.culprits]
+                raise _with_hint(error.with_culprits(more), seen) from error
+            # Joints that are misread explain themselves, and would mislead a guess about poses.
+            if stage.name == "joints" and known.mount is not None:
+                seen = known
+        return _with_reading(known, seen)
+
+
+def _with_hint(error: VisioncalError, seen: Known | None) -> VisioncalError:
+    """Adds to an error, once the target's poses are known, what leads on.
+
+    That is how the robot's poses should be read, or else what proposes the views that are missing.
+    """
+    if seen is None:
+        return error
+    hint = reading_hint(seen)
+    (planned,) = with_proposal([error.next_step], modelled=seen.robot is not None)
+    next_step = planned if seen.scenes else error.next_step
+    if hint:
+        next_step = f"{hint} {error.next_step}".strip()
+    return type(error)(error.message, culprits=error.culprits, next_step=next_step)
+
+
+def _with_reading(known: Known, seen: Known | None) -> Known:
+    """Adds to a poor verdict how the poses should be read, where that explains it."""
+    if known.verdict is None or seen is None or not is_suspect(known):
+        return known
+    hint = reading_hint(seen)
+    if not hint:
+        return known
+    return replace(known, verdict=with_misread(known.verdict, hint))

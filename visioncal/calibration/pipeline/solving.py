@@ -1,0 +1,507 @@
+"""From what was seen to the fit of the whole cell: start, agreement, lenses and boards."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.arm_results import arms_of, with_drifts, with_errors
+from visioncal.calibration.pipeline.network_ties import ambiguous_error, untied_robots
+from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
+from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.clocks import clock_effects
+from visioncal.calibration.stages.fit_messages import found_of_looks
+from visioncal.calibration.stages.handeye import closed_form_state
+from visioncal.calibration.stages.init_frames import place
+from visioncal.calibration.stages.kinematics import check_asked
+from visioncal.calibration.stages.observed import Observed, nothing_seen
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.priors import most_contradicted
+from visioncal.calibration.stages.refine import refined
+from visioncal.calibration.stages.side import FramesSide
+from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.core.errors import DegenerateError
+from visioncal.core.types import FloatArray, IntArray, Mask, SolverName, Target
+from visioncal.estimation.arm import rows_of
+from visioncal.estimation.effects.lenses import LENSES, Looks, Seen
+from visioncal.estimation.joint import Fitted
+from visioncal.estimation.joint import settle as settle_looks
+from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
+from visioncal.estimation.outliers import Agreed, agree, settle
+from visioncal.estimation.parts import Effect, Observations, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import (
+    Solution,
+    covariance_of,
+    estimate_noise,
+    fit_problem,
+    starting_noise,
+)
+
+# Arms are linearised anew so often, or until their errors move by less, which is far below any
+# arm's repeatability.
+_ROUNDS, _AT_REST_RAD = 4, 1e-7
+# Covariance of a pose that was given without one, but for its level [rad^2, m^2].
+_NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The fit of a whole cell.
+
+    Attributes:
+        cell: The cell; its rows are the observations in the fit's order.
+        agreed: The fit, what it uses, and what moved.
+        seen: What all corners say of lenses and boards; None without images.
+        poses: Each row's one pose.
+        untied: Frames that nothing ties to the rest.
+        arms: The robots' arms, as far as they were calibrated.
+        asked: How far that was to be.
+        late: The errors of clocks, as effects.
+        solver: By which solver the edges are.
+    """
+
+    cell: Cell
+    agreed: Agreed
+    seen: Seen | None
+    poses: tuple[ViewPoses, ...]
+    untied: tuple[str, ...]
+    arms: Mapping[str, RobotArm]
+    asked: str
+    late: tuple[Effect, ...]
+    solver: str = "joint"
+
+    @property
+    def part(self) -> Problem:
+        """The observations that the fit was made from."""
+        return self.agreed.problem.subset(self.agreed.used)
+
+    def found_of_looks(self) -> Iterator[tuple[str, bool]]:
+        """Says what was found of lenses and boards; see `stages.found`."""
+        if self.seen is not None:
+            part = self.agreed.problem.subset(self.agreed.used)
+            side = _side(self.cell, self.agreed, self.arms, self.late)
+            yield from found_of_looks(side, Fitted(self.seen, part, self.agreed.fit))
+
+    @property
+    def looks(self) -> Looks | None:
+        """Lenses and boards as they were found; None without images."""
+        return self.looks_at(self.agreed.fit.state)
+
+    def looks_at(self, state: State) -> Looks | None:
+        """Lenses and boards as some state has them; None without images."""
+        if self.seen is None:
+            return None
+        found = self.agreed.problem.values_of(LENSES, state)
+        return self.seen.looks.with_values(self.seen.free, found)
+
+    def chain_px(self, rows: IntArray, state: State) -> FloatArray:
+        """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
+
+        Args:
+            rows: (m,) the observations.
+            state: The unknowns of the fit, or those of another one to a part of them.
+        """
+        looks, chosen = self.looks_at(state), np.isin(np.arange(len(self.cell.rows)), rows)
+        if looks is None:
+            return np.full(len(rows), np.nan)
+        poses = self.agreed.problem.subset(chosen).predicted(state)
+        lenses = {it: looks.camera(it) for it in looks.problems}
+        seen = [self.poses[it].corners for it in rows]
+        cameras = [lenses.get(self.cell.rows[it].seer) for it in rows]
+        return chain_rms_px(seen, poses, cameras, np.concatenate(looks.corners))
+
+    def columns_of(self, places: IntArray) -> IntArray:
+        """The problem's columns of free values of lenses and boards, by their places."""
+        first = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0)).start
+        free = np.zeros(0) if self.seen is None else self.seen.free
+        return np.asarray(first + np.searchsorted(free, places))
+
+
+def solve(
+    cell: Cell, looked: Observed, asked: str = "auto", solver: SolverName = "joint"
+) -> Solved:
+    """Solves a cell, of one robot and one camera or of many.
+
+    Args:
+        cell: The cell.
+        looked: What was observed in it.
+        asked: How far the robots' arms are to be calibrated; see `stages.kinematics.check_level`.
+        solver: `joint`, or the closed form that the edges of one robot and one camera are to be by.
+
+    Raises:
+        DataError: A level is asked for, and no arm has what it takes.
+        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+    """
+    missing = {
+        it.view: looked.reasons.get(it.view, "nothing was found in its image")
+        for it in cell.rows
+        if it.view not in looked.poses
+    }
+    cell = cell.without(missing)
+    if not cell.rows:
+        raise nothing_seen(looked)
+    arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
+    check_arms(arms, asked)
+    if cell.mount is not None:
+        can = solver == "joint" and all(it.is_modelled for it in arms.values())
+        check_asked(asked, can=can)
+    if solver != "joint":
+        cell, asked = replace(cell, priors=()), "hand-eye"
+    cell, lost = _tied_part(cell)
+    views = [looked.poses[it.view] for it in cell.rows]
+    cell, views, problem, state, unplaced = _started(cell, views)
+    agreed = agree(problem, state, _movable(cell, problem))
+    late = clock_effects(cell, looked.clocks)
+    agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
+    arms = with_drifts(arms, agreed.problem.subset(agreed.used), agreed.fit, asked)
+    if any(it.drift is not None for it in arms.values()):
+        agreed, seen, arms = _agreeing_looks(cell, looked, views, agreed, arms, late)
+    agreed = _levelled(cell, views, agreed)
+    for _ in range(_ROUNDS):
+        if asked != "hand-eye":
+            arms = _levels(cell, agreed, arms, asked)
+            erring = [name for name, it in arms.items() if it.frees_errors()]
+            late = clock_effects(cell, looked.clocks, erring)
+            agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
+        before = agreed.used
+        agreed = _without_contradicted(cell, settle(agreed, _movable(cell, agreed.problem)))
+        agreed = _without_misreported(agreed, arms, before)
+        agreed, seen, arms = _at_rest(cell, agreed, seen, arms, late)
+        # What agrees by now has a say in how far the arms are calibrated.
+        if np.array_equal(before, agreed.used):
+            break
+    agreed = _with_repeats(agreed)
+    found = Solved(cell, agreed, seen, tuple(views), (*lost, *unplaced), arms, asked, late)
+    return found if solver == "joint" else _by_closed_form(found, solver)
+
+
+def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:
+    """Leaves out what agrees with an arm's joints alone, where its reported pose is another.
+
+    A wrong report says nothing against joints and cameras, but would mislead the next fit.
+    """
+    problem, used = agreed.problem, agreed.used.copy()
+    stops = problem.observations.stops
+    for robot, arm in arms.items():
+        mine = rows_of(problem, robot)
+        sound = np.isin(np.arange(len(arm.stood)), stops[mine & before])
+        used &= before | ~mine | arm.reported_alike(sound)[stops]
+    if np.array_equal(used, agreed.used):
+        return agreed
+    fit = fit_problem(problem.subset(used), agreed.fit.state, agreed.fit.noise)
+    return replace(agreed, used=used, fit=fit)
+
+
+def _by_closed_form(solved: Solved, solver: str) -> Solved:
+    """The fit with the edges of a closed form, and the noise that these leave."""
+    agreed = solved.agreed
+    part = agreed.problem.subset(agreed.used)
+    mount = solved.cell.mount
+    if mount is None:
+        raise RuntimeError("closed forms are for one robot and one camera")
+    state = closed_form_state(part, solver, agreed.fit.state, mount)
+    noise = estimate_noise(part, state, starting_noise(part), from_above=True)
+    return replace(solved, agreed=replace(agreed, fit=Solution(state, noise)), solver=solver)
+
+
+def _agreeing_looks(
+    cell: Cell,
+    looked: Observed,
+    views: Sequence[ViewPoses],
+    agreed: Agreed,
+    arms: Mapping[str, RobotArm],
+    late: Sequence[Effect],
+) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+    """Fits lenses, boards and frames, until the same observations agree under them.
+
+    In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
+    when the arms are calibrated.
+    """
+    for _ in range(_ROUNDS):
+        agreed, seen, fitted = _with_looks(cell, looked, views, agreed, arms, late)
+        if cell.mount is None:
+            break
+        before, agreed = agreed.used, settle(agreed)
+        if np.array_equal(before, agreed.used):
+            break
+    return agreed, seen, fitted
+
+
+def _with_looks(
+    cell: Cell,
+    looked: Observed,
+    views: Sequence[ViewPoses],
+    agreed: Agreed,
+    arms: Mapping[str, RobotArm],
+    late: Sequence[Effect],
+) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+    """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
+    arms = {name: it.erring(None) for name, it in arms.items()}
+    poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
+    agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
+    if looked.scenes and not agreed.problem.is_combined:
+        side = _side(cell, agreed, arms, late)
+        looks = side.looks(looked.scenes, _views_by_camera(looked, views))
+        fitted, side = refined(side, looks, _frames(agreed))
+        return _settled(agreed, side, fitted), fitted.seen, side.arms
+    drifts = tuple(effects_of(arms))
+    agreed = _with_effects(agreed, drifts) if drifts else agreed
+    arms = with_errors(arms, agreed.problem.subset(agreed.used), agreed.fit)
+    others = (*late, *effects_of(arms))
+    return _with_effects(agreed, others) if others else agreed, None, arms
+
+
+def _levels(
+    cell: Cell, agreed: Agreed, arms: Mapping[str, RobotArm], asked: str
+) -> dict[str, RobotArm]:
+    """Chooses how far each arm is calibrated, beside the errors of the others."""
+    problem, chosen = agreed.problem.subset(agreed.used), dict(arms)
+    views = [cell.rows[it].view for it in np.flatnonzero(agreed.used)]
+    for name, arm in arms.items():
+        stated = arm.without_errors(problem)
+        start = State(agreed.fit.state.edges, stated.start_values)
+        chosen[name] = arm.with_level(stated, start, asked, views, agreed.fit.noise)
+        problem = chosen[name].put_into(problem)
+    return chosen
+
+
+def _at_rest(
+    cell: Cell,
+    agreed: Agreed,
+    seen: Seen | None,
+    arms: Mapping[str, RobotArm],
+    late: Sequence[Effect],
+) -> tuple[Agreed, Seen | None, Mapping[str, RobotArm]]:
+    """Fits with calibrated arms that are linearised anew until they stay."""
+    for _ in range(_ROUNDS if any(it.model is not None for it in arms.values()) else 0):
+        poses = {**agreed.problem.poses, **{name: it.poses for name, it in arms.items()}}
+        agreed = replace(agreed, problem=replace(agreed.problem, poses=poses))
+        if seen is None:
+            agreed = _with_effects(agreed, (*late, *effects_of(arms)))
+        else:
+            side = _side(cell, agreed, arms, late)
+            fitted = settle_looks(seen.looks, side, seen.moving, _frames(agreed))
+            agreed, seen = _settled(agreed, side, fitted), fitted.seen
+        moved = {name: it.moved(agreed.problem, agreed.fit.state) for name, it in arms.items()}
+        arms = {name: arm for name, (arm, _) in moved.items()}
+        if max(step for _, step in moved.values()) < _AT_REST_RAD:
+            break
+    return agreed, seen, arms
+
+
+def _side(
+    cell: Cell, agreed: Agreed, arms: Mapping[str, RobotArm], late: Sequence[Effect]
+) -> FramesSide:
+    views = [it.view for it in cell.rows]
+    return FramesSide(agreed.problem, agreed.used, views, arms, late, agreed.fit.noise)
+
+
+def _frames(agreed: Agreed) -> dict[str, FloatArray]:
+    """Where the unknown frames are."""
+    return dict(zip(agreed.problem.unknown, agreed.fit.state.edges, strict=True))
+
+
+def _settled(agreed: Agreed, side: FramesSide, fitted: Fitted) -> Agreed:
+    return replace(agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
+
+
+def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:
+    """The views of each camera's images that some fit may use, each with its one pose."""
+    known = {**looked.poses, **{it.view: it for it in views}}
+    # Frames of a sweep that are not needed were taken on the move: rows of theirs are not at rest.
+    out = looked.held_back | looked.spared.keys()
+    return {
+        frame: [known[it] for it in look.corners if it in known and it not in out]
+        for frame, look in looked.cameras.items()
+    }
+
+
+def _with_repeats(agreed: Agreed) -> Agreed:
+    """Fits once more, repeated views of still boards by still cameras sharing an error.
+
+    What moved was looked for without it: their differences do not share it.
+    """
+    problem = replace(agreed.problem, with_repeats=True)
+    fit = fit_problem(problem.subset(agreed.used), agreed.fit.state, agreed.fit.noise)
+    return replace(agreed, problem=problem, fit=fit)
+
+
+def _without_contradicted(cell: Cell, agreed: Agreed) -> Agreed:
+    """Leaves out priors that the observations contradict, the worst first: it misleads the rest."""
+    for _ in agreed.problem.priors:
+        part = agreed.problem.subset(agreed.used)
+        worst = most_contradicted(part, agreed.fit.state, covariance_of(part, agreed.fit))
+        if worst is None:
+            break
+        kept = tuple(it for it in agreed.problem.priors if it is not worst)
+        problem = replace(agreed.problem, priors=kept)
+        agreed = settle(replace(agreed, problem=problem), _movable(cell, problem))
+    return agreed
+
+
+def _levelled(cell: Cell, views: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
+    """Asks for the noise level of cameras, too, now that what is wrong is out.
+
+    Corners of one image may err alike, as those of small squares do: poses then scatter by more
+    than corners do about them, but never by less. Where one camera sees one robot once a stop, the
+    robot's noise has taken that up.
+    """
+    is_alone = cell.mount is not None and not agreed.problem.shared_units
+    if is_alone or agreed.problem.is_combined:
+        return agreed
+    sensors = sensors_of(cell, views)
+    frames = tuple(dict.fromkeys((*sensors, *(it.seer for it in cell.rows))))
+    places = {it: at for at, it in enumerate(frames)}
+    problem = agreed.problem
+    observations = replace(
+        problem.observations,
+        sensors=np.array([places[it.seer] for it in cell.rows], dtype=np.int64),
+    )
+    more = np.ones(len(frames) - len(sensors))
+    noise = agreed.fit.noise
+    return replace(
+        agreed,
+        problem=replace(
+            problem,
+            observations=observations,
+            least_levels=np.concatenate([np.zeros(len(sensors)), more]),
+        ),
+        fit=replace(
+            agreed.fit, noise=replace(noise, sensors=np.concatenate([noise.sensors, more]))
+        ),
+    )
+
+
+def _with_effects(agreed: Agreed, effects: Sequence[Effect]) -> Agreed:
+    problem = agreed.problem.with_effects(effects)
+    state = State(agreed.fit.state.edges, problem.start_values)
+    fit = fit_problem(problem.subset(agreed.used), state, agreed.fit.noise)
+    return replace(agreed, problem=problem, fit=fit)
+
+
+def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
+    """What may be bumped or slip: all that is unknown but bases.
+
+    One camera that sees one robot move cannot tell what slipped from a pose that is wrong.
+    """
+    if cell.mount is not None:
+        return ()
+    bases = {branch.parent for branch in problem.tree.branches.values() if branch.robot}
+    return tuple(it for it in problem.tree.unknown if it not in bases)
+
+
+def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
+    """The part of a cell that observations tie together, and the frames outside."""
+    tied = cell.tied()
+    lost = tuple(it for it in cell.tree.branches if it not in tied)
+    untied_robots(cell, lost)
+    return _without_frames(cell, lost), tuple(it for it in lost if not _is_flange(cell, it))
+
+
+def _is_flange(cell: Cell, frame: str) -> bool:
+    return bool(cell.tree.branches[frame].robot)
+
+
+def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
+    tree = cell.tree.without(frames)
+    reasons = {
+        it.view: f"nothing ties {it.seer if it.seer in frames else it.seen} to the rest of the cell"
+        for it in cell.rows
+        if it.seer not in tree.branches or it.seen not in tree.branches
+    }
+    robots = set(tree.robots)
+    poses = {name: it for name, it in cell.poses.items() if name in robots}
+    priors = tuple(
+        it for it in cell.priors if it.first in tree.branches and it.second in tree.branches
+    )
+    return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
+
+
+def _started(
+    cell: Cell, views: Sequence[ViewPoses]
+) -> tuple[Cell, list[ViewPoses], Problem, State, tuple[str, ...]]:
+    """Finds a start, and gives each view its one pose by it."""
+    if cell.mount is not None:
+        refuse_too_few(problem_of(cell, views), cell.mount, len(cell.rows))
+        _refuse_few_of_each(cell)
+    placed = place(problem_of(cell, views), views, targets_of(cell))
+    tied, clear = placed.tied, {it.view: it for it in placed.views}
+    if tied.untied:
+        untied_robots(cell, tied.untied, seen=True)
+        cell = _without_frames(cell, tied.untied)
+    if tied.ambiguous:
+        raise ambiguous_error(cell, tied.ambiguous)
+    cell, lost = _tied_part(cell.without({it.view: it.reason for it in placed.rejections}))
+    views = [clear[it.view] for it in cell.rows]
+    problem = problem_of(cell, views)
+    return cell, views, problem, problem.start(tied.edges), (*tied.untied, *lost)
+
+
+def _refuse_few_of_each(cell: Cell) -> None:
+    """Refuses several targets of which none is seen often enough to begin with."""
+    shown = [it.seen for it in cell.rows]
+    counts = {it: shown.count(it) for it in dict.fromkeys(shown)}
+    if len(counts) > 1 and max(counts.values()) < FEWEST_VIEWS and cell.mount != "instrument":
+        told = ", ".join(f"{it.partition('_')[2]} in {count}" for it, count in counts.items())
+        raise DegenerateError(
+            f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
+            f"begin with; here {told}.",
+            culprits=[it.replace("_", " ", 1) for it in counts],
+            next_step="Add views of one of them, tilted about different axes.",
+        )
+
+
+def targets_of(cell: Cell) -> dict[str, Target]:
+    """The printed targets by their frames."""
+    return {f"target_{name}" if name else "target": it for name, it in cell.session.plates.items()}
+
+
+def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
+    """The problem of views with one pose each, lenses and boards as they are taken to be."""
+    given = np.array([not it.covariance.any() for it in views])
+    levels = {it: at for at, it in enumerate(sensors_of(cell, views))}
+    sensors = [
+        levels.get(row.seer, -1) if is_sensed(row.seer, view) else -1
+        for row, view in zip(cell.rows, views, strict=True)
+    ]
+    spread = np.array([it.covariance[0] for it in views])
+    places = np.array([it.is_place for it in cell.rows], dtype=bool)
+    spread[given] = _NOMINAL
+    turned = {row.seen for row, place in zip(cell.rows, places.tolist(), strict=True) if not place}
+    # What one camera measured with one robot, without a word of its noise, has that of both as one.
+    is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
+    if is_combined:
+        sensors, spread = [-1] * len(views), np.zeros((len(views), 6, 6))
+    return Problem(
+        cell.tree,
+        cell.poses,
+        Observations(
+            tuple(it.seer for it in cell.rows),
+            tuple(it.seen for it in cell.rows),
+            np.array([it.station for it in cell.rows]),
+            np.array(sensors, dtype=np.int64),
+            np.array([it.cam_from_target[0] for it in views]),
+            spread,
+            ~places,
+        ),
+        priors=cell.priors,
+        points=frozenset(it.seen for it in cell.rows) - turned,
+        is_combined=is_combined,
+    )
+
+
+def is_sensed(seer: str, view: ViewPoses) -> bool:
+    """Whether an observation's noise is known up to a level: those of corners is known."""
+    return seer.startswith("instrument") or not view.covariance.any()
+
+
+def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
+    """The frames whose observations' noise is known up to a level; other cameras come behind.
+
+    Of one camera or instrument with one robot it is what is stated: the rest is the robot's.
+    """
+    if cell.mount is not None:
+        return ()
+    pairs = zip(cell.rows, views, strict=True)
+    return tuple(dict.fromkeys(row.seer for row, view in pairs if is_sensed(row.seer, view)))

@@ -1,0 +1,144 @@
+"""The way of a session in order: one entry a step, of one camera and one robot or of a whole cell.
+
+A step is one file in `calibration.stages`, or a few lines here that hand it what it needs.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from visioncal.calibration.pipeline.answer import answer_of
+from visioncal.calibration.pipeline.judging import check_answer, findings_of
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.solving import solve
+from visioncal.calibration.pipeline.unused_facts import not_used
+from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
+from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
+from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.stages.kinematics import check_asked
+from visioncal.calibration.stages.loads import check_stops
+from visioncal.calibration.stages.observed import all_held_back
+from visioncal.calibration.stages.readings import (
+    exchanged_points,
+    read_instrument,
+    read_instruments,
+)
+from visioncal.calibration.stages.robots import check_joints, read_robots
+from visioncal.core.errors import DataError
+from visioncal.core.types import Rejection
+from visioncal.session import STREAMS
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the way, by the name that progress shows."""
+
+    name: str
+    run: Callable[[Known], Known]
+
+
+def _read_robot(known: Known) -> Known:
+    session = known.session
+    if not session.views:
+        what = "streams and no views" if session.streams else "no views"
+        raise DataError(
+            " ".join([f"session {session.name!r} has {what}.", *session.warnings]),
+            culprits=[f"{STREAMS}/{it}.csv" for it in session.streams] or [session.name],
+            next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
+            "dynamics identify.",
+        )
+    known = known.noting((), (*session.warnings, *not_used(known)))
+    if len(known.held_back) == len(session.views):
+        raise all_held_back(known)
+    # Views that have a time alone get their poses once the camera's are known.
+    return known if waits_for_clock(session) else _reported(known)
+
+
+def _reported(known: Known) -> Known:
+    """Takes up what is reported of the robots."""
+    known = read_robots(known)
+    if known.mount is None:
+        return known
+    matched = known.reported.matched
+    if matched is not None and matched.misread:
+        check_asked(known.level, can=False, misread=matched.misread)
+    if not known.base_from_flange:
+        raise DataError(
+            f"session {known.session.name!r}: no view has a pose of the robot.",
+            culprits=known.lost_views,
+            next_step=" ".join(known.session.warnings)
+            or "Fill in x_m to qw, or joint angles and [robot] model.",
+        )
+    views, declared = (
+        tuple(known.base_from_flange),
+        {it.number: it.stop for it in known.session.views},
+    )
+    check_stops(known.loads(views), views, [declared[it] for it in views])
+    return known
+
+
+def _readings(known: Known) -> Known:
+    """Takes up what instruments read."""
+    if known.mount == "instrument":
+        readings = read_instrument(known.session)
+        known = replace(known, readings=readings).noting(readings.rejections)
+        if not readings.are_poses:
+            if known.solver != "joint":
+                raise DataError(
+                    f"solver {known.solver!r} needs poses, and the instrument reads places alone.",
+                    next_step="Leave --solver out.",
+                )
+            known = known.noting(exchanged_points(known, readings))
+    poses = {
+        view: it
+        for view, it in read_instruments(known.session).items()
+        if view not in known.reasons
+    }
+    return replace(known, poses={**known.poses, **poses})
+
+
+def _detect(known: Known) -> Known:
+    return detect_targets(known, known.found_before)
+
+
+def _clock(known: Known) -> Known:
+    """Gives views that have a time alone the robot's poses out of its stream."""
+    return _reported(set_clocks(known)) if waits_for_clock(known.session) else known
+
+
+def _joints(known: Known) -> Known:
+    """Refuses joints that only fit what the camera sees where they are read otherwise."""
+    drops = known.level != "hand-eye"
+    return check_joints(known, drops=drops, takes=drops and known.solver == "joint")
+
+
+def _solve(known: Known) -> Known:
+    cell = read_cell(known)
+    return replace(known, read=cell, fit=solve(cell, known, known.level, known.solver))
+
+
+def _examine(known: Known) -> Known:
+    check_answer(known)
+    answer = answer_of(known.cell, known, known.fitted, known.convention)
+    out = (it for it in answer.sights if not it.used and it.view not in known.held_back)
+    return replace(known, answer=answer).noting(Rejection(it.view, it.reason) for it in out)
+
+
+def _judge(known: Known) -> Known:
+    findings = findings_of(known)
+    known = replace(known, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
+    return replace(known, findings=findings, verdict=judge(findings))
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage("robot", _read_robot),
+    Stage("readings", _readings),
+    Stage("detect", _detect),
+    Stage("intrinsics", estimate_lenses),
+    Stage("pnp", locate_targets),
+    Stage("clock", _clock),
+    Stage("joints", _joints),
+    Stage("solve", _solve),
+    Stage("examine", _examine),
+    Stage("judge", _judge),
+)

@@ -1,0 +1,108 @@
+"""The result of a whole cell: its frames, each with respect to all others."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.pipeline.judging import weakest_link
+from visioncal.calibration.pipeline.lens_documents import cameras_of, fit_section, shape_sections
+from visioncal.calibration.pipeline.network_ties import untied_words
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.stages.cell import robot_key
+from visioncal.calibration.stages.need import need_met
+from visioncal.estimation.arm import stops_of
+from visioncal.results import Alignment, RobotResult, Untied
+from visioncal.robot import Robot
+from visioncal.vision.targets import target_document
+
+
+def alignment_of(known: Known) -> Alignment:
+    """Puts together what is known of a whole cell when all steps have run.
+
+    Raises:
+        RuntimeError: One has not.
+    """
+    session, cell, solved, answer = known.session, known.cell, known.fitted, known.solved
+    if known.verdict is None or known.findings is None:
+        raise RuntimeError("a step is missing")
+    branches, edges = answer.problem.tree.branches, answer.edges
+    parents = {it.name: branches[it.key].parent for it in answer.versions.values()}
+    kept = {
+        name: it.parent
+        for name, it in cell.tree.branches.items()
+        if name in solved.cell.tree.branches
+    }
+    size = 6 * len(edges)
+    return Alignment(
+        session_name=session.name,
+        session_sha256=session.digest(),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        reference=cell.reference,
+        frames=kept | parents,
+        robots={name: it.robot for name, it in solved.cell.tree.branches.items() if it.robot},
+        edges={f"{parents[name]}_from_{name}": edge for name, edge in edges.items()},
+        joint_covariance=answer.covariance[:size, :size],
+        cameras=cameras_of(known),
+        noise=answer.sigmas,
+        sights=answer.sights,
+        left_out=answer.held_out.method if np.isfinite(answer.held_out.away_m).any() else "",
+        moved=answer.moved,
+        untied=tuple(Untied(it, untied_words(cell, it)) for it in solved.untied),
+        weakest=weakest_link(solved.cell, answer.last_edges),
+        verdict=known.verdict,
+        details=_details(known),
+        arms=_arms(known),
+        targets={name or "target": target_document(it) for name, it in session.plates.items()},
+        stages={
+            **shape_sections(known),
+            "joint_fit": fit_section(known),
+            "uncertainty": {
+                "budget_mm": {
+                    f"{parents[it]}_from_{it}": mm for it, mm in answer.budget_mm.items()
+                },
+                "noise_95": _intervals(known),
+            },
+        },
+        need=need_met(known.findings.need, known.findings.picks, whole=True),
+    )
+
+
+def _arms(known: Known) -> dict[str, RobotResult]:
+    session, solved = known.session, known.fitted
+    models = session.robot_documents
+    found = {
+        robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
+        for name in session.robots
+    }
+    for name in solved.arms:
+        found[name] = RobotResult(found[name].model, arm_documents(known, name))
+    return found
+
+
+def arm_documents(known: Known, robot: str) -> dict[str, Any]:
+    """What was found of a robot's arm, as calibration.json has it: one section a stage."""
+    solved, answer, first = known.fitted, known.solved, dict[int, int]()
+    for row in solved.cell.rows:
+        first.setdefault(row.station, row.view)
+    stops = stops_of(answer.problem, robot)
+    found = answer.arms[robot]
+    return solved.arms[robot].at(stops).documents(found, [first[it] for it in stops.tolist()])
+
+
+def _details(known: Known) -> dict[str, Any]:
+    """What was found of clocks."""
+    clocks = known.solved.clocks(known)
+    return {"clocks": {it.words: at.document() for it, at in clocks.items()}} if clocks else {}
+
+
+def _intervals(known: Known) -> dict[str, dict[str, list[float]]]:
+    """95 % intervals of the levels of robots, as the noise names them."""
+    pairs = zip(known.solved.problem.robots, known.solved.intervals, strict=True)
+    return {
+        robot: {
+            "translation_mm": (1e3 * shift_m).tolist(),
+            "rotation_deg": np.rad2deg(turn_rad).tolist(),
+        }
+        for robot, (turn_rad, shift_m) in pairs
+    }

@@ -1,0 +1,320 @@
+"""Stage 7: what the stops tell of a calibrated arm, and what it is worth all over its workspace."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.guess.joints import JointReading
+from visioncal.core.number_format import figure
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.armpair import ArmData, ArmPair
+from visioncal.estimation.excitation_advice import Move, joints_to_move
+from visioncal.estimation.identifiability import Slopes, Told, count_told, what_is_told
+from visioncal.estimation.indices import Indices
+from visioncal.estimation.null_space import (
+    dominant_words,
+    imitated,
+    joint_words,
+    listed,
+    null_of,
+    null_words,
+)
+from visioncal.estimation.parameters import (
+    Parameter,
+    free_parameters,
+    parameter_moves,
+    parameter_slopes,
+)
+from visioncal.estimation.solve import whitened
+from visioncal.estimation.stop_influence import stop_worth
+from visioncal.estimation.workspace import postures
+from visioncal.robot import (
+    Convention,
+    DHTable,
+    Robot,
+    convert_table,
+    parallel_axes,
+    table_from_document,
+    table_of,
+)
+
+# So many places are enough for a map.
+_PLACES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A number of the arm's table.
+
+    Attributes:
+        parameter: Which.
+        nominal: As stated [rad or m].
+        identified: As found.
+        sigma: Standard deviation of what was found. What the stops do not tell keeps about what was
+            stated, and the sigma of the arm's errors.
+    """
+
+    parameter: Parameter
+    nominal: float
+    identified: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Telling:
+    """What the stops tell of the arm.
+
+    Attributes:
+        convention: Of the table whose numbers are told.
+        estimates: Its numbers that are not held.
+        told: What the stops tell, and what any stops could.
+        indices: How well; None where they tell nothing of the arm.
+        not_told: What they do not, in words: first what no stops tell.
+        advice: What to do where other stops would tell more; empty where they would not.
+        worth: (m,) by which share the mean predicted variance of the places below would grow
+            without each stop, lens and board as they are.
+        places: (k, 3) of the flange all over the workspace, in the base's frame [m].
+        sigmas_m: (k,) predicted sigma of the place of what the flange carries there [m].
+    """
+
+    convention: Convention
+    estimates: tuple[Estimate, ...]
+    told: Told
+    indices: Indices | None
+    not_told: tuple[str, ...]
+    advice: str
+    worth: FloatArray
+    places: FloatArray
+    sigmas_m: FloatArray
+
+    def document(
+        self, robot: Robot, views: Sequence[int], lost: JointReading | None = None
+    ) -> dict[str, Any]:
+        """It as calibration.json has it.
+
+        Args:
+            robot: The nominal arm.
+            views: (m,) by which views the stops go.
+            lost: A joint whose zero was found far from where it was stated.
+        """
+        ordered = sorted(zip(self.worth.tolist(), views, strict=True), key=lambda it: -it[0])
+        return {
+            "convention": self.convention,
+            "parameters": [_number(it, robot, lost) for it in self.estimates],
+            "workspace_sigma_mm": {
+                "median": 1e3 * float(np.median(self.sigmas_m)),
+                "p95": 1e3 * float(np.quantile(self.sigmas_m, 0.95)),
+            },
+            "workspace_map": [
+                dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_mm": 1e3 * sigma}
+                for place, sigma in list(
+                    zip(self.places.tolist(), self.sigmas_m.tolist(), strict=True)
+                )[:_PLACES]
+            ],
+            "observability": self._observability(),
+            "not_told": list(self.not_told),
+            "stops": [{"view": view, "worth": worth} for worth, view in ordered],
+        }
+
+    def _observability(self) -> dict[str, Any]:
+        told, indices = self.told, self.indices
+        counted = {
+            "columns": told.columns,
+            "identifiable": told.identifiable,
+            "told": told.told,
+        }
+        if indices is None:
+            return counted
+        return counted | {
+            "condition": indices.condition,
+            "o1": indices.o1,
+            "o2": indices.o2,
+            "o3": indices.o3,
+            "o4": indices.o4,
+            "o5": indices.o5,
+        }
+
+
+def _number(estimate: Estimate, robot: Robot, lost: JointReading | None) -> dict[str, Any]:
+    joint, nominal = estimate.parameter.joint, estimate.nominal
+    if lost is not None and estimate.parameter.name == "theta_rad":
+        # The fit starts where the zero was found; what is told starts where it was stated.
+        nominal -= float(robot.chain.functions[joint, 1] * lost.zeros[joint])
+    return {
+        "joint": robot.joint_names[joint],
+        "name": estimate.parameter.name,
+        "nominal": nominal,
+        "identified": estimate.identified,
+        "change": estimate.identified - nominal,
+        "sigma": estimate.sigma,
+    }
+
+
+def tell(arm: ArmData, convention: Convention | None = None) -> Telling:
+    """Says what the stops tell of an arm, and what it is worth.
+
+    Args:
+        arm: What was seen of it.
+        convention: Of the table that is wanted; None for the stated one, or Hayati's where axes are
+            nearly parallel, which has no leap there.
+    """
+    anywhere = postures(arm.model.robot)
+    with one_blas_thread():
+        numbers = _numbers(arm.model, convention)
+        weight = arm.pair.weight(arm.noise, arm.measured)
+        by_arm, by_numbers = _at(arm, anywhere, weight), _by_numbers(arm, numbers, anywhere, weight)
+        told, null = what_is_told(_at_stops(arm), by_arm), null_of(by_numbers)
+        lacking = None
+        if told.missing.size:
+            lacking = _Lacking(
+                imitated(by_numbers, by_arm, told.missing), _moves(arm, told, weight)
+            )
+        place = _place_slopes(arm, anywhere)
+        seen = arm.covariance[np.ix_(arm.chain, arm.chain)]
+        sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, seen, place))
+        fitted = (arm.problem, arm.state, arm.noise)
+        worth = stop_worth(*fitted, arm.stops, place, arm.chain)
+    nominal = arm.model.nominal
+    return Telling(
+        convention=numbers.before.convention,
+        estimates=tuple(_estimates(arm, numbers)),
+        told=told,
+        indices=Indices.of(told.values, len(arm.stops)) if len(told.values) else None,
+        not_told=(
+            *null_words(null, numbers.parameters, nominal),
+            *([_missing_words(lacking, numbers.parameters, nominal)] if lacking else []),
+        ),
+        advice=_advice(lacking, told, numbers.parameters, nominal) if lacking else "",
+        worth=worth,
+        places=arm.model.robot.base_from_flange(anywhere)[:, :3, 3],
+        sigmas_m=sigmas_m,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbers:
+    """The arm's table as stated and as found, and how its free numbers (k) move with the errors."""
+
+    before: DHTable
+    after: DHTable
+    parameters: tuple[Parameter, ...]
+    moves: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Lacking:
+    """What numbers of the table (k, n) do what is not told, and the joints that would tell."""
+
+    changes: FloatArray
+    moves: tuple[Move, ...]
+
+
+def _numbers(model: ArmModel, convention: Convention | None) -> _Numbers:
+    before = _stated_table(model.nominal)
+    if convention is None and parallel_axes(model.nominal).any():
+        convention = "hayati"
+    before = convert_table(before, convention or before.convention)
+    after = table_of(model.bare, before.convention, like=before)
+    parameters = free_parameters(model, before)
+    return _Numbers(before, after, parameters, parameter_moves(model, after, parameters))
+
+
+def _stated_table(robot: Robot) -> DHTable:
+    if "convention" in robot.document:
+        return table_from_document(robot.document)
+    return table_of(robot, "standard")
+
+
+def _at_stops(arm: ArmData) -> Slopes:
+    """The stops' slopes, in units of their noise."""
+    _, slopes = whitened(arm.problem, arm.state, arm.noise, arm.measured)
+    flat = slopes.reshape(-1, arm.problem.size)
+    return Slopes(flat[:, arm.frames], flat[:, arm.columns] * arm.error_rad)
+
+
+def _at(arm: ArmData, q: FloatArray, weight: FloatArray) -> Slopes:
+    """Slopes at any postures, in units of a noise like the stops'."""
+    flange = arm.model.base_from_flange(q)
+    return _through(arm.pair, flange, arm.basis(q) * arm.error_rad, weight)
+
+
+def _by_numbers(arm: ArmData, numbers: _Numbers, q: FloatArray, weight: FloatArray) -> Slopes:
+    """Slopes by the nominal arm's numbers, whose axes are exactly as they are meant."""
+    model, parameters = arm.model, numbers.parameters
+    moved = parameter_slopes(numbers.before, parameters, q, model.flange_from_reported)
+    flange = model.nominal.base_from_flange(q) @ model.flange_from_reported
+    return _through(arm.pair, flange, moved * [it.unit for it in parameters], weight)
+
+
+def _through(pair: ArmPair, flange: FloatArray, moved: FloatArray, weight: FloatArray) -> Slopes:
+    """Slopes of the pair by the frames at both ends, and by (k, 6, p) motions of the flange."""
+    carried = weight @ pair.at(flange)[0].by_errors
+    frames, arm = carried @ pair.frame_slopes(flange), carried @ moved
+    return Slopes(frames.reshape(-1, 12), arm.reshape(-1, moved.shape[2]))
+
+
+def _moves(arm: ArmData, told: Told, weight: FloatArray) -> tuple[Move, ...]:
+    """The joints that would tell what is missing, for noise that is alike at all stops."""
+
+    def count(q: FloatArray) -> int:
+        return count_told(_at(arm, q, weight))
+
+    return joints_to_move(arm.model.robot, arm.q, count, told.identifiable - told.told)
+
+
+def _place_slopes(arm: ArmData, q: FloatArray) -> FloatArray:
+    """How the place of what the flange carries moves with the chain's unknowns, (k, 3, f + p)."""
+    poses, moved = arm.pair.slopes(arm.model.base_from_flange(q), arm.basis(q))
+    edges = moved.shape[2] - len(arm.columns)
+    slopes = np.zeros((len(q), 6, arm.problem.size))
+    slopes[:, :, :edges], slopes[:, :, arm.columns] = moved[:, :, :edges], moved[:, :, edges:]
+    return arm.pair.place_slopes(poses, slopes[:, :, arm.chain], arm.at)
+
+
+def _estimates(arm: ArmData, numbers: _Numbers) -> Iterator[Estimate]:
+    links = arm.error_rad * arm.model.weights.get("links", 1.0)
+    sigmas = np.sqrt(np.einsum("ij,jk,ik->i", numbers.moves, arm.spread, numbers.moves))
+    for parameter, sigma, moves in zip(numbers.parameters, sigmas, numbers.moves, strict=True):
+        # Where the base or the flange takes a number's place it is as open as it was beforehand.
+        known = 0.0 if moves.any() else links * parameter.unit
+        yield Estimate(
+            parameter,
+            parameter.value(numbers.before),
+            parameter.value(numbers.after),
+            float(max(sigma, known)),
+        )
+
+
+def _missing_words(lacking: _Lacking, parameters: Sequence[Parameter], robot: Robot) -> str:
+    named = dominant_words(lacking.changes, parameters, robot)
+    if not lacking.moves:
+        return f"these stops do not tell {named}"
+    first, *others = (
+        (joint_words(it.joint, robot), _length(it.moved, it.joint, robot)) for it in lacking.moves
+    )
+    moved = listed([f"{first[0]} moved by {first[1]}", *(f"{it} by {way}" for it, way in others)])
+    return f"{moved} only, too little to tell {named}"
+
+
+def _advice(lacking: _Lacking, told: Told, parameters: Sequence[Parameter], robot: Robot) -> str:
+    further = "Add stops in which the arm stands otherwise, all over the workspace."
+    if lacking.moves:
+        joints = [
+            f"joint {it.joint + 1} by {_length(it.wanted, it.joint, robot)}" for it in lacking.moves
+        ]
+        further = f"Add stops that move {listed(joints)} or more."
+    return (
+        f"The stops tell {told.told} of the {told.identifiable} values that can be told of this "
+        f"arm and its frames: {_missing_words(lacking, parameters, robot)}. What is not told stays "
+        f"about as stated. {further}"
+    )
+
+
+def _length(way: float, joint: int, robot: Robot) -> str:
+    if robot.chain.prismatic[joint]:
+        return f"{figure(1e3 * way)} mm"
+    return f"{figure(float(np.rad2deg(way)))} deg"

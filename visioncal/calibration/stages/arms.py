@@ -1,0 +1,475 @@
+"""The robots' arms: where each stood, which of its errors show, and how they are unknowns."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from visioncal.calibration.stages import backlash, elastic, thermal
+from visioncal.calibration.stages.arm_identifiability import Telling, tell
+from visioncal.calibration.stages.backlash import Play, plays_of
+from visioncal.calibration.stages.elastic import Elastic, springs_of
+from visioncal.calibration.stages.joints import Matched
+from visioncal.calibration.stages.kinematics import Kinematics, choose_level
+from visioncal.calibration.stages.loads import check_elastic, check_poses
+from visioncal.calibration.stages.reported_poses import moved_arm
+from visioncal.calibration.stages.thermal import (
+    Heat,
+    drift_by_view,
+    drift_document,
+    find_drift,
+    heating,
+)
+from visioncal.calibration.stages.thermal_fit import Stops, ThermalFit
+from visioncal.core.transforms import distances, invert, mean_transform
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.arm import (
+    ArmErrors,
+    find_arm_errors,
+    link_basis,
+    pose_basis,
+    rows_of,
+    stops_of,
+)
+from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
+from visioncal.estimation.armpair import ArmData, ArmPair
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import Solution
+from visioncal.robot import Convention, Loads
+from visioncal.session import Session, View
+from visioncal.session.loads import loads_of
+
+# Poses and joints are written with so many digits [m, rad].
+_ROUNDED = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ArmFound:
+    """What the stops tell of an arm.
+
+    Attributes:
+        telling: Of its numbers; None where it stands as stated.
+        springs: Of its joints as springs; None for a rigid one.
+        plays: Of the play in its joints; empty where stops did not come from both sides.
+        drift: Its drift with temperature, as calibration.json has it; None for none.
+    """
+
+    telling: Telling | None = None
+    springs: Elastic | None = None
+    plays: tuple[Play, ...] = ()
+    drift: Mapping[str, Any] | None = None
+
+    def notes(self) -> Iterator[str]:
+        """Words what is no reason for doubt."""
+        if self.telling is not None and self.telling.advice:
+            yield self.telling.advice
+        yield from backlash.remarks(self.plays)
+        if self.springs is not None:
+            yield from elastic.remarks(self.springs)
+
+    def doubts(self) -> Iterator[str]:
+        """Words what speaks against it."""
+        if self.springs is not None:
+            yield from elastic.doubts(self.springs)
+
+
+@dataclass(frozen=True, eq=False)
+class RobotArm:
+    """A robot's arm at the s stops of a cell.
+
+    Attributes:
+        robot: The robot, as the problem has it.
+        reported: (s, 4, 4) `base_from_flange` as it was reported; not a number where unknown.
+        stood: (s,) the m stops at which it was.
+        joints_rad: (m, n) its joints there; None where they are missing or belong to no model.
+        loads: What it carried there.
+        matched: Its model, beside poses and joints; None where none is known.
+        heat: What heats it; None where its joints are not known.
+        thermal: How it drifts with that; None where that was not asked or cannot be.
+        errors: Errors that follow its posture, where they are likely.
+        kinematics: Which levels were compared; None where that was not asked or cannot be.
+        model: The arm with the errors of the level that was taken; None where it stays as stated.
+    """
+
+    robot: str
+    reported: FloatArray
+    stood: Mask
+    joints_rad: FloatArray | None
+    loads: Loads
+    matched: Matched | None = None
+    heat: Heat | None = None
+    thermal: ThermalFit | None = None
+    errors: ArmErrors | None = None
+    kinematics: Kinematics | None = None
+    model: ArmModel | None = None
+
+    @classmethod
+    def of(
+        cls,
+        robot: str,
+        reported: FloatArray,
+        views: Sequence[View],
+        matched: Matched | None,
+        recorded: tuple[Session, str],
+    ) -> Self:
+        """Reads an arm, as it is stated.
+
+        Args:
+            robot: The robot, as the problem has it.
+            reported: (s, 4, 4) `base_from_flange`; not a number at stops at which it was not.
+            views: The rows that tell of it at the m stops at which it was.
+            matched: Its model, beside poses and joints; None where none is known.
+            recorded: The session, and the robot's name there.
+        """
+        joints = [] if matched is None else [matched.joints_rad.get(it.number) for it in views]
+        q = [it for it in joints if it is not None]
+        known, heat = 0 < len(q) == len(views), None
+        if known:
+            stamps_s = np.array([it.stamp_s for it in views], dtype=float)
+            numbers = np.array([it.number for it in views])
+            heat = Heat(*recorded, len(q[0]), numbers, stamps_s)
+        return cls(
+            robot,
+            reported,
+            np.isfinite(reported[:, 0, 0]),
+            np.array(q) if known else None,
+            loads_of([it.numbers for it in views], [it.text.get("approach", "") for it in views]),
+            matched,
+            heat,
+        )
+
+    @property
+    def is_modelled(self) -> bool:
+        """Whether its joints at all stops belong to a known model."""
+        return self.matched is not None and self.joints_rad is not None
+
+    def at(self, stops: IntArray) -> Self:
+        """The arm at (k,) of its stops."""
+        stood = self.stood[stops]
+        kept = (np.cumsum(self.stood) - 1)[stops][stood]
+        joints, errors = self.joints_rad, self.errors
+        return replace(
+            self,
+            reported=self.reported[stops],
+            stood=stood,
+            joints_rad=None if joints is None else joints[kept],
+            loads=self.loads.chosen(kept),
+            heat=None if self.heat is None else self.heat.at(kept),
+            errors=None if errors is None else replace(errors, basis=errors.basis[stops]),
+        )
+
+    @property
+    def drift(self) -> ThermalFit | None:
+        """How it drifts with its temperature; None where it does not beyond chance."""
+        return None if self.thermal is None or not thermal.is_found(self.thermal) else self.thermal
+
+    @property
+    def warming(self) -> Stops:
+        """Where it stood, and when; a stop without a time counts as at the start."""
+        if self.joints_rad is None or self.heat is None or self.thermal is None:
+            raise RuntimeError("an arm drifts by its joints and what heats them")
+        start_s = self.thermal.inputs.stamps_s[0]
+        stamps_s = np.nan_to_num(self.heat.stamps_s, nan=start_s)
+        return Stops(self.robot, np.flatnonzero(self.stood), self.joints_rad, stamps_s)
+
+    def erring(self, errors: ArmErrors | None) -> Self:
+        """The arm with errors that were found at some of its stops, none of them estimated yet."""
+        arm = replace(self, errors=errors, kinematics=None, model=None)
+        return arm if errors is None else replace(arm, errors=replace(errors, basis=arm.basis))
+
+    @property
+    def poses(self) -> FloatArray:
+        """(s, 4, 4) where the flange stood, by the calibrated arm where there is one."""
+        poses = self.reported.copy()
+        if self.model is not None and self.joints_rad is not None:
+            poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
+        if self.drift is not None:
+            poses[self.stood] = poses[self.stood] @ self.drift.motion(self.warming)
+        return poses
+
+    def frees_errors(self, *, freely: bool = False) -> bool:
+        """Whether its errors are unknowns: those that are estimated, or freely all found."""
+        return self.errors is not None and (freely or self.errors.is_estimated)
+
+    def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
+        """What moves its flange at all stops: what is open about its drift, and its errors."""
+        drift, found = self.drift, []
+        if drift is not None:
+            found.append(drift.effect(self.warming, len(self.stood)))
+        if self.errors is not None and self.frees_errors(freely=freely):
+            values = None if self.model is None else self.model.values
+            found.append(self.errors.effect(self.robot, values=values))
+        return tuple(found)
+
+    def put_into(self, problem: Problem) -> Problem:
+        """A problem with this arm in the place of what it has of it."""
+        mine = {f"{it} of {self.robot}" for it in ("arm", "temperature")}
+        rest = [it for it in problem.effects if it.name not in mine]
+        moved = replace(problem, poses={**problem.poses, self.robot: self.poses})
+        return moved.with_effects([*rest, *self.effects()])
+
+    def without_errors(self, problem: Problem) -> Problem:
+        """A problem with this arm as reported, but for its drift."""
+        return self.erring(None).put_into(problem)
+
+    def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
+        """Looks for how it drifts with its temperature, where the session tells.
+
+        Args:
+            problem: The observations, with this arm as reported.
+            start: Where to start.
+            asked: A key of `stages.kinematics.ASKED`.
+
+        Raises:
+            DataError: The level asks for it, and the session lacks what it takes.
+            DegenerateError: The level asks for it, and all views were taken about equally warm.
+        """
+        seen = self.at(stops_of(problem, self.robot))
+        inputs = heating(seen.heat if self.is_modelled else None, asked)
+        if inputs is None or seen.heat is None or seen.joints_rad is None or self.matched is None:
+            return self
+        places = stops_of(problem, self.robot)
+        stops = Stops(self.robot, places, seen.joints_rad, seen.heat.stamps_s)
+        found = find_drift(problem, start, stops, inputs, self.matched.arm)
+        return replace(self, thermal=found)
+
+    def with_errors(self, problem: Problem, fit: Solution) -> Self:
+        """Looks for errors that follow its posture.
+
+        Args:
+            problem: The observations, with this arm as stated.
+            fit: Their fit.
+        """
+        found = find_arm_errors(
+            problem, fit.state, fit.noise, self.robot, self.basis, of_links=self.is_modelled
+        )
+        return replace(self, errors=found)
+
+    def stated(self, problem: Problem) -> Problem | None:
+        """A problem with a lost zero where the model has it; None where none is lost.
+
+        Args:
+            problem: The observations, with the zero where it was found.
+        """
+        matched, q = self.matched, self.joints_rad
+        if matched is None or matched.zero is None or q is None:
+            return None
+        poses = problem.poses[self.robot].copy()
+        poses[self.stood] = moved_arm(poses[self.stood], q, matched.arm, matched.robot)
+        return replace(problem, poses={**problem.poses, self.robot: poses})
+
+    def reported_alike(self, agrees: Mask) -> Mask:
+        """(s,) where the reported poses are those of the joints, as much as where views agree.
+
+        A wrong report says nothing against joints and cameras, but would mislead the fit.
+
+        Args:
+            agrees: (s,) where they do.
+        """
+        if self.matched is None or self.joints_rad is None:
+            return agrees
+        nominal = self.matched.arm.base_from_flange(self.joints_rad)
+        tools, sound = invert(nominal) @ self.reported[self.stood], agrees[self.stood]
+        away = distances(tools, mean_transform(tools[sound]))
+        found = agrees.copy()
+        found[self.stood] = np.all([it <= 2.0 * it[sound].max() + _ROUNDED for it in away], axis=0)
+        return found
+
+    def _seen(
+        self, problem: Problem, fit: Solution, spread: FloatArray, middles: Mapping[str, FloatArray]
+    ) -> ArmData | None:
+        """What was seen of its errors; None where it stands as stated."""
+        columns = problem.effect_columns.get(f"arm of {self.robot}")
+        if self.model is None or self.errors is None or self.joints_rad is None or columns is None:
+            return None
+        stops, every = stops_of(problem, self.robot), np.arange(problem.size)
+        rows = np.searchsorted(np.flatnonzero(self.stood), stops)
+        pair = ArmPair.of(problem, fit.state, self.robot)
+        # Readings of one point show its place and no rotation; several points make a frame.
+        shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
+        # The rotation of what is only a point beside it is no value of its frame.
+        edges = problem.counted.copy()
+        edges[problem.edge_columns(pair.observed)] = True
+        edges[6 * len(problem.unknown) :] = False
+        return ArmData(
+            problem,
+            fit.state,
+            fit.noise,
+            spread,
+            self.robot,
+            self.model,
+            every[columns],
+            self.errors.sigma,
+            stops,
+            self.joints_rad[rows],
+            self.loads.chosen(rows),
+            middles.get(pair.observed, np.zeros(3)),
+            every[edges],
+            measured=np.repeat([shows_pose, True], 3),
+        )
+
+    def found(
+        self,
+        problem: Problem,
+        fit: Solution,
+        spread: FloatArray,
+        middles: Mapping[str, FloatArray],
+        convention: Convention | None = None,
+    ) -> ArmFound:
+        """What the stops tell of it.
+
+        Args:
+            problem: The observations that agree, with its errors among the unknowns.
+            fit: Their fit.
+            spread: (p, p) its covariance.
+            middles: (3,) the middle of each printed target by its frame, in that [m].
+            convention: Of the table that is wanted; see `stages.tell`.
+        """
+        drift = None
+        if self.drift is not None and self.heat is not None:
+            seen = self.at(stops_of(problem, self.robot))
+            stops = replace(seen.warming, places=stops_of(problem, self.robot))
+            views = [] if seen.heat is None else seen.heat.views.tolist()
+            drift = drift_document(self.drift, stops, views, problem, fit)
+        data = self._seen(problem, fit, spread, middles)
+        if data is None or self.kinematics is None:
+            return ArmFound(drift=drift)
+        # With nothing but play and springs its numbers are as stated.
+        erring = data.model.weights.keys() & set(RIGID)
+        return ArmFound(
+            tell(data, convention) if erring else None,
+            springs_of(data, self.kinematics.errors),
+            plays_of(data.model, data.spread),
+            drift,
+        )
+
+    def documents(self, found: ArmFound, views: Sequence[int]) -> dict[str, Any]:
+        """What was found of it, as calibration.json has it: one section a stage.
+
+        Args:
+            found: What the stops tell of it.
+            views: By which views these stops go.
+        """
+        stages: dict[str, Any] = {}
+        if self.errors is not None:
+            stages["arm_errors"] = self.errors.document()
+        if found.drift is not None and self.drift is not None and self.heat is not None:
+            rows = drift_by_view(self.drift, self.warming, self.heat.views.tolist())
+            stages["thermal"] = {**found.drift, "views": rows}
+        if self.kinematics is None:
+            return stages
+        stages["kinematics"] = self.kinematics.document()
+        if self.model is None:
+            return stages
+        stages["kinematics"]["robot"] = dict(self.model.robot.document)
+        if found.plays:
+            stages["kinematics"]["backlash"] = [it.document() for it in found.plays]
+        if found.telling is not None:
+            zero = None if self.matched is None else self.matched.zero
+            stages["kinematics"] |= found.telling.document(self.model.nominal, views, zero)
+            stages["kinematics"]["left_out"] = self.kinematics.left_out()
+        if found.springs is not None:
+            stages["elastic"] = found.springs.document(views)
+        return stages
+
+    @property
+    def basis(self) -> FloatArray:
+        """(s, 6, p) how small errors move its flange.
+
+        They are those of its model where it is calibrated, or else of any of its links, where these
+        are known.
+        """
+        if self.matched is None or self.joints_rad is None:
+            return self._by_stop(pose_basis(self.reported[self.stood]))
+        if self.model is None:
+            return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
+        return self._by_stop(self.model.basis(self.joints_rad, self.loads))
+
+    def with_level(
+        self,
+        problem: Problem,
+        start: State,
+        asked: str,
+        views: Sequence[int],
+        noise: Noise | None = None,
+    ) -> Self:
+        """Chooses how far it is calibrated.
+
+        Args:
+            problem: The observations, with this arm as reported.
+            start: Where to start.
+            asked: A key of `stages.kinematics.ASKED`.
+            views: (n,) by which view each observation goes.
+            noise: The noise's levels to start from; those from above where None.
+        """
+        stops = stops_of(problem, self.robot)
+        if self.matched is None or self.joints_rad is None or not len(stops):
+            return self
+        seen = self.at(stops)
+        q, loads = seen.joints_rad, seen.loads
+        if q is None:
+            return self
+        model = ArmModel.of(self.matched.arm, q, seen.reported).loaded(q, loads)
+        blocks = blocks_of(model.nominal, self.loads)
+        bases = {name: self._columns(model, name) for name in blocks}
+        found = choose_level(
+            problem, start, self.robot, bases, asked, self.stated(problem), noise=noise
+        )
+        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
+        arm = replace(self, kinematics=replace(found, views=tuple(views[it] for it in mine)))
+        return arm._bending(model.erring(found.errors)) if found.errors else arm
+
+    def _columns(self, model: ArmModel, name: str) -> FloatArray:
+        """(s, 6, p) how the flange moves with the errors of a block."""
+        if self.joints_rad is None:
+            raise RuntimeError("an arm is calibrated by its joints")
+        return self._by_stop(model.columns(name, self.joints_rad, self.loads))
+
+    def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
+        """Linearises the calibrated arm anew where a fit has it.
+
+        Returns:
+            The arm, and how far its farthest error has moved [rad].
+        """
+        if self.model is None:
+            return self, 0.0
+        name = f"arm of {self.robot}"
+        start = [it.values for it in problem.effects if it.name == name]
+        if not start:
+            return self, 0.0
+        step = problem.values_of(name, state) - start[0]
+        return self._bending(self.model.moved(step)), float(np.abs(step).max())
+
+    def _bending(self, model: ArmModel) -> Self:
+        """The arm with the errors of its model as they move the flange."""
+        if self.kinematics is None:
+            return self
+        found = self.kinematics.errors.values()
+        arm, gain = replace(self, model=model), sum(it.gain for it in found)
+        return replace(arm, errors=ArmErrors(arm.basis, next(iter(found)).sigma, gain, True))
+
+    def _by_stop(self, columns: FloatArray) -> FloatArray:
+        """(s, 6, p) of (m, 6, p): zero where the robot did not stand."""
+        found = np.zeros((len(self.stood), *columns.shape[1:]))
+        found[self.stood] = columns
+        return found
+
+
+def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
+    """The errors of all arms that are unknowns; see `RobotArm.effects`."""
+    for arm in arms.values():
+        yield from arm.effects(freely=freely)
+
+
+def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
+    """Refuses loads that determine nothing.
+
+    Raises:
+        DataError: Springs are asked for that nothing bends.
+        DegenerateError: Loads change while an arm stands still.
+    """
+    for arm in arms.values():
+        check_poses(arm.loads, arm.reported[arm.stood])
+        check_elastic(asked, None if arm.matched is None else arm.matched.robot, arm.loads)

@@ -1,0 +1,74 @@
+"""What stops that were approached from both sides say of the play in the joints."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray
+from visioncal.estimation.armmodel import BACKLASH, ArmModel
+
+# A dead-band of fewer standard deviations may be chance.
+_SURE = 3.0
+
+
+@dataclass(frozen=True)
+class Play:
+    """The play of a joint.
+
+    Attributes:
+        joint: Its name.
+        deadband_rad: How far apart the joint stands when it is approached from its two sides, where
+            its encoder tells the same [rad]. Negative where it overshoots.
+        sigma_rad: Its standard deviation [rad].
+    """
+
+    joint: str
+    deadband_rad: float
+    sigma_rad: float
+
+    def document(self) -> dict[str, Any]:
+        """It as calibration.json has it."""
+        return {
+            "joint": self.joint,
+            "deadband_rad": self.deadband_rad,
+            "sigma_rad": self.sigma_rad,
+        }
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is beyond chance."""
+        return abs(self.deadband_rad) > _SURE * self.sigma_rad
+
+
+def plays_of(model: ArmModel, spread: FloatArray) -> tuple[Play, ...]:
+    """Tells the play of each joint; nothing where stops did not come from both sides.
+
+    Args:
+        model: The arm.
+        spread: (p, p) covariance of its errors.
+    """
+    if BACKLASH not in model.weights:
+        return ()
+    place = model.place_of(BACKLASH)
+    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(spread)[place])
+    names = model.nominal.joint_names
+    columns = zip(names, model.backlash.tolist(), sigmas.tolist(), strict=True)
+    return tuple(Play(name, band, sigma) for name, band, sigma in columns)
+
+
+def remarks(plays: Sequence[Play]) -> Iterator[str]:
+    """Says which joints have play, for the verdict."""
+    sure = [it for it in plays if it.is_sure]
+    if not sure:
+        return
+    words = ", ".join(
+        f"{it.joint} {figure(1e3 * abs(it.deadband_rad))} +- {figure(1e3 * it.sigma_rad)} mrad"
+        for it in sure
+    )
+    yield (
+        f"Joints have play: {words}. The calibrated arm stands in the middle of it: approach every "
+        "stop from the same side where half of that matters."
+    )

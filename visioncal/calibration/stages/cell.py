@@ -1,0 +1,204 @@
+"""What a session tells of a whole cell: its frames, where its robots stood, who saw what."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.priors import priors_of
+from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, Mount
+from visioncal.estimation.chain import edge_names
+from visioncal.estimation.parts import FramePrior
+from visioncal.estimation.tree import Branch, Tree
+from visioncal.results import HELD_BACK
+from visioncal.session import Observation, Session, frame_name
+from visioncal.session.kinds import is_seen
+from visioncal.session.single import is_whole_cell
+
+_CELL = "cell"
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """An observation that can be used, of a place alone or of a pose."""
+
+    view: int
+    station: int
+    seer: str
+    seen: str
+    is_place: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A session as a whole cell.
+
+    Attributes:
+        session: The session.
+        tree: Its frames; the base of one robot, or one other frame, stands for the cell.
+        reference: That frame.
+        poses: (s, 4, 4) `base_from_flange` by robot and station; not a number where unknown.
+        rows: The observations that can be used.
+        reasons: Why others cannot, by view.
+        stops: What the session calls each station: its stop's number, or its first view's.
+        priors: Where frames were measured to be, beside the observations.
+        held: The observations that could be used, and that the session keeps from every fit.
+    """
+
+    session: Session
+    tree: Tree
+    reference: str
+    poses: Mapping[str, FloatArray]
+    rows: tuple[Row, ...]
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    stops: tuple[int, ...] = ()
+    priors: tuple[FramePrior, ...] = ()
+    held: tuple[Row, ...] = ()
+
+    @property
+    def mount(self) -> Mount | None:
+        """Where the camera of one camera and one robot is; None of a whole cell."""
+        return None if is_whole_cell(self.session) else self.session.mount
+
+    def without(self, reasons: Mapping[int, str]) -> "Cell":
+        """Returns the cell without some views."""
+        rows = tuple(it for it in self.rows if it.view not in reasons)
+        return replace(self, rows=rows, reasons={**self.reasons, **reasons})
+
+    def tied(self) -> tuple[str, ...]:
+        """The frames that observations tie to the reference, in the tree's order."""
+        names = [_CELL, *self.tree.branches]
+        place = {name: at for at, name in enumerate(names)}
+        pairs = [
+            (place[name], place[branch.parent])
+            for name, branch in self.tree.branches.items()
+            if branch.known is not None
+        ]
+        pairs += [
+            (place[it.first], place[it.second]) for it in self.priors if it.matrix is not None
+        ]
+        for seer, seen in {(it.seer, it.seen) for it in self.rows}:
+            ends = [seer, seen]
+            for step in self.tree.path(seer, seen):
+                if step.robot:
+                    ends += [step.frame, self.tree.branches[step.frame].parent]
+            pairs += [(place[seer], place[it]) for it in ends]
+        links = coo_array(
+            (np.ones(len(pairs)), np.array(pairs, dtype=np.int64).reshape(-1, 2).T),
+            shape=(len(names), len(names)),
+        )
+        part = connected_components(links, directed=False)[1]
+        return tuple(it for it in self.tree.branches if part[place[it]] == part[0])
+
+    def held_to(self, reference: str) -> "Cell":
+        """Returns the cell in which one frame stands for it."""
+        tree = self.tree.with_known(reference, np.eye(4))
+        return replace(self, tree=tree, reference=reference)
+
+
+def read_cell(seen: Observed) -> Cell:
+    """Takes what was observed as a whole cell.
+
+    Raises:
+        DataError: It observes nothing, or what it says of its frames is not clear.
+    """
+    session = seen.timed
+    frames = session.frames
+    branches = {
+        name: Branch(parent, robot=_robot_of(session, name)) for name, parent in frames.items()
+    }
+    observations = [it for it in session.observations if not it.view.is_of_lens]
+    if not observations:
+        raise DataError(
+            f"session {session.name!r}: no row tells what a camera or an instrument saw.",
+            next_step="Give rows images and cameras, or poses in cft_ columns.",
+        )
+    rows = [
+        Row(
+            it.view.number,
+            it.station,
+            it.seer,
+            it.seen,
+            not is_seen(it.view) and it.view.instrument_from_probe() is None,
+        )
+        for it in observations
+        if _is_known(it, seen.robots)
+    ]
+    held = tuple(it for it in rows if it.view in seen.held_back)
+    rows = [it for it in rows if it.view not in seen.held_back]
+    reasons = {**dict.fromkeys(seen.held_back, HELD_BACK), **seen.reasons, **seen.spared}
+    stations: dict[int, int] = {}
+    for it in observations:
+        number = it.view.number if it.view.stop is None else it.view.stop
+        stations.setdefault(it.station, number)
+    tree = Tree(_CELL, branches)
+    tables = session.declaration.prior
+    if not is_whole_cell(session):
+        tables = {name: it for name, it in tables.items() if name in pair_edges(session)}
+    priors = priors_of(tables, tree)
+    poses = _poses(seen, observations)
+    cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
+    cell = replace(cell, stops=tuple(stations[it] for it in sorted(stations)))
+    return cell.held_to(_reference(cell))
+
+
+def pair_edges(session: Session) -> tuple[str, ...]:
+    """The names of the unknown edges of one camera and one robot, the camera's first."""
+    camera, target = edge_names(session.mount)
+    if session.mount == "instrument":
+        return camera, target
+    boards = tuple(session.targets) or ("",)
+    parent = target.partition("_from_")[0]
+    return (camera, *(f"{parent}_from_{frame_name('target', it)}" for it in boards))
+
+
+def _robot_of(session: Session, frame: str) -> str:
+    """The name that a flange's robot goes by, by its frame: two may not share an empty one."""
+    for name in session.robots:
+        if frame == frame_name("flange", name):
+            return robot_key(name)
+    return ""
+
+
+def robot_key(name: str) -> str:
+    """What a robot is called where every robot must have a name."""
+    return name or "robot"
+
+
+def _is_known(it: Observation, robots: Mapping[str, Reported]) -> bool:
+    """Whether it is known where all robots stood by way of which something was observed."""
+    view = it.view.number
+    return not it.lacks and all(view in robots[name].base_from_flange for name in it.robots)
+
+
+def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, FloatArray]:
+    """(s, 4, 4) where every robot stood at every station."""
+    count = 1 + max(it.station for it in observations)
+    poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in seen.robots}
+    for it in observations:
+        for name, row in it.robots.items():
+            known = seen.robots[name].base_from_flange
+            # What most rows of a stop tell comes before what each tells itself.
+            at = row.number if row.number in known else it.view.number
+            if at in known:
+                poses[robot_key(name)][it.station] = known[at]
+    return poses
+
+
+def _reference(cell: Cell) -> str:
+    """The frame that stands for the cell: the first base of most observations, or the like."""
+    tree = cell.tree
+    bases = [tree.branches[it].parent for it in tree.branches if tree.branches[it].robot]
+    still = [it for it, branch in tree.branches.items() if branch.parent == _CELL]
+    choices = [it for it in bases if it in still] or still
+
+    def rows(name: str) -> int:
+        tied = cell.held_to(name).tied()
+        return sum(it.seer in tied for it in cell.rows)
+
+    return max(choices, key=rows)

@@ -1,0 +1,337 @@
+"""Where the flange was when a view was taken, out of a stream with a clock of its own.
+
+A view that has a time and no pose of the robot gets it from the robot's stream. How far the
+camera's clock is ahead of the robot's is estimated from the motion that both have seen.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visioncal.calibration.stages.image_delays import find_delays, straighten
+from visioncal.calibration.stages.motion import Motion, at_rest, is_open, slow_and_new
+from visioncal.calibration.stages.offset import (
+    FEWEST_VIEWS,
+    LARGEST_SIGMA_S,
+    LEAST_CORRELATION,
+    Clock,
+    no_offset,
+    speed_words,
+    stated_doubts,
+    told_words,
+    turning_words,
+    why_untold,
+)
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
+from visioncal.estimation.clock import ClockFit, DelayedFit, clear_fit, fit_offset
+from visioncal.estimation.clock_correlation import Frames, Match, turning_matches
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.effects.delays import Delay
+from visioncal.session import View
+
+# A stated offset is taken to be known so well [s].
+_STATED_SIGMA_S = 1e-3
+_SPARED = "not needed: slower views stand for it, at the same places"
+_NO_TIME = "no pose of the robot: neither a pose nor a time is there"
+_BEYOND = "no pose of the robot: it was taken before or after the robot's stream"
+_IN_A_GAP = "no pose of the robot: samples of its stream are missing around that time"
+_IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
+# So many views are all used; of more, slow ones.
+_MANY_VIEWS = 60
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A camera's frame and the name of a robot that parts it from what it sees."""
+
+    camera: str
+    robot: str
+
+    @property
+    def words(self) -> str:
+        """Both, as messages and results name them."""
+        return f"{self.camera} and robot {self.robot or 'robot'}"
+
+    @property
+    def effect(self) -> str:
+        """The effect of their clocks' offset, by its name."""
+        return f"clock of {self.words}"
+
+    def delay(self, of: Delay) -> str:
+        """The effect of a time within the camera's images, by its name."""
+        return f"{of.name} of {self.words}"
+
+
+@dataclass(frozen=True, eq=False)
+class Clocked:
+    """Views with the robot's poses at their time.
+
+    Attributes:
+        clock: The offset.
+        views: Those that have a pose now, or had one before, in the session's order.
+        rejections: Those that have none, and why.
+        spared: Why the others of very many are not needed, by view.
+        poses: Poses that were made anew of corners taken before or after their stamp.
+        warnings: What gives reason for doubt.
+        notes: What is good to know.
+    """
+
+    clock: Clock
+    views: tuple[View, ...]
+    rejections: tuple[Rejection, ...]
+    spared: Mapping[int, str]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+    poses: Mapping[int, ViewPoses] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What one camera saw while one robot moved.
+
+    Attributes:
+        motion: The robot's stream.
+        mount: Where the camera is.
+        views: The rows; those that have a time and no pose of the robot wait for the clock.
+        stated_s: The stated offset; None where none is stated.
+        camera: The camera's intrinsics; None where it is not known how it took its images.
+        positions: (c, 3) corners of all boards, numbered through [m].
+    """
+
+    motion: Motion
+    mount: Mount
+    views: tuple[View, ...]
+    stated_s: float | None
+    camera: Camera | None = None
+    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> Frames:
+        """What the camera saw over time, each view by its best pose."""
+        known = [it.corners for _, it in seen]
+        corners = {view.number: it for (view, _), it in zip(seen, known, strict=True) if it}
+        measured = bool(seen) and len(corners) == len(seen)
+        stacked = measured and self.camera is not None
+        return Frames(
+            "eye-in-hand" if self.mount == "eye-in-hand" else "eye-to-hand",
+            np.array([view.stamp_s for view, _ in seen], dtype=float),
+            np.array([it.cam_from_target[0] for _, it in seen]).reshape(-1, 4, 4),
+            np.array([it.covariance[0] for _, it in seen]) if measured else None,
+            CornerStack.of(corners, self.positions) if stacked else None,
+        )
+
+
+def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
+    """Gives views the robot's poses at their time.
+
+    Args:
+        sweep: What a camera saw while a robot moved.
+        poses: What the camera saw, by view.
+
+    Raises:
+        DataError: No view lies within the stream.
+        DegenerateError: The motion does not tell the offset, it is not stated, and too few views
+            were taken at rest.
+    """
+    motion = sweep.motion
+    views = [view for view in sweep.views if is_open(view) and view.number in poses]
+    views.sort(key=lambda view: view.stamp_s or 0.0)
+    fitted = [view for view in views if not view.holdout]
+    stated_s = sweep.stated_s
+    frames = _frames(sweep, fitted, poses)
+    matches = turning_matches(motion.flange, frames, stated_s or 0.0)
+    sound = [it for it in matches if it.correlation >= LEAST_CORRELATION and not it.at_end]
+    starts = [it.offset_s for it in sound] + [it for it in (stated_s,) if it is not None]
+    fits = fit_offset(motion.flange, frames, starts) if sound else ()
+    fit = clear_fit(fits, stated_s)
+    if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
+        nearest_s = fit.offset_s
+        match = min(sound, key=lambda it: abs(it.offset_s - nearest_s))
+        return _by_motion(sweep, views, (fit, match), frames, poses)
+    if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
+        return _by_turning(sweep, views, sound[0])
+    return _untold(sweep, views, (fits, matches))
+
+
+def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
+    """What the camera saw over time: of several boards one, and where it can be of clear poses."""
+    seen = [(view, poses[view.number]) for view in views]
+    boards = [it.board for _, it in seen]
+    most = max(sorted(set(boards)), key=boards.count, default=0)
+    seen = [it for it in seen if it[1].board == most]
+    clear = [it for it in seen if len(it[1].cam_from_target) == 1]
+    return sweep.frames(clear if 2 * len(clear) > len(seen) else seen)
+
+
+def _by_motion(
+    sweep: Sweep,
+    views: Sequence[View],
+    told: tuple[ClockFit, Match],
+    frames: Frames,
+    poses: Mapping[int, ViewPoses],
+) -> Clocked:
+    fit, match = told
+    late, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
+    fit = fit if late is None else late.clock
+    clock = Clock(
+        fit.offset_s,
+        fit.sigma_s,
+        "motion",
+        sweep.stated_s,
+        fit.frames,
+        match.correlation,
+        speeds={},
+        delays=delays,
+    )
+    words, warnings = told_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
+    notes = [words, *(it.words for it in delays if it.is_clear)]
+    placed = _placed(sweep, views, clock, warnings, notes)
+    return placed if late is None else _straightened(sweep, placed, views, poses, late)
+
+
+def _straightened(
+    sweep: Sweep,
+    placed: Clocked,
+    views: Sequence[View],
+    poses: Mapping[int, ViewPoses],
+    late: DelayedFit,
+) -> Clocked:
+    """Sets the corners straight of all views that the stream covers."""
+    flange, clock = sweep.motion.flange, placed.clock
+    seen = [(view, poses[view.number]) for view in views if poses[view.number].corners is not None]
+    at_s = np.array([view.stamp_s for view, _ in seen], dtype=float) - clock.camera_minus_robot_s
+    covered = flange.covers(at_s)
+    seen, at_s = [it for it, ok in zip(seen, covered, strict=True) if ok], at_s[covered]
+    if sweep.camera is None:
+        return placed
+    found = straighten(
+        sweep.frames(seen),
+        (flange.at(at_s), flange.speeds(at_s)),
+        [it for _, it in seen],
+        sweep.camera,
+        late,
+    )
+    slopes = {view: it for view, it in found.slopes.items() if view in clock.speeds}
+    places = {it: at for at, it in enumerate(late.delays)}
+    delays = tuple(
+        replace(it, slopes={view: by[:, places[it.of]] for view, by in slopes.items()})
+        if it.of in places
+        else it
+        for it in clock.delays
+    )
+    return replace(placed, clock=replace(clock, delays=delays), poses=found.poses)
+
+
+def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:
+    """Takes the offset at which both turn alike, where the chain as it is read does not close."""
+    clock = Clock(
+        match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
+    )
+    warnings = [turning_words(match), *stated_doubts(clock, views)]
+    return _placed(sweep, views, clock, warnings, [])
+
+
+def _untold(
+    sweep: Sweep,
+    views: Sequence[View],
+    tried: tuple[Sequence[ClockFit], Sequence[Match]],
+) -> Clocked:
+    """Does without an estimate: by what is stated, or with views at rest."""
+    why, stated_s = why_untold(*tried), sweep.stated_s
+    offset_s = stated_s or 0.0
+    correlation = max((it.correlation for it in tried[1]), default=None)
+    stamps_s = np.array([view.stamp_s for view in views], dtype=float)
+    resting = at_rest(sweep.motion.flange, stamps_s - offset_s)
+    clock = Clock(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
+    if resting.all() and len(views):
+        note = (
+            f"The clocks of camera and robot are taken to be {1e3 * offset_s:+.4g} ms apart, "
+            f"{'as stated' if stated_s is not None else 'as nothing is stated'}: the views were "
+            "taken at rest, where this does not count."
+        )
+        return _placed(sweep, views, clock, [], [note])
+    if stated_s is not None:
+        warning = (
+            f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
+            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
+        )
+        clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
+        return _placed(sweep, views, clock, [warning], [])
+    if resting.sum() < FEWEST_VIEWS:
+        raise no_offset(sweep.motion, views, resting, why)
+    warning = (
+        f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
+        f"between the clocks is not known: {why}."
+    )
+    kept = [view for view, it in zip(views, resting, strict=True) if it]
+    placed = _placed(sweep, kept, clock, [warning], [])
+    rejected = {it.view: it for it in placed.rejections} | {
+        view.number: Rejection(view.number, _IN_MOTION)
+        for view, it in zip(views, resting, strict=True)
+        if not it
+    }
+    return replace(placed, rejections=tuple(rejected.values()))
+
+
+def _placed(
+    sweep: Sweep,
+    views: Sequence[View],
+    clock: Clock,
+    warnings: Sequence[str],
+    notes: Sequence[str],
+) -> Clocked:
+    """Gives views their poses at an offset, and chooses among very many."""
+    at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
+    covered = sweep.motion.flange.covers(at_s)
+    inside = [view for view, it in zip(views, covered, strict=True) if it]
+    poses, speeds = sweep.motion.flange.at(at_s[covered]), sweep.motion.flange.speeds(at_s[covered])
+    chosen = _chosen(inside, poses, speeds)
+    taken = [inside[at].number for at in chosen]
+    rows = dict(zip(taken, sweep.motion.numbers(at_s[covered][chosen]), strict=True))
+    if clock.method != "rest":
+        clock = replace(clock, speeds=dict(zip(taken, speeds[chosen], strict=True)))
+        notes = [*notes, speed_words(clock, speeds[chosen], len(inside))]
+    lost = dict(_uncovered(sweep.motion, views, at_s, covered))
+    # A sweep may be longer than the stream beside it.
+    beyond = {it for it, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
+    spared = {it.number: _SPARED for it in inside if it.number not in rows}
+    lost |= {it.number: _NO_TIME for it in sweep.views if _knows_nothing(it)}
+    return Clocked(
+        clock,
+        tuple(
+            replace(it, numbers={**it.numbers, **rows.get(it.number, {})})
+            for it in sweep.views
+            if it.number in rows or not (is_open(it) or _knows_nothing(it))
+        ),
+        tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
+        spared | dict.fromkeys(beyond, _BEYOND),
+        tuple(warnings),
+        tuple(notes),
+    )
+
+
+def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> IntArray:
+    """Which views to use: all of few, of many the slow ones, and those that are held back."""
+    everything = np.arange(len(views))
+    if len(views) <= _MANY_VIEWS:
+        return everything
+    held = np.array([view.holdout for view in views])
+    free = everything[~held]
+    return np.sort([*free[slow_and_new(poses[free], speeds[free])], *everything[held]])
+
+
+def _uncovered(
+    motion: Motion, views: Sequence[View], at_s: FloatArray, covered: Mask
+) -> Iterator[tuple[int, str]]:
+    """The views about which the stream says nothing, and why."""
+    first_s, last_s = motion.flange.stamps_s[[0, -1]]
+    for view, it_s, there in zip(views, at_s, covered, strict=True):
+        if not there:
+            within = first_s <= it_s <= last_s
+            yield view.number, _IN_A_GAP if within else _BEYOND
+
+
+def _knows_nothing(view: View) -> bool:
+    """Whether neither a pose of the robot nor a time is there."""
+    return view.stamp_s is None and view.base_from_flange() is None and view.joints_rad is None

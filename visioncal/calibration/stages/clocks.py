@@ -1,0 +1,140 @@
+"""Rows that have a time and no pose of a robot: its stream tells them where it was.
+
+Every pair of a camera and a robot has clocks of its own, whose offset is estimated from the motion
+that both have seen.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.calibration.stages.clock import Clocked, Pair, Sweep, set_clock
+from visioncal.calibration.stages.motion import is_open, motion_of, stream_of
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.offset import Clock
+from visioncal.core.errors import VisioncalError
+from visioncal.core.types import Rejection
+from visioncal.estimation.effects.clock import clock_effect
+from visioncal.estimation.parts import Effect
+from visioncal.robot import Robot
+from visioncal.session import Session, View, frame_name
+from visioncal.session.kinds import is_seen
+from visioncal.session.tables import ClockTable
+from visioncal.vision.targets import numbered_positions
+
+T = TypeVar("T", bound=Observed)
+
+
+def waits_for_clock(session: Session) -> bool:
+    """Tells whether rows have a time, and the pose of the robot that they need in a stream."""
+    return bool(_waiting(session))
+
+
+def set_clocks(seen: T) -> T:
+    """Gives rows the poses of robots at their times.
+
+    Raises:
+        DataError: The stream of an only robot has no poses, and no joints that its model knows, or
+            no view of its only camera lies within it.
+        DegenerateError: The motion of an only pair does not tell the offset, it is not stated, and
+            too few views were taken at rest.
+    """
+    for pair, rows in _waiting(seen.session).items():
+        seen = _with_pair(seen, pair, rows)
+    return seen
+
+
+def _waiting(session: Session) -> dict[Pair, list[View]]:
+    """The rows that lack the pose of one robot that has a stream, where any of them has a time."""
+    if not session.streams or not any(is_open(view) for view in session.views):
+        return {}
+    found: dict[Pair, list[View]] = {}
+    for it in session.observations:
+        if len(it.lacks) == 1 and is_seen(it.view) and stream_of(session, it.lacks[0]):
+            found.setdefault(Pair(it.seer, it.lacks[0]), []).append(it.view)
+    return {pair: rows for pair, rows in found.items() if any(map(is_open, rows))}
+
+
+def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
+    session, lens = seen.session, seen.lenses.get(pair.camera)
+    document = session.robot_documents.get(pair.robot)
+    # An only pair needs no name, and there is nothing to go on with where it has no clock.
+    is_only = max(len(session.cameras), len(session.robots)) < 2
+    of = "" if is_only else f"{pair.words}: "
+    on_flange = session.frames[pair.camera] == frame_name("flange", pair.robot)
+    try:
+        motion = motion_of(
+            session,
+            None if document is None else Robot.from_document(document),
+            stream_of(session, pair.robot),
+        )
+        sweep = Sweep(
+            motion,
+            "eye-in-hand" if on_flange else "eye-to-hand",
+            tuple(rows),
+            _stated_s(session, pair.camera),
+            None if lens is None else lens.camera,
+            numbered_positions(tuple(session.boards.values())),
+        )
+        clocked = set_clock(sweep, seen.poses)
+    except VisioncalError as error:
+        if is_only:
+            raise
+        lost = [Rejection(it.number, f"no pose: {error.message}") for it in rows]
+        return seen.noting(lost, (f"{of}{error.message} {error.next_step}".strip(),))
+    named = {"robot": pair.robot} if pair.robot else {}
+    views = tuple(replace(it, text={**it.text, **named}) for it in clocked.views)
+    seen = replace(
+        seen,
+        clocks={**seen.clocks, pair: replace(clocked, views=views)},
+        poses={**seen.poses, **clocked.poses},
+        notes=(*seen.notes, *(f"{of}{it}" for it in clocked.notes)),
+    )
+    return seen.noting(clocked.rejections, (f"{of}{it}" for it in clocked.warnings))
+
+
+def _stated_s(session: Session, camera: str) -> float | None:
+    """What the session states of a camera's clock, or of all of them."""
+    declared = session.declaration
+    tables: dict[str, ClockTable] = {
+        frame_name("camera", name): it for name, it in declared.clocks.items()
+    }
+    clock = tables.get(camera, declared.clock)
+    return clock.camera_minus_robot_s if clock.model_fields_set else None
+
+
+def clock_effects(
+    cell: Cell, clocks: Mapping[Pair, Clocked], erring: Collection[str] = ()
+) -> tuple[Effect, ...]:
+    """The errors of offsets and times within images [s], as effects on the cell's rows.
+
+    Args:
+        cell: The cell.
+        clocks: What was found of clocks.
+        erring: The robots, as the problem has them, whose arms' errors are unknowns of the fit.
+    """
+    views = [it.view for it in cell.rows]
+    found: list[Effect] = []
+    for pair, clocked in clocks.items():
+        if clocked.clock.speeds and robot_key(pair.robot) in cell.poses:
+            errs = robot_key(pair.robot) in erring
+            found.append(_effect(cell, pair, clocked.clock, clocked.clock.known_s(erring=errs)))
+            found += [
+                it.effect(views, pair.delay(it.of)) for it in clocked.clock.delays if it.is_clear
+            ]
+    return tuple(found)
+
+
+def _effect(cell: Cell, pair: Pair, clock: Clock, sigma_s: float) -> Effect:
+    speeds = clock.speeds
+    concerned = np.array([it.view in speeds for it in cell.rows], dtype=bool)
+    robot = robot_key(pair.robot)
+    moving = np.zeros((len(cell.poses[robot]), 6))
+    for row in cell.rows:
+        if row.view in speeds:
+            moving[row.station] = speeds[row.view]
+    found = clock_effect(moving, sigma_s, pair.effect, robot)
+    return replace(found, concerned=concerned)

@@ -1,0 +1,234 @@
+"""Corners by all pixels around them, in the images where the template has found them before."""
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from visioncal.calibration.stages.detect import image_of
+from visioncal.core.types import Camera, Corners, FloatArray, Image, Progress, Rejection
+from visioncal.results.evidence import ExplainedImage, ViewEvidence
+from visioncal.session import Session, View
+from visioncal.vision.dense.blur import Blur
+from visioncal.vision.dense.fit import Fitted, fit_corners
+from visioncal.vision.dense.library import ONE_TORCH_THREAD
+from visioncal.vision.dense.shown import MAGNIFIED, Explained, explain
+from visioncal.vision.finders.template import Refined, refine
+
+# Views that show whether smoothing helps, its sigma [px], and by how much it has to.
+_SAMPLE, _SMOOTH_PX, _HELPS = 4, 0.7, 0.95
+# Of a view where less than this share of the corners could be fitted, those of the template serve.
+_LEAST_FITTED = 0.5
+_KINDS = ("charuco", "checkerboard")
+# Of pictures for people.
+_QUALITY = 90
+# What the template has of an image, and what all pixels have.
+_Look: TypeAlias = tuple[Refined, Fitted | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Dense:
+    """How corners are fitted by all pixels, and what was found of the images.
+
+    Attributes:
+        device: What torch works on: `cpu` or `cuda`.
+        fits: What was fitted, by view.
+    """
+
+    device: str
+    fits: Mapping[int, Fitted] = field(default_factory=dict)
+
+    @property
+    def blurs(self) -> dict[int, Blur]:
+        """The point-spread function of each view's image."""
+        return {view: it.blur for view, it in self.fits.items()}
+
+    def notes(self) -> tuple[str, ...]:
+        """What blurs the images, in sentences."""
+        words = []
+        moved, focus = (
+            {view: it for view, it in self.blurs.items() if it.cause == cause}
+            for cause in ("motion", "focus")
+        )
+        if moved:
+            view, worst = max(moved.items(), key=lambda it: it[1].length_px)
+            words.append(
+                f"Motion smears {len(moved)} of {len(self.fits)} images, by up to "
+                f"{worst.length_px:.1f} px (view {view}, at {worst.direction_deg:.0f} deg from the "
+                "image's rows): stand still for longer before an image, or expose for less."
+            )
+        if focus:
+            view, worst = max(focus.items(), key=lambda it: it[1].width_px)
+            words.append(
+                f"{len(focus)} of {len(self.fits)} images are out of focus, with edges up to "
+                f"{worst.width_px:.1f} px wide as a sigma (view {view}): set the focus to the "
+                "distance of the board, or close the aperture."
+            )
+        return tuple(words)
+
+
+def fit_densely(
+    session: Session,
+    views: Sequence[View],
+    corners: Mapping[int, Corners],
+    dense: Dense,
+    progress: Progress | None = None,
+) -> tuple[dict[int, Corners], Dense]:
+    """Fits the corners of views by all pixels around them.
+
+    Args:
+        session: What was recorded.
+        views: Its views.
+        corners: What was found in them, each by its own board's numbers.
+        dense: How.
+        progress: Told after each image.
+
+    Returns:
+        The corners, each with its weight, and what was found of the images. What other detectors
+        have found stays as it is.
+    """
+    boards, board_of = session.boards, session.board_of
+    mine = [
+        it
+        for it in views
+        if it.number in corners
+        and it.image
+        and not it.has_corners
+        and boards[board_of(it)].kind in _KINDS
+    ]
+
+    def fit(view: View, smooth_px: float) -> _Look | None:
+        image = image_of(session, view)
+        if isinstance(image, Rejection):
+            return None
+        target, seen = boards[board_of(view)], corners[view.number]
+        start = refine(image, target, seen.ids, seen.px)
+        found = fit_corners(
+            image,
+            target,
+            seen.ids,
+            start.px,
+            start.blur_px,
+            device=dense.device,
+            smooth_px=smooth_px,
+        )
+        return start, found
+
+    # One thread keeps a GPU busy.
+    threads = (os.cpu_count() or 1) if dense.device == "cpu" else 1
+    found = {}
+    with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(threads) as pool:
+        sample = mine[:: max(1, len(mine) // _SAMPLE)][:_SAMPLE]
+        both = [
+            list(pool.map(lambda view, px=px: fit(view, px), sample)) for px in (0.0, _SMOOTH_PX)
+        ]
+        smooths = _smoothing_helps(*both)
+        ready = dict(zip((it.number for it in sample), both[smooths], strict=True))
+        rest = [it for it in mine if it.number not in ready]
+        looks = pool.map(lambda view: fit(view, smooths * _SMOOTH_PX), rest)
+        looked = chain(ready.items(), zip((it.number for it in rest), looks, strict=True))
+        for view, it in looked:
+            if it is not None:
+                found[view] = it
+            if progress is not None:
+                progress("dense", len(found), len(mine))
+    fits = {
+        view: it
+        for view, (_, it) in found.items()
+        if it is not None and it.fitted.mean() >= _LEAST_FITTED
+    }
+    sigmas = {view: fits[view].sigma_px if view in fits else start.sigma_px
+              for view, (start, _) in found.items()}  # fmt: skip
+    every = np.concatenate([np.zeros(0), *sigmas.values()])
+    typical_px = float(np.nanmedian(every)) if np.isfinite(every).any() else 1.0
+    weighed = {
+        view: _weighed(corners[view], fits.get(view), typical_px / sigmas[view]) for view in found
+    }
+    return {**corners, **weighed}, replace(dense, fits={**dense.fits, **fits})
+
+
+def _smoothing_helps(plain: Sequence[_Look | None], smooth: Sequence[_Look | None]) -> bool:
+    """Whether corners scatter less when image and model are smoothed alike."""
+    shares = [
+        after[1].scatter_px / before[1].scatter_px
+        for before, after in zip(plain, smooth, strict=True)
+        if before is not None and before[1] is not None
+        and after is not None and after[1] is not None and before[1].scatter_px > 0.0
+    ]  # fmt: skip
+    return bool(shares) and float(np.median(shares)) < _HELPS
+
+
+def _weighed(seen: Corners, fit: Fitted | None, weights: FloatArray) -> Corners:
+    """The corners that a fit has, or those of the template, with weights where they are known."""
+    known = np.isfinite(weights)
+    if fit is None and known.any():
+        return replace(seen, weights=np.where(known, weights, np.nanmin(weights)))
+    if fit is None:
+        return seen
+    return replace(
+        seen,
+        ids=seen.ids[known],
+        px=fit.px[known],
+        blur_px=fit.blur.width_px,
+        weights=weights[known],
+    )
+
+
+def explained(
+    session: Session, evidence: Sequence[ViewEvidence], dense: Dense, camera: Camera
+) -> tuple[ViewEvidence, ...]:
+    """Adds to the evidence of views how far a calibration explains their images.
+
+    Args:
+        session: What was recorded.
+        evidence: Of its views, with the corners where the calibration puts them.
+        dense: What blurs the images.
+        camera: The camera as calibrated.
+    """
+    rows = {view.number: view for view in session.views}
+
+    def explained(seen: ViewEvidence) -> ViewEvidence:
+        fit, px = dense.fits.get(seen.view), seen.predicted_px
+        if fit is None or px is None or seen.corners is None:
+            return seen
+        view = rows[seen.view]
+        image = image_of(session, view)
+        if isinstance(image, Rejection):
+            return seen
+        target = session.boards[session.board_of(view)]
+        found = explain(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
+        if found is None:
+            return seen
+        drawn, rest = (_as_jpeg(it) for it in (found.drawn, found.rest))
+        return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, found)))
+
+    with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return tuple(pool.map(explained, evidence))
+
+
+def _as_jpeg(image: Image) -> bytes:
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+
+
+def _words(fit: Fitted, found: Explained) -> str:
+    """What blurs an image, and how much of it is not explained."""
+    blur = fit.blur
+    cause = {
+        "motion": "**Smeared by motion.** ",
+        "focus": "**Out of focus.** ",
+        "": "**Sharp.** ",
+    }[blur.cause]
+    return (
+        f"{cause}Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian of "
+        f"{blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
+        f"{blur.length_px:.2f} px at {blur.direction_deg:.0f} deg from the image's rows.\n\n"
+        f"What is not explained has an rms of {found.rest_rms:.1f} grey levels on the board, about "
+        f"its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. Edges that "
+        "show on one side light and on the other dark are where the board is not where the "
+        "calibration has it."
+    )

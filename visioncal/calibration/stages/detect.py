@@ -1,0 +1,369 @@
+"""Finds the target in every image, on threads, with a reason where it cannot be used.
+
+Where another detector has found the corners of a view (corners.csv), these are taken.
+"""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Condition
+
+import cv2
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.threads import Shared
+from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Target
+from visioncal.estimation.planar import determines_pose
+from visioncal.session import Session, View
+from visioncal.session.kinds import name_of
+from visioncal.vision.finders import NotFound, find_target, fitting_layouts
+from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
+from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
+from visioncal.vision.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
+from visioncal.vision.targets import corner_positions, point_numbers
+
+# A homography takes four points.
+_FEWEST_GIVEN = 4
+# Corners that others have found may lie outside the image by this share of it.
+_OUTSIDE = 0.1
+# Images looked at to tell which layout was printed.
+_LAYOUT_SAMPLE = 3
+
+
+@dataclass(frozen=True)
+class DetectOptions:
+    """What a view needs in order to be used.
+
+    Attributes:
+        min_corners: Fewest corners of a board; a homography needs 4, the rest are its check.
+        max_blur_px: Widest edges, as a Gaussian's sigma [px]. Defocus of this size still gives
+            corners to 0.1 px; motion of this size is a pose that changed during the exposure.
+        threads: How many images are worked on at a time; 0 for one a core.
+    """
+
+    min_corners: int = 6
+    max_blur_px: float = 4.0
+    threads: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """The corners by view, in the session's order, and the views without."""
+
+    corners: Mapping[int, Corners]
+    rejections: tuple[Rejection, ...]
+    resolution: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What one image gave."""
+
+    found: Corners | Rejection
+    resolution: tuple[int, int] | None
+    misfit: bool = False
+
+
+class _Room:
+    """Bounds what threads work on at once, in shares of the largest image that is looked at."""
+
+    def __init__(self) -> None:
+        self._left = 1.0
+        self._changed = Condition()
+
+    @contextmanager
+    def taken(self, share: float) -> Iterator[None]:
+        """Waits until there is room for a share; one beyond all of it waits to be alone."""
+        share = min(max(share, 0.0), 1.0)
+        with self._changed:
+            # Shares add up to one but for rounding.
+            self._changed.wait_for(lambda: self._left >= share - 1e-9)
+            self._left -= share
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._left += share
+                self._changed.notify_all()
+
+
+def detect(
+    session: Session,
+    options: DetectOptions | None = None,
+    progress: Progress | None = None,
+    *,
+    among: Sequence[View] | None = None,
+) -> Detections:
+    """Finds in each image of a session the target that its row is said to show.
+
+    Args:
+        session: A session with a target; its views without images or corners are passed over.
+        options: What a view needs.
+        progress: Told after each image.
+        among: Those of its views to look at; all where None.
+
+    Returns:
+        The corners and the rejected views.
+
+    Raises:
+        DataError: No view shows the target, an image has another size than the camera, the size
+            of the images is not known, or the board that was printed has another layout than the
+            one declared.
+    """
+    options = options or DetectOptions()
+    if not session.boards:
+        raise DataError("session: images need a target.", next_step="Name one in session.toml.")
+    among = session.views if among is None else among
+    views = [view for view in among if view.image and not view.has_corners]
+    stated = _stated_resolution(session, among)
+    looks: list[_Look] = []
+    room = _Room()
+    with (
+        _ONE_OPENCV_THREAD.held(),
+        ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
+    ):
+        for look in pool.map(lambda view: _look(session, view, stated, options, room), views):
+            looks.append(look)
+            if progress is not None:
+                progress("detect", len(looks), len(views))
+    given = [view for view in among if view.has_corners]
+    resolution = _common_resolution(session, views, looks, given, stated)
+    for name in session.boards:
+        _check_layout(session, name, views, looks)
+    own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
+    own |= {view.number: _given(session, view, resolution) for view in given}
+    found = [own[view.number] for view in among if view.number in own]
+    return Detections(
+        {it.view: it for it in found if isinstance(it, Corners)},
+        tuple(it for it in found if isinstance(it, Rejection)),
+        resolution,
+    )
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+# OpenCV's threads inside ours slow both down.
+_ONE_OPENCV_THREAD = Shared(_one_opencv_thread)
+
+
+def image_of(session: Session, view: View) -> Image | Rejection:
+    """Reads a view's (h, w) grey image; or says why there is none."""
+    if not session.images.exists(view.image):
+        return Rejection(view.number, f"{view.image} {session.images.absence(view.image)}")
+    return _decoded(view, session.images.read(view.image))
+
+
+def _decoded(view: View, data: bytes) -> Image | Rejection:
+    image = decode_image(data)
+    return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
+
+
+def _look(
+    session: Session,
+    view: View,
+    stated: tuple[int, int] | None,
+    options: DetectOptions,
+    room: _Room,
+) -> _Look:
+    absence = session.images.absence(view.image)
+    if absence:
+        return _Look(Rejection(view.number, f"{view.image} {absence}"), None)
+    name = session.board_of(view)
+    target = session.boards[name]
+    data = session.images.read(view.image)
+    size = claimed_size(data) or (0, 0)
+    pixels = size[0] * size[1]
+    if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
+        # Refused in any case: what another size shows need not be looked at.
+        return _Look(Rejection(view.number, f"{view.image} is of another size"), size)
+    most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
+    with room.taken(pixels / most):
+        image = _decoded(view, data)
+        if isinstance(image, Rejection):
+            return _Look(image, None)
+        found, misfit = look_for(image, target, view.number, options, name=name)
+    return _Look(found, (image.shape[1], image.shape[0]), misfit)
+
+
+def look_for(
+    image: Image,
+    target: Target,
+    view: int,
+    options: DetectOptions | None = None,
+    *,
+    name: str = "",
+) -> tuple[Corners | Rejection, bool]:
+    """Looks for a target in one image, as `detect` does in those of a session.
+
+    Args:
+        image: (h, w) grey image.
+        target: What to look for.
+        view: The view's number.
+        options: What a view needs.
+        name: What the session calls the target, where it has several.
+
+    Returns:
+        The corners, or why the view cannot be used; and whether markers were seen that lie
+        otherwise than on this target.
+    """
+    options = options or DetectOptions()
+    seen = find_target(image, target)
+    if isinstance(seen, NotFound):
+        cause = why_hard_to_see(image, options.max_blur_px)
+        reason = f"{seen.reason}; {cause}" if cause else seen.reason
+        reason = f"{reason} (looked for target {name})" if name else reason
+        return Rejection(view, reason), seen.misfit
+    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
+    trouble = _trouble(target, seen.ids, blur, options)
+    if trouble:
+        return Rejection(view, trouble), False
+    return Corners(view, seen.ids, seen.px, blur, seen.weights), False
+
+
+def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners | Rejection:
+    """The corners that another detector has found in a view, or why they do not serve."""
+    corners, target = session.corners[view.number], session.boards[session.board_of(view)]
+    positions = corner_positions(target)
+    size = np.array(resolution)
+    beyond = np.any((corners.px < -_OUTSIDE * size) | (corners.px > (1 + _OUTSIDE) * size), axis=1)
+    trouble = ""
+    if beyond.any():
+        at = int(np.argmax(beyond))
+        u_px, v_px = corners.px[at].tolist()
+        trouble = (
+            f"corners.csv: point {point_numbers(target)[corners.ids[at]]} at ({u_px:g}, "
+            f"{v_px:g}) px lies far outside the image of {size[0]} x {size[1]} px"
+        )
+    elif len(corners.ids) < _FEWEST_GIVEN:
+        trouble = (
+            f"too few corners: corners.csv has {len(corners.ids)} of {len(positions)}, needs "
+            f"{_FEWEST_GIVEN}"
+        )
+    elif not determines_pose(positions[corners.ids]):
+        trouble = f"corners on one line: all {len(corners.ids)} of corners.csv, or all but one"
+    return Rejection(view.number, trouble) if trouble else corners
+
+
+def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
+    needed = 4 if target.kind in ("marker", "points") else options.min_corners
+    if len(ids) < needed:
+        return f"too few corners: {len(ids)} of {len(corner_positions(target))}, needs {needed}"
+    if not determines_pose(corner_positions(target)[ids]):
+        return f"corners on one line: all {len(ids)}, or all but one, lie in one row of the board"
+    if blur_px > options.max_blur_px:
+        return f"blurred: edges are {blur_px:.1f} px wide (limit {options.max_blur_px:.1f})"
+    return ""
+
+
+def _common_resolution(
+    session: Session,
+    views: Sequence[View],
+    looks: Sequence[_Look],
+    given: Sequence[View],
+    stated: tuple[int, int] | None,
+) -> tuple[int, int]:
+    """Checks that all images have the camera's size, or at least one size between them."""
+    sizes = [look.resolution for look in looks if look.resolution is not None]
+    if not sizes and given:
+        if stated is None:
+            raise DataError(
+                f"session {session.name!r}: the camera's resolution is missing, and no image that "
+                "is searched tells it.",
+                culprits=["session.toml: camera.resolution"],
+                next_step="Add resolution = [width, height] to [camera]: the size of the images "
+                "in which the corners were found.",
+            )
+        return stated
+    if not sizes:
+        reasons = [f"view {it.view}: {it.reason}" for it in _rejections(looks)]
+        raise DataError(
+            f"session {session.name!r}: none of its {len(views)} images can be read.",
+            culprits=reasons,
+            next_step=f"First: {reasons[0]}." if reasons else "Give the views images.",
+        )
+    wanted = stated or max(set(sizes), key=sizes.count)
+    line_of = {view.number: line for line, view in enumerate(session.views, start=2)}
+    culprits = [
+        f"views.csv line {line_of[view.number]}, column image: {view.image} is "
+        f"{look.resolution[0]} x {look.resolution[1]} px"
+        for view, look in zip(views, looks, strict=True)
+        if look.resolution is not None and look.resolution != wanted
+    ]
+    if culprits:
+        source = "the camera's resolution" if stated else "most other images"
+        raise DataError(
+            f"{culprits[0]}, but {source} is {wanted[0]} x {wanted[1]} px"
+            + (f" ({len(culprits)} images in all)." if len(culprits) > 1 else "."),
+            culprits=culprits,
+            next_step="Correct [camera] resolution in session.toml, or take out these views.",
+        )
+    return wanted
+
+
+def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:
+    """The size of the images of the camera that took some views, if it is stated."""
+    names = {name_of(session.declaration, "camera", view) for view in views}
+    sizes = {session.cameras[name].size for name in names & session.cameras.keys()} - {None}
+    return sizes.pop() if len(sizes) == 1 else None
+
+
+def _rejections(looks: Sequence[_Look]) -> list[Rejection]:
+    return [look.found for look in looks if isinstance(look.found, Rejection)]
+
+
+def _check_layout(
+    session: Session, name: str, views: Sequence[View], looks: Sequence[_Look]
+) -> None:
+    """Refuses a board whose markers lie otherwise than declared in most views that show it."""
+    target, board_of = session.boards[name], session.board_of
+    mine = [it for it in zip(views, looks, strict=True) if board_of(it[0]) == name]
+    misfits = [view for view, look in mine if look.misfit]
+    shown = sum(isinstance(look.found, Corners) for _, look in mine)
+    if not misfits or len(misfits) <= shown:
+        return
+    culprits = [f"view {it.number}" for it in misfits]
+    if target.kind != "charuco":
+        reasons = [it.reason for it in _rejections([look for _, look in mine if look.misfit])]
+        raise DataError(
+            f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views another "
+            f"board is seen: {max(set(reasons), key=reasons.count)}.",
+            culprits=culprits,
+            next_step="Mend the target's .toml, or name another: visioncal target check IMAGE says "
+            "what is printed.",
+        )
+    images = [decode_image(session.images.read(it.image)) for it in misfits[:_LAYOUT_SAMPLE]]
+    fitting = [fitting_layouts(it, target) for it in images if not isinstance(it, str)]
+    common = [it for it in fitting[0] if all(it in others for others in fitting)]
+    seen = (
+        f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views the markers do "
+        f"not lie as on a ChArUco board of {target.columns} x {target.rows} squares with "
+        f"legacy = {str(target.legacy).lower()}"
+    )
+    if not common:
+        raise DataError(
+            f"{seen}, nor with columns and rows exchanged or in the other layout.",
+            culprits=culprits,
+            next_step="Count the squares on the print and check the dictionary.",
+        )
+    best = common[0]
+    changes = [
+        f"{name} = {str(value).lower()}"
+        for name, value in (("columns", best.columns), ("rows", best.rows), ("legacy", best.legacy))
+        if value != getattr(target, name)
+    ]
+    raise DataError(
+        f"{seen}; they fit {', '.join(changes)}.",
+        culprits=culprits,
+        next_step=f"Set {', '.join(changes)} in the target's .toml.",
+    )

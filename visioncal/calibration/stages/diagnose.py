@@ -1,0 +1,72 @@
+"""Whether the residuals are noise: what they show beyond it, in words."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
+from visioncal.estimation.solve import Solution
+
+# Fewer stops than this leave no residuals to be tested.
+_FEWEST_STOPS = 6
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What the residuals of one robot's stops show beyond noise.
+
+    Attributes:
+        alike: Whether neighbouring stops err alike.
+        moved: How its base or what it looks at crept; None where noise explains it.
+    """
+
+    alike: Neighbours
+    moved: Drift | None
+
+
+def misfits(problem: Problem, fit: Solution) -> dict[str, Misfit]:
+    """Tests the residuals of each robot's stops for what is no noise; of few stops, none.
+
+    Args:
+        problem: The observations, their stops in the order of the session.
+        fit: Their fit, at rest.
+    """
+    found = {}
+    for robot in problem.robots:
+        if len(stops_of(problem, robot)) >= _FEWEST_STOPS:
+            fitted = (problem, fit.state, fit.noise, robot)
+            found[robot] = Misfit(neighbours(*fitted), drift(*fitted))
+    return found
+
+
+def misfit_words(found: Misfit, arm: ArmErrors | None, *, calibrated: bool) -> Iterator[str]:
+    """Words what of a robot's residuals is no noise, and what it probably is."""
+    alike, moved = found.alike, found.moved
+    if arm is not None and arm.is_significant and not calibrated:
+        size = f"{1e3 * LEVER_M * arm.sigma:.2g} mm and {np.rad2deg(arm.sigma):.2g} deg"
+        told = (
+            "they were estimated along"
+            if arm.of_links
+            else "without joint angles and a known [robot] model they cannot be estimated along"
+        )
+        yield (
+            f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
+            f"under {SIGNIFICANT:.0f}): its links are off from the model by typically {size}; "
+            f"{told}. What of them looks the same in all views is in no residual, and counts in "
+            "the covariance: a kinematic calibration of the arm would take it out."
+        )
+    if moved is not None:
+        yield (
+            f"Residuals drift with time: from the first stop to the last, base or target moved by "
+            f"{1e3 * moved.moved_m:.2g} mm and {np.rad2deg(moved.moved_rad):.2g} deg. Fasten them, "
+            "let the arm warm up, and record again."
+        )
+    if alike.is_significant:
+        yield (
+            f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
+            f"{np.sqrt(alike.factor):.2g} times farther than independent noise would. The robot's "
+            "share of the sigmas was multiplied by as much."
+        )

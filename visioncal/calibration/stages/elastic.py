@@ -1,0 +1,270 @@
+"""What the stops say of the joints' springs: stiffnesses, and whether loads and bends fit."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
+from visioncal.estimation.armpair import ArmData
+from visioncal.estimation.bending import (
+    Factor,
+    bends_seen,
+    compliance_unit,
+    flange_bends,
+    payload_factor,
+)
+from visioncal.robot import Loads, Robot
+
+# A joint is told where the stops leave less than this share of what was open about it.
+_TOLD = 0.5
+# Torque on a joint from which on it counts as loaded [N m].
+_LOADED_NM = 0.05
+_SURE = 2.0
+
+
+@dataclass(frozen=True)
+class Spring:
+    """A joint as a spring.
+
+    Attributes:
+        joint: Its name.
+        compliance: What it yields to a torque, zero or more [rad/(N m)].
+        sigma: Its standard deviation; where the stops do not tell it, that of springs at large.
+        is_told: Whether the stops tell it; others stay rigid.
+        torque_nm: Least and greatest torque on it at the stops [N m].
+    """
+
+    joint: str
+    compliance: float
+    sigma: float
+    is_told: bool
+    torque_nm: tuple[float, float]
+
+    @property
+    def stiffness(self) -> float | None:
+        """[N m/rad]; None where the joint is not told, or as good as rigid."""
+        if not self.is_told or self.compliance < _SURE * self.sigma:
+            return None
+        return 1.0 / self.compliance
+
+    @property
+    def words(self) -> str:
+        """Its stiffness with its sigma, in words; empty where it has none."""
+        stiffness, sigma = self.stiffness, self.stiffness_sigma
+        if stiffness is None or sigma is None:
+            return ""
+        return f"{1e-3 * stiffness:.4g} +- {figure(1e-3 * sigma)} kN m/rad"
+
+    def document(self) -> dict[str, Any]:
+        """It as calibration.json has it."""
+        row: dict[str, Any] = {
+            "joint": self.joint,
+            "compliance_rad_per_nm": self.compliance,
+            "sigma_rad_per_nm": self.sigma,
+            "told": self.is_told,
+            "torque_nm": list(self.torque_nm),
+        }
+        if self.stiffness is not None:
+            row["stiffness_nm_per_rad"] = self.stiffness
+            row["stiffness_sigma_nm_per_rad"] = self.stiffness_sigma
+        return row
+
+    @property
+    def stiffness_sigma(self) -> float | None:
+        """Standard deviation of the stiffness, to first order [N m/rad]."""
+        return None if self.stiffness is None else self.sigma * self.stiffness**2
+
+
+@dataclass(frozen=True, eq=False)
+class Elastic:
+    """The springs of an arm, and what the stops say of them.
+
+    Attributes:
+        springs: Joint by joint.
+        torques_nm: (m, n) on the joints at the stops [N m].
+        bends_rad: (m, n) how far each stop alone sees each joint bend [rad]; NaN where it cannot.
+        sag_mm: (m,) how far the loads of each stop move the flange [mm].
+        payload_kg: (m,) what it carried [kg].
+        payload: By which factor payload and force bend the arm beyond what is stated; None where
+            nothing hung on the flange.
+        weighs: Whether the model of the arm tells the masses of its links.
+        weight_moments: (n, 4 n) how the joints yield to the weight of links whose masses are not
+            known (see `bent_joints`); None where they are, or where they hardly yield.
+    """
+
+    springs: tuple[Spring, ...]
+    torques_nm: FloatArray
+    bends_rad: FloatArray
+    sag_mm: FloatArray
+    payload_kg: FloatArray
+    payload: Factor | None
+    weighs: bool
+    weight_moments: FloatArray | None
+
+    @property
+    def untold(self) -> tuple[str, ...]:
+        """The joints that the loads do not tell."""
+        return tuple(it.joint for it in self.springs if not it.is_told)
+
+    def document(self, views: Sequence[int]) -> dict[str, Any]:
+        """It as calibration.json has it.
+
+        Args:
+            views: (m,) by which views the stops go.
+        """
+        document: dict[str, Any] = {
+            "joints": [it.document() for it in self.springs],
+            "not_told": list(self.untold),
+            "weight": "of the model's masses" if self.weighs else "unknown",
+            "payload_kg": [float(self.payload_kg.min()), float(self.payload_kg.max())],
+            "sag_mm": {
+                "median": float(np.median(self.sag_mm)),
+                "most": float(self.sag_mm.max()),
+            },
+            "stops": [self._stop(at, view) for at, view in enumerate(views)],
+        }
+        if self.weight_moments is not None:
+            document["weight_moments"] = self.weight_moments.tolist()
+        if self.payload is not None:
+            document["payload_factor"] = {
+                "value": self.payload.value,
+                "sigma": self.payload.sigma,
+            }
+        return document
+
+    def _stop(self, at: int, view: int) -> dict[str, Any]:
+        """Torques and bends of a stop; a bend that is not told is left out."""
+        joints = (it.joint for it in self.springs)
+        bends = zip(joints, self.bends_rad[at].tolist(), strict=True)
+        return {
+            "view": view,
+            "payload_kg": float(self.payload_kg[at]),
+            "sag_mm": float(self.sag_mm[at]),
+            "torque_nm": self.torques_nm[at].tolist(),
+            "bend_mrad": {name: 1e3 * bend for name, bend in bends if np.isfinite(bend)},
+        }
+
+
+def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
+    """Tells what was found of the springs; None for a rigid arm.
+
+    Args:
+        arm: What was seen of it.
+        errors: Its errors by block, with their sizes before the stops were asked.
+    """
+    if not errors.keys() & {COMPLIANCE, WEIGHT}:
+        return None
+    model, q, loads = arm.model, arm.q, arm.loads
+    prior = errors[COMPLIANCE].sigma / model.torque_nm if COMPLIANCE in errors else 0.0
+    torques = model.robot.load_torques(model.bent(q, loads), loads)
+    sigmas = np.full(model.nominal.joint_count, prior)
+    bends_rad = np.full(torques.shape, np.nan)
+    if COMPLIANCE in model.weights:
+        variances = np.diag(arm.spread)[model.place_of(COMPLIANCE)]
+        sigmas = compliance_unit(model) * np.sqrt(variances)
+        bends_rad = bends_seen(arm, torques)
+    told = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _TOLD * prior)
+    return Elastic(
+        tuple(_springs(model, np.minimum(sigmas, prior), told, torques)),
+        torques,
+        bends_rad,
+        1e3 * flange_bends(model, q, loads),
+        loads.payload_kg,
+        payload_factor(arm),
+        model.nominal.masses is not None,
+        model.moments,
+    )
+
+
+def _springs(
+    model: ArmModel, sigmas: FloatArray, told: Mask, torques: FloatArray
+) -> Iterator[Spring]:
+    for at, name in enumerate(model.nominal.joint_names):
+        low, high = float(torques[:, at].min()), float(torques[:, at].max())
+        compliance = float(model.compliance[at])
+        yield Spring(name, compliance, float(sigmas[at]), bool(told[at]), (low, high))
+
+
+def remarks(elastic: Elastic) -> Iterator[str]:
+    """Says what was found of the springs, for the verdict."""
+    stiff = [it for it in elastic.springs if it.stiffness is not None]
+    if stiff:
+        words = ", ".join(f"{it.joint} {it.words}" for it in stiff)
+        yield (
+            f"The joints bend under load: their stiffness is {words}. At these stops that moves "
+            f"the flange by up to {figure(float(elastic.sag_mm.max()))} mm."
+        )
+    if elastic.weight_moments is not None:
+        yield (
+            "The arm yields to its own weight, of which its model tells nothing: how far, is told "
+            "at every posture, and counted. Stiffness is told by payload_kg that changes, or by "
+            "mass_kg and com_m in the joints' table."
+        )
+    elif elastic.untold:
+        several = len(elastic.untold) > 1
+        yield (
+            f"{some_of(elastic.untold)} {'are' if several else 'is'} not seen to bend under the "
+            f"loads of these stops, and {'are' if several else 'is'} taken for rigid. A load of "
+            "another direction, or farther out, would tell."
+        )
+
+
+def doubts(elastic: Elastic) -> Iterator[str]:
+    """Says where payload and bend do not fit together."""
+    factor = elastic.payload
+    if factor is not None and elastic.weighs and factor.is_off:
+        more = "heavier or hangs farther out" if factor.value > 1.0 else "lighter or hangs nearer"
+        yield (
+            f"Load and bend do not fit: the stops with a load bend {factor.value:.2f} +- "
+            f"{factor.sigma:.1g} times as far as the load times its reach asks of joints that "
+            f"yield to the arm's own weight as they do. The load is {more} than stated "
+            "(payload_kg, payload_x_m ...), or the masses of the arm's links are off."
+        )
+
+
+def deflection_words(
+    robot: Robot,
+    q: FloatArray,
+    stiffness_nm_per_rad: Sequence[float],
+    loads: Loads,
+    seen_mm: float,
+    sigma_mm: float,
+) -> str:
+    """Says whether a deflection that was seen follows from stiffnesses and a load.
+
+    Args:
+        robot: The arm.
+        q: (1, n) the posture [rad].
+        stiffness_nm_per_rad: Joint by joint; inf for a rigid one.
+        loads: The one load.
+        seen_mm: By how much the flange moved when it was put on [mm].
+        sigma_mm: What that is known to [mm].
+
+    Returns:
+        A sentence; empty where they fit to within three standard deviations.
+    """
+    compliance = 1.0 / np.array(stiffness_nm_per_rad)
+    torques = robot.load_torques(q, loads) - robot.load_torques(q)
+    bends = compliance * torques
+    moved = np.einsum("mij,mj->mi", robot.axis_jacobian(q), bends)[:, 3:]
+    expected_mm = 1e3 * float(np.linalg.norm(moved))
+    if abs(seen_mm - expected_mm) <= 3.0 * sigma_mm:
+        return ""
+    joints = ", ".join(
+        f"{name} {torque:.3g} N m / {1.0 / yields:.3g} N m/rad = {1e3 * bend:.2g} mrad"
+        for name, torque, yields, bend in zip(
+            robot.joint_names, torques[0], compliance, bends[0], strict=True
+        )
+        if yields
+    )
+    return (
+        f"Load and deflection do not fit: {joints} move the flange by {figure(expected_mm)} mm, "
+        f"and {figure(seen_mm)} mm are stated. Either the joints are {seen_mm / expected_mm:.1f} "
+        "times as compliant, or what bends is not the joints."
+    )

@@ -1,0 +1,221 @@
+"""What the joint fit found of lenses and boards, in sentences for the user."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.core.number_format import figure
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import FloatArray, IntArray, Target
+from visioncal.estimation.appearance import MOST_LOOSE
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.joint import (
+    Fitted,
+    MeasuredScale,
+    Side,
+    chance_limit,
+    contradicted_lens,
+    measured_scale,
+    moved_surprise,
+)
+from visioncal.estimation.scene import ONLY_CAMERA, Scene
+from visioncal.estimation.solve import held_shift
+
+# A rig that is as stated seems not to be in one session of ten thousand.
+_FALSE_ALARM = 1e-4
+
+
+def found_of_looks(side: Side, fitted: Fitted) -> Iterator[tuple[str, bool]]:
+    """Says what a joint fit found of lenses and boards, and whether each is a reason for doubt.
+
+    Args:
+        side: The frames' side of the fit.
+        fitted: The answer.
+    """
+    looks = fitted.looks
+    cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
+    for (camera, problem), it in cameras:
+        moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
+        found = noise_words(problem.stack, it.residuals, problem.unknowns(it, moving))
+        for words, is_doubt in (found, *_lens_words(fitted, camera)):
+            if words:
+                yield _of(camera, words), is_doubt
+    scene = next(iter(looks.problems.values())).scene
+    for board, target in enumerate(scene.targets):
+        if board not in looks.printed:
+            yield from ((it, True) for it in points_words(target, looks.moved_points(board)))
+            continue
+        called = f"board {scene.names[board]}".strip()
+        if _moves(fitted, looks.scale_of(board)):
+            yield scale_words(called, target.square_m, measured_scale(side, fitted, board))
+        if _moved(fitted, looks.shape_of(board)):
+            yield bend_words(called, 1e3 * float(np.ptp(looks.corners[board][:, 2]))), True
+
+
+def _of(camera: str, words: str) -> str:
+    """Names the camera, where it is not the only one."""
+    return words if camera == ONLY_CAMERA else f"{camera}: {words[0].lower()}{words[1:]}"
+
+
+def noise_words(stack: CornerStack, residuals: FloatArray, unknowns: int) -> tuple[str, bool]:
+    """Whether corners scatter otherwise than corners.csv states, in words; empty where not.
+
+    Args:
+        stack: The corners.
+        residuals: (n, 2) by their weights [px].
+        unknowns: How many were fitted to them.
+
+    Returns:
+        The words, and whether it is a reason for doubt: less scatter than is stated is none.
+    """
+    stated, shown = stack.stated_px, stack.shown_px(residuals, unknowns)
+    if stated is None or not stack.contradicts(residuals, unknowns):
+        return "", False
+    more = shown > stated
+    advice = (
+        "by the scatter. Look for errors of the detector, the lens or the target that sigma_px "
+        "leaves out."
+        if more
+        else "by what is stated. State what the detector errs by, or leave sigma_px out."
+    )
+    return (
+        f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
+        f"(sigma_px of a typical corner). The result goes {advice}",
+        more,
+    )
+
+
+def scale_words(board: str, square_m: float, measured: MeasuredScale) -> tuple[str, bool]:
+    """Words another size than the file states, and whether it is a reason for doubt.
+
+    Args:
+        board: What the board is called.
+        square_m: The stated side of its squares [m].
+        measured: What the robot's motion says.
+    """
+    side, share = 1e3 * square_m, f"{100 * measured.stated_sigma:.1g} %"
+    sized = (
+        f"By the robot's motion the {board} is "
+        f"{100 * abs(measured.scale):.2g} % "
+        f"{'larger' if measured.scale > 0 else 'smaller'} than stated (sigma "
+        f"{100 * measured.sigma:.1g} %): squares of {side * (1 + measured.scale):.4g} mm, not of "
+        f"{side:.4g} mm"
+    )
+    if not measured.contradicts:
+        allowed = f"{sized}, which what is stated allows (to within {share})."
+        return f"{allowed} The result goes by both.", False
+    return (
+        f"{sized}, which is not what is stated (to within {share}). The result goes by the robot. "
+        "Measure over many squares and mend square_m and square_sigma_m; if the board is right, "
+        "the arm's model is off by as much.",
+        True,
+    )
+
+
+def bend_words(board: str, bend_mm: float) -> str:
+    """Words a board that is not flat; `bend_mm` is the depth of its corners [mm]."""
+    return (
+        f"The {board} is not flat: its corners lie within {bend_mm:.2g} mm of "
+        "depth. Its shape was estimated with the rest; a board on a stiff, flat plate makes a "
+        "better result."
+    )
+
+
+def points_words(target: Target, moved_m: FloatArray) -> Iterator[str]:
+    """Whether a rig's points lie farther from where its table has them than it says.
+
+    Args:
+        target: The rig.
+        moved_m: (3 n,) how far its points were moved [m]; empty where they were not.
+    """
+    if not target.point_sigmas_m:
+        return
+    if not len(moved_m):
+        yield (
+            f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
+            f"their sigma_m counts for up to {MOST_LOOSE}."
+        )
+        return
+    sigmas = np.array(target.point_sigmas_m)
+    away = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
+    worst = int(np.argmax(away / sigmas))
+    if (away[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
+        yield (
+            f"Point {target.point_numbers[worst]} of target {target.name} lies "
+            f"{figure(1e3 * float(away[worst]))} mm from where its table has it, which is stated "
+            f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both: "
+            "measure the point again."
+        )
+
+
+def _lens_words(fitted: Fitted, camera: str) -> Iterator[tuple[str, bool]]:
+    looks = fitted.looks
+    problem, lens = looks.problems[camera], looks.lens_of(camera)
+    if problem.scene.mode == "refine" and not problem.has_spare_corners:
+        words = (
+            f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
+            f"{len(problem.stack.views)} views leave too little to judge by. Show a board with "
+            "more corners, or more views."
+        )
+        yield words, True
+    if not problem.scene.estimated and _moved(fitted, lens):
+        is_exact = problem.scene.matrix_sigma_px is None
+        steps = (looks.values - looks.stated)[lens[:4]]
+        yield lens_words(steps, is_doubtful=is_exact or contradicted_lens(fitted, camera))
+    if problem.contested:
+        shift = held_shift(fitted.problem, fitted.fit)[fitted.columns]
+        moves = shift[np.searchsorted(fitted.seen.free, lens[:4])]
+        yield contest_words(problem.scene, moves), True
+
+
+def lens_words(steps_px: FloatArray, *, is_doubtful: bool) -> tuple[str, bool]:
+    """Words given intrinsics that were refined, and whether it is a reason for doubt.
+
+    Args:
+        steps_px: (4,) by how much fx, fy, cx, cy moved [px].
+        is_doubtful: Whether they were taken for exact, or for better than they are.
+    """
+    if is_doubtful:
+        return (
+            "The given intrinsics do not fit these images and were refined: fx, fy, cx, cy moved "
+            f"by {_px(steps_px)} px. Calibrate the camera anew, or hold them with "
+            'intrinsics = "hold".',
+            True,
+        )
+    return (
+        "The given intrinsics were refined within what is stated: fx, fy, cx, cy moved by "
+        f"{_px(steps_px)} px.",
+        False,
+    )
+
+
+def contest_words(scene: Scene, moves_px: FloatArray) -> str:
+    """Words intrinsics that stay although the corners speak against them.
+
+    Args:
+        scene: What the camera looks at.
+        moves_px: (4,) how far fx, fy, cx, cy would move [px].
+    """
+    why = (
+        'intrinsics = "hold" keeps them'
+        if scene.mode == "hold"
+        else "they were kept, because views left out are predicted no better with others"
+    )
+    return (
+        "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
+        f"{_px(moves_px)} px. But {why}; what this does to the result counts in its sigmas. "
+        "Calibrate the camera anew."
+    )
+
+
+def _moves(fitted: Fitted, places: IntArray) -> bool:
+    return bool(np.isin(places, fitted.moving).all())
+
+
+def _moved(fitted: Fitted, places: IntArray) -> bool:
+    """Whether values were moved from what is stated by more than chance."""
+    return _moves(fitted, places) and moved_surprise(fitted, places) > chance_limit(len(places))
+
+
+def _px(values: FloatArray) -> str:
+    return ", ".join(f"{'-' if it < 0 else '+'}{figure(abs(it))}" for it in values)

@@ -1,0 +1,174 @@
+"""Grows the tree of a whole cell's frames from what pairs of them say of each other.
+
+Each body of frames (what stands in the cell, what a flange carries) is grown by the best transforms
+first (Prim 1957). What these do not reach is placed by views of which all else is known. A board
+that looks the same turned does not say which way round it was seen: what is placed by way of such
+a board is tried every way round, and all views together tell which it was.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+
+import numpy as np
+
+from visioncal.calibration.stages.init_instruments import placed_by_points
+from visioncal.calibration.stages.init_two_arms import between_arms
+from visioncal.calibration.stages.pair_observations import Factor, Growth, factors_of, product_of
+from visioncal.calibration.stages.pairwise import FEWEST, consensus, hand_eye
+from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray
+
+# A view that is farther off than this says nothing more about which start is right [m].
+_FAR_M = 0.1
+# So many starts are tried, by turns of boards, and not more.
+_MOST_TRIED = 256
+
+
+@dataclass(frozen=True, eq=False)
+class _Grown:
+    """Frames (4, 4) in their bodies, and those that stand there by a turned board, one or more."""
+
+    placed: dict[str, FloatArray]
+    by_turn: tuple[str, ...]
+    counts: tuple[int, ...]
+
+
+def grow(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Places all frames in their bodies.
+
+    Returns:
+        (4, 4) `body_from_frame` by name, and the frames that might as well be elsewhere, because
+        nothing tells which way round a board was seen.
+    """
+    first = _grown(growth, ())
+    if not first.by_turn:
+        return first.placed, ()
+    found = []
+    for chosen in _choices(first.counts):
+        grown = _grown(growth, chosen)
+        found.append((_score(growth, grown.placed), chosen, grown))
+    found.sort(key=lambda it: it[0])
+    score, chosen, best = found[0]
+    rivals = [it for value, it, _ in found[1:] if value < CLEAR_RATIO * score]
+    ambiguous = {
+        name
+        for rival in rivals
+        for name, mine, other in zip(best.by_turn, chosen, rival, strict=False)
+        if mine != other
+    }
+    return best.placed, tuple(it for it in best.placed if it in ambiguous)
+
+
+def _choices(counts: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    tried = list(counts)
+    while np.prod(tried, dtype=float) > _MOST_TRIED:
+        tried[tried.index(max(tried))] = 1
+    yield from product(*(range(it) for it in tried))
+
+
+def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
+    tree = growth.tree
+    placed = {tree.root: np.eye(4)}
+    placed |= {name: np.eye(4) for name, branch in tree.branches.items() if branch.robot}
+    by_turn: list[str] = []
+    counts: list[int] = []
+    while options := (
+        [*_related(growth, placed)]
+        or [*_implied(growth, placed)]
+        or [*placed_by_points(growth, placed)]
+        or [*_parted(growth, placed)]
+    ):
+        # What a turned board places comes last: others may come by a way that is certain.
+        name, matrices, _ = min(options, key=lambda it: (len(it[1]), it[2]))
+        at = 0
+        if len(matrices) > 1:
+            at = chosen[len(by_turn)] if len(by_turn) < len(chosen) else 0
+            by_turn.append(name)
+            counts.append(len(matrices))
+        placed[name] = matrices[at]
+    return _Grown(placed, tuple(by_turn), tuple(counts))
+
+
+def _related(
+    growth: Growth, placed: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, FloatArray, float]]:
+    """Frames that a relation places: each with (t, 4, 4) where it may be, and how well [m]."""
+    for it in growth.relations:
+        if it.first in placed and it.second not in placed:
+            yield it.second, (placed[it.first] @ it.matrix)[None], it.sigma_m
+        elif it.second in placed and it.first not in placed:
+            yield it.first, placed[it.second] @ invert(it.matrix @ it.turns), it.sigma_m
+
+
+def _implied(
+    growth: Growth, placed: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, FloatArray, float]]:
+    """Frames that are all that is not placed of what some views have to do with."""
+    for pair in growth.oriented:
+        rows = growth.sighted.early(pair.rows)
+        factors = factors_of(growth, pair, rows)
+        missing = [it for it in factors if it.frame and it.frame not in placed]
+        if len(missing) != 1:
+            continue
+        (it,) = missing
+        at = factors.index(it)
+        before, after = (product_of(part, placed) for part in (factors[:at], factors[at + 1 :]))
+        there = growth.sighted.candidates.take(rows).carried(invert(before), invert(after))
+        if it.is_inverse:
+            there = replace(there, poses=invert(there.poses))
+        # A board's own frame may be either way round: that of its first view is taken.
+        ways = range(1 if it.frame == pair.seen else len(growth.sighted.turns_of(pair.seen)))
+        found = [consensus(there, way) for way in ways]
+        yield it.frame, np.array([matrix for matrix, *_ in found]), found[0][2]
+
+
+def _parted(
+    growth: Growth, placed: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, FloatArray, float]]:
+    """Frames that are one of two that robots part, of all that some views have to do with.
+
+    Views say `before * u * between * v * after = seen`, u and v being unknown: a hand-eye
+    calibration with `between^-1` for its robot. Where three are unknown, two arms part them.
+    """
+    for pair in growth.oriented:
+        rows = growth.sighted.early(pair.rows)
+        factors = factors_of(growth, pair, rows)
+        open_ones = [at for at, it in enumerate(factors) if it.frame and it.frame not in placed]
+        if len(rows) < FEWEST or len(open_ones) not in (2, 3):
+            continue
+        # What no robot parts cannot be told apart.
+        inner = [factors[begin + 1 : end] for begin, end in pairwise(open_ones)]
+        if not all(any(not it.frame for it in part) for part in inner):
+            continue
+        parts = [
+            product_of(factors[begin + 1 : end], placed)
+            for begin, end in pairwise([-1, *open_ones, len(factors)])
+        ]
+        there = growth.sighted.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
+        if len(open_ones) == 2:
+            found = hand_eye(invert(parts[1]), there, "eye-in-hand")
+            if found is not None:
+                (u_inverse, v), (sigma_u, sigma_v) = found
+                yield _as_placed(factors[open_ones[0]], invert(u_inverse), sigma_u)
+                yield _as_placed(factors[open_ones[1]], v, sigma_v)
+        elif (middle := between_arms(parts[1], parts[2], there)) is not None:
+            yield _as_placed(factors[open_ones[1]], *middle)
+
+
+def _as_placed(factor: Factor, matrix: FloatArray, sigma_m: float) -> tuple[str, FloatArray, float]:
+    there = invert(matrix) if factor.is_inverse else matrix
+    return factor.frame, there[None], sigma_m
+
+
+def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
+    """Mean distance [m] of the early views from what the placed frames predict."""
+    away = []
+    for pair in growth.oriented:
+        rows = growth.sighted.early(pair.rows)
+        factors = factors_of(growth, pair, rows)
+        if all(it.frame in placed for it in factors if it.frame):
+            distances = growth.sighted.candidates.take(rows).distances(product_of(factors, placed))
+            away.append(np.minimum(distances.min(axis=1), _FAR_M))
+    return float(np.concatenate(away).mean()) if away else 0.0

@@ -1,0 +1,259 @@
+"""The camera's intrinsics, where the session gives none."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+
+from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
+from visioncal.estimation.bundle import BundleFit, fit_bundle
+from visioncal.estimation.corners import CornerStack, mean_square_by_view
+from visioncal.estimation.gating import gate
+from visioncal.estimation.planar import planar_poses
+from visioncal.estimation.poses import fit_poses
+from visioncal.vision.targets import numbered_positions
+
+Coefficients: TypeAlias = Literal["auto", 5, 8]
+
+# Two views of a plane determine fx, fy, cx, cy in theory (Zhang 2000, section 3.1); a third gives
+# the distortion and a first check.
+_FEWEST_VIEWS = 3
+_ROUNDS = 3
+# Starts for the focal length, in image widths, where Zhang's own start does not converge.
+_FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
+# The rational model has to explain this share more, of views in the fit and of views left out.
+_WORTH_COMPARING = 0.02
+_FOLDS = 5
+# Limits of the warnings: the focal length as a share, the principal point in pixels.
+_FOCAL_LIMIT, _CENTRE_LIMIT_PX = 0.005, 5.0
+_TILT_SPREAD_DEG, _DISTANCE_SPREAD, _GRID = 10.0, 1.2, 3
+
+
+@dataclass(frozen=True)
+class IntrinsicsOptions:
+    """How to estimate.
+
+    Attributes:
+        coefficients: Brown's model with 5 or 8 coefficients; `auto` takes 8 where that predicts
+            views better that the fit has not seen. A fisheye always has 4.
+    """
+
+    coefficients: Coefficients = "auto"
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """Estimated intrinsics.
+
+    Attributes:
+        camera: The intrinsics.
+        covariance: (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
+        sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
+        rejections: Views whose residual is no noise.
+        warnings: What the views do not determine, in words.
+    """
+
+    camera: Camera
+    covariance: FloatArray
+    sigma_px: float
+    rejections: tuple[Rejection, ...]
+    warnings: tuple[str, ...]
+
+
+def estimate_intrinsics(
+    corners: Mapping[int, Corners],
+    targets: Sequence[Target],
+    resolution: tuple[int, int],
+    model: CameraKind,
+    options: IntrinsicsOptions | None = None,
+) -> Intrinsics:
+    """Estimates the intrinsics from views of targets (Zhang 2000 where these are planar).
+
+    Args:
+        corners: The corners by view.
+        targets: What was seen; the corners of several are numbered through.
+        resolution: (width, height) [px].
+        model: `brown` or `fisheye`.
+        options: How to estimate.
+
+    Returns:
+        The intrinsics with covariance.
+
+    Raises:
+        DataError: There are too few views.
+        DegenerateError: The views do not determine the focal length at all.
+        ConvergenceError: No start converges.
+    """
+    options = options or IntrinsicsOptions()
+    if len(corners) < _FEWEST_VIEWS:
+        raise DataError(
+            f"intrinsics: {len(corners)} views show the target, and at least {_FEWEST_VIEWS} are "
+            "needed.",
+            culprits=["views"],
+            next_step="Add views, or give matrix and distortion in [camera].",
+        )
+    stack = CornerStack.of(corners, numbered_positions(targets))
+    with one_blas_thread():
+        coefficients = 4 if model == "fisheye" else 8 if options.coefficients == 8 else 5
+        fit = _first_fit(stack, model, resolution, coefficients)
+        reasons: dict[int, str] = {}
+        for _ in range(_ROUNDS):
+            passed = gate(stack, fit.residuals)
+            if passed.is_open:
+                break
+            reasons |= passed.reasons
+            kept = stack.keep(passed.mask)
+            poses = fit.cam_from_target[np.isin(stack.views, kept.views)]
+            stack, fit = kept, _fit(kept, fit.camera, poses)
+        if model == "brown" and options.coefficients == "auto":
+            fit = _with_rational_terms(stack, fit)
+    _check(fit)
+    return Intrinsics(
+        fit.camera,
+        fit.covariance,
+        fit.sigma_px,
+        tuple(Rejection(*item) for item in reasons.items()),
+        tuple(_warnings(stack, fit)),
+    )
+
+
+def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
+    """Fits with priors far wider than any lens, which only keep the undetermined in place."""
+    size = np.array(camera.resolution, dtype=float)
+    sigma = np.concatenate([np.full(2, size[0]), size / 4, np.full(len(camera.distortion), 100.0)])
+    return fit_bundle(stack, camera, poses, sigma)
+
+
+def _first_fit(
+    stack: CornerStack, model: CameraKind, resolution: tuple[int, int], coefficients: int
+) -> BundleFit:
+    """Fits from Zhang's start and from a row of focal lengths; the first good one wins."""
+    best: BundleFit | None = None
+    for focal in _focal_starts(stack, resolution):
+        width, height = resolution
+        matrix = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
+        camera = Camera(model, resolution, matrix, np.zeros(coefficients))
+        fit = _fit(stack, camera, planar_poses(stack, camera).first)
+        if best is None or fit.sigma_px < best.sigma_px:
+            best = fit
+        # Corners are found to a few tenths of a pixel; a wrong basin is off by many pixels.
+        if best.sigma_px < 1.0 and best.settled:
+            break
+    if best is None or not np.isfinite(best.sigma_px):
+        raise ConvergenceError(
+            "intrinsics: no focal length explains the views.",
+            next_step="Check the target's description against the print.",
+        )
+    return best
+
+
+def _focal_starts(stack: CornerStack, resolution: tuple[int, int]) -> Iterator[float]:
+    if _is_flat(stack):
+        points = np.split(stack.points.astype(np.float32), stack.starts[1:])
+        px = np.split(stack.px.astype(np.float32), stack.starts[1:])
+        zhang = cv2.initCameraMatrix2D(points, px, resolution)[0, 0]
+        if np.isfinite(zhang) and 0.1 * resolution[0] < zhang < 20 * resolution[0]:
+            yield float(zhang)
+    yield from (share * resolution[0] for share in _FOCAL_WIDTHS)
+
+
+def _is_flat(stack: CornerStack) -> bool:
+    """Whether all targets are planes of constant z, as printed ones are."""
+    return not stack.points[:, 2].any()
+
+
+def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
+    """Takes 8 coefficients instead of 5 where views that were left out are predicted better."""
+    wider = _fit(stack, _padded(fit.camera), fit.cam_from_target)
+    gain = 1.0 - float(np.sum(wider.residuals**2) / np.sum(fit.residuals**2))
+    if not wider.settled or gain < _WORTH_COMPARING or len(stack.views) < 2 * _FOLDS:
+        return fit
+    # By the typical view: where a fold leaves out an edge of the image, the wider model may run
+    # away there, and with all views it does not.
+    ratio = float(np.median(_held_out(stack, wider) / _held_out(stack, fit)))
+    return wider if ratio < 1.0 - _WORTH_COMPARING else fit
+
+
+def _padded(camera: Camera) -> Camera:
+    distortion = np.concatenate([camera.distortion, np.zeros(3)])
+    return Camera(camera.model, camera.resolution, camera.matrix, distortion)
+
+
+def _held_out(stack: CornerStack, fit: BundleFit) -> FloatArray:
+    """Mean squared error (v,) [px^2] of views that the intrinsics were not fitted to."""
+    fold = np.arange(len(stack.views)) % _FOLDS
+    squares = np.zeros(len(stack.views))
+    for left_out in range(_FOLDS):
+        inside = fold[stack.view_of] != left_out
+        fitted = _fit(stack.keep(inside), fit.camera, fit.cam_from_target[fold != left_out])
+        rest = stack.keep(~inside)
+        poses = fit_poses(rest, fitted.camera, fit.cam_from_target[fold == left_out])
+        squares[fold == left_out] = mean_square_by_view(rest, poses.residuals)
+    return squares
+
+
+def _check(fit: BundleFit) -> None:
+    relative = np.sqrt(np.diag(fit.covariance)[:2]) / fit.camera.matrix[:2]
+    if not fit.settled or not np.all(np.isfinite(relative)) or np.any(fit.camera.matrix[:2] <= 0):
+        raise ConvergenceError(
+            "intrinsics: the estimate does not come to rest.",
+            next_step="Give matrix and distortion in [camera], or add tilted views.",
+        )
+    if relative.max() > 0.2:
+        raise DegenerateError(
+            f"intrinsics: the views leave the focal length open to {100 * relative.max():.0f} %.",
+            next_step="Add views tilted by 30 to 45 degrees, or give matrix and distortion.",
+        )
+
+
+def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[str]:
+    """Says what the views do not determine, and what about the views is the cause."""
+    sigma = np.sqrt(np.diag(fit.covariance))
+    focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
+    causes = list(_causes(fit)) if _is_flat(stack) else []
+    advice = f" {' '.join(causes)}" if causes else " Add views, tilted and near the image's edges."
+    if focal > _FOCAL_LIMIT:
+        yield f"The corners alone tell the focal length to {100 * focal:.1f} % only.{advice}"
+    if centre > _CENTRE_LIMIT_PX:
+        yield f"The corners alone tell the image centre to {centre:.1f} px only.{advice}"
+    if focal <= _FOCAL_LIMIT and centre <= _CENTRE_LIMIT_PX:
+        yield from causes
+    empty = _unvisited(stack, fit.camera.resolution)
+    if empty:
+        yield (
+            f"No corner was ever seen in the {' and '.join(empty)} of the image, so the lens is "
+            "extrapolated there. Move the target there in some views."
+        )
+
+
+def _causes(fit: BundleFit) -> Iterator[str]:
+    poses = fit.cam_from_target
+    axis = poses[:, :3, 2]
+    tilt = np.rad2deg(np.arccos(np.clip(np.abs(axis[:, 2]), 0.0, 1.0)))
+    if tilt.max() < _TILT_SPREAD_DEG:
+        yield (
+            f"All views are frontal (tilted by at most {tilt.max():.0f} degrees): add views tilted "
+            "by 30 to 45 degrees."
+        )
+    distance = np.linalg.norm(poses[:, :3, 3], axis=1)
+    spread = distance.max() / distance.min()
+    if spread < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
+        yield f"All views are from one distance (within {100 * (spread - 1):.0f} %): vary it."
+
+
+def _unvisited(stack: CornerStack, resolution: tuple[int, int]) -> list[str]:
+    """Names the corners of the image in which no corner of the target was seen."""
+    cell = np.minimum((stack.px / (np.array(resolution) / _GRID)).astype(int), _GRID - 1)
+    last = _GRID - 1
+    names = {
+        (0, 0): "upper left",
+        (last, 0): "upper right",
+        (0, last): "lower left",
+        (last, last): "lower right",
+    }
+    visited = set(map(tuple, cell.tolist()))
+    return [name for place, name in names.items() if place not in visited]

@@ -1,0 +1,607 @@
+"""Whether a result can be trusted, in plain sentences: of one camera and robot, or of many."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.calibration.stages.causes import Doubt, ranked, warned
+from visioncal.calibration.stages.need import CHECK, GOOD, Picks, need_met
+from visioncal.calibration.stages.next_views_hint import with_proposal
+from visioncal.core.number_format import figure, percent
+from visioncal.core.types import Mount, Need, Rejection
+from visioncal.estimation.observability import Direction
+from visioncal.results import NeedMet, Rms, Verdict, VerdictStatus, ViewResult
+
+# Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
+_ROUNDING = 1e-6
+_LISTED_VIEWS, _LISTED_PARTS = 3, 3
+_CAMERA_CAUSES = (
+    "a board that moved, images paired with other poses, units or conventions of the poses, "
+    "intrinsics, a warped board"
+)
+_CAUSES: Mapping[Mount, str] = {
+    "eye-in-hand": _CAMERA_CAUSES,
+    "eye-to-hand": _CAMERA_CAUSES,
+    "instrument": "an instrument or a tool that moved, readings paired with other poses, units or "
+    "conventions of the poses",
+}
+# So many views in a row are not left out by chance.
+_LEAST_RUN = 3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where doubt begins and where trust ends: (check, bad) limits.
+
+    Attributes:
+        scatter_mm: Held-out scatter of the target's position [mm]. Pick cells live with 1 mm.
+        scatter_deg: Held-out scatter of its orientation [deg].
+        sigma_mm: Predicted sigma of the worst direction of an edge [mm].
+        sigma_deg: The same in rotation [deg].
+        pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
+        level: How much more a camera's poses scatter than its corners say.
+        robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and
+            what is beyond is seldom independent from stop to stop, as the covariance takes it.
+        robot_deg: The same in rotation [deg].
+        stops: Stops of the robot in the fit; fewer leave too little to check the result with.
+        lost_share: Share of views that could not be used.
+        optimism: Held-out over in-sample scatter; large where each view carries the fit.
+        outlier: Residual of a view over the median of all.
+        holdout: Residuals of views held back over those of views left out in turn.
+    """
+
+    scatter_mm: tuple[float, float] = (2.0, 10.0)
+    scatter_deg: tuple[float, float] = (0.3, 2.0)
+    sigma_mm: tuple[float, float] = (1.0, 3.0)
+    sigma_deg: tuple[float, float] = (0.1, 0.3)
+    pixel_px: tuple[float, float] = (0.7, 3.0)
+    level: float = 2.0
+    robot_mm: float = 0.2
+    robot_deg: float = 0.02
+    stops: tuple[int, int] = (10, 5)
+    lost_share: tuple[float, float] = (0.25, 0.6)
+    optimism: tuple[float, float] = (1.6, 4.0)
+    outlier: float = 6.0
+    holdout: float = 4.0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What one camera or instrument saw of one target.
+
+    Attributes:
+        views: What became of each view.
+        rms: Residuals of the used ones.
+        held_out: Residuals of these, left out in turn.
+        holdout: Residuals of those held back by the session; None where there are none.
+        disagreeing: Those whose robot pose and image do not belong together.
+        name: Both, by name; empty where there are no others.
+    """
+
+    views: Sequence[ViewResult]
+    rms: Rms
+    held_out: Rms
+    holdout: Rms | None = None
+    disagreeing: Sequence[Rejection] = ()
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A camera or an instrument.
+
+    Attributes:
+        used: How many of its views are used.
+        lost: Those that could not be; those held back on purpose are not among them.
+        disagreeing: How many of these have a robot pose and an image that do not belong together.
+        pixel_px: Noise of a corner's coordinate; None without images [px].
+        level: By how much more its poses scatter than their noise says.
+        name: Its frame; empty where there is no other.
+    """
+
+    used: int
+    lost: Sequence[Rejection] = ()
+    disagreeing: Sequence[int] = ()
+    pixel_px: float | None = None
+    level: float = 1.0
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A robot.
+
+    Attributes:
+        stops: At how many stops it has a part in the fit.
+        away_mm: Noise of its flange; None where that cannot be told from the cameras' [mm].
+        away_deg: The same in rotation [deg].
+        errs: Whether its errors follow its posture, which is said elsewhere.
+        workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
+            the median; None for a nominal arm [mm].
+        modelled: Whether its model is known.
+        name: Its name; empty where there is no other.
+    """
+
+    stops: int
+    away_mm: float | None = None
+    away_deg: float | None = None
+    errs: bool = False
+    workspace_mm: float | None = None
+    modelled: bool = False
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """How well a place is known where it counts.
+
+    Attributes:
+        words: What it is, in words.
+        budget_mm: Its standard deviation by source, and as a `total` [mm].
+        radius95_mm: It is right to within this in 95 % of cases [mm].
+    """
+
+    words: str
+    budget_mm: Mapping[str, float]
+    radius95_mm: float
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the verdict is made of.
+
+    Attributes:
+        pairs: What each camera saw of each target.
+        sensors: The cameras and instruments.
+        arms: The robots.
+        worst: The worst directions of all unknown edges; the first is told of in a good verdict.
+        places: How well places are known.
+        warnings: What earlier stages had to say.
+        notes: What of it is no reason for doubt.
+        mount: What observed whom.
+        need: What the task needs; None where that is not said.
+        picks: What picks err by, by each camera and robot; empty where that is not predicted.
+    """
+
+    pairs: Sequence[Pair]
+    sensors: Sequence[Sensor]
+    arms: Sequence[Arm]
+    worst: Sequence[Direction]
+    places: Sequence[Place]
+    warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    mount: Mount = "eye-in-hand"
+    need: Need | None = None
+    picks: Sequence[Picks] = ()
+
+    @property
+    def rms(self) -> Rms:
+        """Residuals of all used views."""
+        return self._pooled(lambda it: it.rms)
+
+    @property
+    def held_out(self) -> Rms:
+        """Residuals of all of them, left out in turn."""
+        return self._pooled(lambda it: it.held_out)
+
+    def _pooled(self, of: Callable[[Pair], Rms]) -> Rms:
+        if len(self.pairs) == 1:
+            return of(self.pairs[0])
+        counts = np.array([sum(view.used for view in it.views) for it in self.pairs])
+
+        def pooled(values: Sequence[float | None]) -> float | None:
+            known = [
+                (it, count) for it, count in zip(values, counts, strict=True) if it is not None
+            ]
+            if not any(count for _, count in known):
+                return None
+            squares, weights = np.array(known).T
+            return float(np.sqrt(np.average(squares**2, weights=weights)))
+
+        each = [of(it) for it in self.pairs]
+        return Rms(pooled([it.mm for it in each]) or 0.0, pooled([it.deg for it in each]))
+
+
+def judge(findings: Findings, limits: Limits | None = None) -> Verdict:
+    """Says whether the result can be trusted, why, and what to do next.
+
+    Args:
+        findings: What is known.
+        limits: Where doubt begins.
+
+    Returns:
+        `bad` with a reason that settles it, `check` with doubts, `good` without. Where the task
+        says what it needs, the chance that picks land within it decides: good from 0.95, check from
+        0.5, bad below, and never good where something is not explained.
+    """
+    limits = limits or Limits()
+    scatter = list(_scatter_doubts(findings, limits))
+    pairs, sensors = findings.pairs, findings.sensors
+    doubts = [
+        *scatter,
+        *(doubt for it in pairs for doubt in _disagreement_doubts(it)),
+        *_outlier_doubts(findings, limits),
+        *(doubt for it in pairs for doubt in _holdout_doubts(it, findings.mount, limits)),
+        # Views that disagree wildly have no sigma worth a word about the motion.
+        *([] if any(it.is_fatal for it in scatter) else _worth_doubts(findings, limits)),
+        *_stop_doubts(findings, limits),
+        *(doubt for it in sensors for doubt in _lost_doubts(it, limits)),
+        *(doubt for it in sensors for doubt in _noise_doubts(it, limits)),
+        *([] if scatter else _robot_doubts(findings, limits)),
+        *(warned(it, _agreeing(findings)) for it in findings.warnings),
+    ]
+    good_for_mm = _good_for_mm(findings.picks, doubts)
+    met = need_met(findings.need, findings.picks)
+    status: VerdictStatus = "good" if not doubts else "check"
+    if met is None:
+        status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
+    elif met.probability >= GOOD:
+        doubts = [it for it in doubts if it.until_mm > (met.need.mm or 0.0)]
+        status = "check" if doubts else "good"
+    else:
+        status = "check" if met.probability >= CHECK else "bad"
+    ordered = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
+    sentences = [doubt.sentence for doubt in ordered] if doubts else [_praise(findings)]
+    if met is not None:
+        sentences.insert(len(ordered) * (met.probability >= GOOD), met_words(findings, met))
+    elif good_for_mm is not None:
+        sentences[0] += f" {_good_for_words(findings.picks, good_for_mm)}"
+    told = tuple(sentences)
+    if doubts and any(it.pixel_px is not None for it in sensors):
+        told = with_proposal(told, modelled=all(it.modelled for it in findings.arms))
+    causes = () if status == "good" else ranked(doubts, findings.picks, met)
+    return Verdict(status, (*told, *findings.notes), good_for_mm, causes)
+
+
+def _agreeing(findings: Findings) -> str:
+    """How well views agree that are not left out."""
+    return f"Without them, views that are left out in turn agree to {_both(findings.held_out)}."
+
+
+def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Doubt]) -> float | None:
+    """The least need that would be met by all pairs; None where none would, or none is known."""
+    least = max((it.until_mm for it in doubts), default=0.0)
+    if not picks or np.isinf(least):
+        return None
+    return max(least, *(it.good_for_mm for it in picks))
+
+
+def _good_for_words(picks: Sequence[Picks], good_for_mm: float) -> str:
+    worst = max(picks, key=lambda it: it.good_for_mm)
+    return (
+        f"It is good for tasks of {figure(good_for_mm)} mm and more at "
+        f"{figure(worst.distance_m)} m from the camera."
+    )
+
+
+def met_words(findings: Findings, met: NeedMet) -> str:
+    """How likely picks land within what is needed."""
+    need, worst = met.need, min(findings.picks, key=lambda it: it.probability(met.need))
+    within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]
+    where = "where the views looked" if need.at == "views" else f"at {list(need.at)} m in the base"
+    who = f" by robot {worst.robot} of what {worst.camera} sees" if len(findings.picks) > 1 else ""
+    return (
+        f"A pick{who} {where} lands within {' and '.join(within)} with a probability of "
+        f"{percent(met.probability)}; 95 % land within {figure(worst.good_for_mm)} mm."
+    )
+
+
+def is_scattered(findings: Findings, limits: Limits | None = None) -> bool:
+    """Whether views disagree with each other by more than a sound cell's do."""
+    return any(_scatter_doubts(findings, limits or Limits()))
+
+
+def _named(name: str, sentence: str) -> str:
+    """A sentence with whom it is of, where there are several."""
+    return f"{name}: {sentence[0].lower()}{sentence[1:]}" if name else sentence
+
+
+def _praise(findings: Findings) -> str:
+    used = sum(view.used for it in findings.pairs for view in it.views)
+    worst = findings.worst[0]
+    return (
+        f"All {used} used views agree: left out of the fit, they are predicted to "
+        f"{_both(findings.held_out)} (rms), and "
+        f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm."
+    )
+
+
+def _both(rms: Rms) -> str:
+    """Residuals in position and, where these are known, in rotation."""
+    return f"{figure(rms.mm)} mm" + ("" if rms.deg is None else f" and {figure(rms.deg)} deg")
+
+
+def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
+    """Two sets' residuals side by side: of position and, where both are known, of rotation."""
+    pairs = [(one.mm, other.mm)]
+    if one.deg is not None and other.deg is not None:
+        pairs.append((one.deg, other.deg))
+    return pairs
+
+
+def _scatter_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    yield from _pair_doubts(findings, limits)
+    ratios = [
+        outside / within
+        for outside, within in _pairs(findings.held_out, findings.rms)
+        if outside > _ROUNDING and within > 0.0
+    ]
+    ratio = max(ratios, default=0.0)
+    if ratio > limits.optimism[0]:
+        yield Doubt(
+            f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
+            "views for their noise. Add 5 or more, tilted about different axes.",
+            ratio > limits.optimism[1],
+            until_mm=0.0,
+        )
+
+
+def _pair_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    words, views, is_fatal = [], list[ViewResult](), False
+    for pair in findings.pairs:
+        held = pair.held_out
+        beyond = [
+            (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
+            for value, unit, (check, bad) in zip(
+                (held.mm, held.deg),
+                ("mm", "deg"),
+                (limits.scatter_mm, limits.scatter_deg),
+                strict=True,
+            )
+            if value is not None and value > check
+        ]
+        if beyond:
+            away = " and ".join(it for it, _ in beyond)
+            words.append(f"{away} ({pair.name})" if pair.name else away)
+            views += pair.views
+            is_fatal |= any(it for _, it in beyond)
+    if words:
+        yield Doubt(
+            f"Left out of the fit, views disagree with the others by "
+            f"{', '.join(words)}, rms; the worst are "
+            f"{_worst_views(views)}. Possible causes: {_CAUSES[findings.mount]}, or an "
+            "arm with large model errors.",
+            is_fatal,
+            until_mm=0.0,
+            cause="unexplained",
+        )
+
+
+def _worst_views(views: Sequence[ViewResult]) -> str:
+    measured = [view for view in views if view.used and view.residual_mm is not None]
+    measured.sort(key=lambda view: -(view.residual_mm or 0.0))
+    return ", ".join(f"view {view.view} ({_residual(view)})" for view in measured[:_LISTED_VIEWS])
+
+
+def _disagreement_doubts(pair: Pair) -> Iterator[Doubt]:
+    """Names the views that were left out because they contradict the others."""
+    out = pair.disagreeing
+    without_it = f"Without them, views that are left out in turn agree to {_both(pair.held_out)}."
+    if not out:
+        return
+    if len(out) == 1:
+        sentence = f"View {out[0].view} was left out: it {out[0].reason}."
+        yield Doubt(_named(pair.name, sentence), cause="wrong_views", without_it=without_it)
+        return
+    named, first = ", ".join(str(it.view) for it in out), out[0].view
+    run = _run(pair)
+    sentence = f"Views {named} were left out; view {first} {out[0].reason}.{run}"
+    cause = "something_moved" if run else "wrong_views"
+    yield Doubt(_named(pair.name, sentence), cause=cause, without_it=without_it)
+
+
+def _run(pair: Pair) -> str:
+    """Says so where the views that were left out follow each other, with no other between them."""
+    out = [it.view for it in pair.disagreeing]
+    compared = [it.view for it in pair.views if it.used or it.view in out]
+    first = compared.index(out[0])
+    end = first + len(out)
+    if len(out) < _LEAST_RUN or compared[first:end] != out or compared == out:
+        return ""
+    when = f"from view {out[0]} on" if first else f"before view {compared[end]}"
+    if first and end < len(compared):
+        when = f"from view {out[0]} to view {out[-1]}"
+    return f" They follow each other: {when}, something had moved."
+
+
+def _outlier_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    """Names single views whose residual stands out from the others'.
+
+    Where the corners tell how well each view sees the board, the consensus has judged them better.
+    """
+    if any(it.away_mm is not None for it in findings.arms):
+        return
+    for pair in findings.pairs:
+        for view, ratio in outlying_views(pair.views, limits.outlier):
+            sentence = (
+                f"View {view.view} stands out: it places the target {_residual(view, ' and ')} "
+                f"from the others, {ratio:.0f} times what is typical. It is in the fit and pulls "
+                "at it: look at its image and its pose, and take it out of views.csv if one of "
+                "them is wrong."
+            )
+            yield Doubt(_named(pair.name, sentence), cause="wrong_views")
+
+
+def outlying_views(
+    views: Sequence[ViewResult], limit: float = Limits.outlier
+) -> tuple[tuple[ViewResult, float], ...]:
+    """The used views whose residual is over so many times the median, with their ratios."""
+    used = [view for view in views if view.used]
+    if not used:
+        return ()
+    away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
+    ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
+    return tuple((view, float(it)) for view, it in zip(used, ratios, strict=True) if it > limit)
+
+
+def _residual(view: ViewResult, between: str = ", ") -> str:
+    turned = "" if view.residual_deg is None else f"{between}{figure(view.residual_deg)} deg"
+    return f"{figure(view.residual_mm or 0.0)} mm{turned}"
+
+
+def _holdout_doubts(pair: Pair, mount: Mount, limits: Limits) -> Iterator[Doubt]:
+    holdout, held = pair.holdout, pair.held_out
+    if holdout is None:
+        return
+    pairs = _pairs(holdout, held)
+    ratio = max(back / max(left, _ROUNDING) for back, left in pairs)
+    if ratio > limits.holdout and max(back for back, _ in pairs) > _ROUNDING:
+        observed = "readings" if mount == "instrument" else "images"
+        sentence = (
+            f"The views that the session holds back are missed by {_both(holdout)}, {ratio:.0f} "
+            "times worse than views left out in turn. They lie where the result does not hold, or "
+            f"their poses or {observed} are wrong."
+        )
+        yield Doubt(_named(pair.name, sentence), cause="holdout")
+
+
+def _worth_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    """Judges the answer where it counts.
+
+    Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors of
+    the first and the last link, which its poses make up for.
+    """
+    if any(it.workspace_mm is None for it in findings.arms):
+        yield from _sigma_doubts(findings, limits)
+        yield from _budget_doubts(findings, limits)
+    for it in findings.arms:
+        if it.workspace_mm is not None and it.workspace_mm > limits.sigma_mm[0]:
+            seen = any(sensor.pixel_px is not None for sensor in findings.sensors)
+            board = (
+                "The board's size counts in it, as no view can tell an arm and a board that are "
+                "both too large: measure its squares, and state square_sigma_m. "
+            )
+            sentence = (
+                "All over the workspace the calibrated arm places its tool to "
+                f"{figure(it.workspace_mm)} mm (sigma, in the median; doubt begins at "
+                f"{limits.sigma_mm[0]:g}). {board if seen else ''}Add views in "
+                "which the arm stands otherwise, all over the workspace."
+            )
+            is_fatal = it.workspace_mm > limits.sigma_mm[1]
+            yield Doubt(_named(_robot(it), sentence), is_fatal, until_mm=0.0)
+
+
+def _sigma_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    weak, is_fatal = [], False
+    for direction in findings.worst:
+        scale, unit, (check, bad) = (
+            (np.rad2deg(1.0), "deg", limits.sigma_deg)
+            if direction.is_rotation
+            else (1e3, "mm", limits.sigma_mm)
+        )
+        sigma = direction.sigma * scale
+        if sigma > check:
+            weak.append(f"{direction.words} ({figure(sigma)} {unit})")
+            is_fatal |= bool(sigma > bad)
+    if weak:
+        yield Doubt(
+            f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt begins "
+            f"at {limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg. Add views tilted by "
+            "20 to 40 degrees about axes across these directions.",
+            is_fatal,
+            until_mm=0.0,
+        )
+
+
+def _budget_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    """Says what makes the result uncertain where it is to be used."""
+    beyond = [it for it in findings.places if it.budget_mm["total"] > limits.sigma_mm[0]]
+    if not beyond:
+        return
+    worst = max(beyond, key=lambda it: it.budget_mm["total"])
+    budget = worst.budget_mm
+    parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
+    others = [
+        f"{it.words} ({figure(it.budget_mm['total'])} mm)" for it in beyond if it is not worst
+    ]
+    yield Doubt(
+        f"{worst.words} is placed to {figure(budget['total'])} mm (sigma; 95 % "
+        f"within {figure(worst.radius95_mm)} mm): "
+        + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
+        + "."
+        + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
+        budget["total"] > limits.sigma_mm[1],
+        until_mm=0.0,
+    )
+
+
+def _stop_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    used = sum(view.used for it in findings.pairs for view in it.views)
+    check, bad = limits.stops
+    for it in findings.arms:
+        if it.stops < check:
+            counted = f"{used} views" if it.stops == used else f"{it.stops} stops"
+            sentence = (
+                f"Only {counted} are used; {check} or more give the result something to be checked "
+                "with."
+            )
+            yield Doubt(_named(_robot(it), sentence), it.stops < bad, until_mm=0.0)
+
+
+def _lost_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
+    lost, used = sensor.lost, sensor.used
+    share = len(lost) / max(used + len(lost), 1)
+    if share > limits.lost_share[0]:
+        told, disagree = "", {*sensor.disagreeing}
+        others = [it for it in lost if it.view not in disagree]
+        if disagree:
+            count = len(disagree) if others else "all"
+            told = f"; {count} of them disagree with the others"
+        if others:
+            told += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
+            told += others[0].reason
+        sentence = f"{len(lost)} of {used + len(lost)} views are not used{told}."
+        yield Doubt(_named(sensor.name, sentence), share > limits.lost_share[1], cause="lost_views")
+
+
+def _noise_doubts(sensor: Sensor, limits: Limits) -> Iterator[Doubt]:
+    check, bad = limits.pixel_px
+    noise = sensor.pixel_px
+    if noise is None:
+        return
+    if noise > check:
+        sentence = (
+            f"Corners deviate by {figure(noise)} px from any pose of a flat board (doubt begins at "
+            f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
+            "are blurred."
+        )
+        yield Doubt(_named(sensor.name, sentence), noise > bad, cause="corner_noise")
+    if sensor.level > limits.level:
+        sentence = (
+            f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
+            "of few pixels, blur, or a lens that is not as stated. Go nearer, or show it larger "
+            "squares."
+        )
+        yield Doubt(_named(sensor.name, sentence), cause="corner_noise")
+
+
+def _robot(arm: Arm) -> str:
+    return f"Robot {arm.name}" if arm.name else ""
+
+
+def _robot_doubts(findings: Findings, limits: Limits) -> Iterator[Doubt]:
+    """An arm is a good instrument: what looks like its error is often something else's.
+
+    A task that needs ten times as much has an arm that is as good as it has to be.
+    """
+    for it in findings.arms:
+        if it.away_mm is None or it.away_deg is None or it.errs:
+            continue
+        beyond = max(it.away_mm / limits.robot_mm, it.away_deg / limits.robot_deg)
+        if beyond > 1.0:
+            cause = (
+                "the instrument reads worse than is stated of it, was moved, or the arm's model is "
+                "off by as much. Read a few stops twice to see how well readings repeat."
+                if findings.mount == "instrument"
+                else "the board is of another size than stated, or warped, the intrinsics are not "
+                "this camera's, or the arm's model is off by as much. Measure the board's squares "
+                "first."
+            )
+            sentence = (
+                f"To explain what is seen, the flange would have to be off by {figure(it.away_mm)} "
+                f"mm and {figure(it.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More "
+                f"likely {cause}"
+            )
+            until_mm = 10.0 * beyond * limits.robot_mm
+            yield Doubt(_named(_robot(it), sentence), until_mm=until_mm, cause="unexplained")

@@ -1,0 +1,275 @@
+"""Which errors of the arm the data tell: none, offsets of the joints, links, eccentric gears."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
+from visioncal.estimation.kinematics import LEVELS, ArmTrials, LevelFit, fit_level, resized
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import robot_levels, starting_noise
+from visioncal.results import Rms
+
+NOMINAL = "nominal"
+# What a zero that was found from the target's poses is still off by, before the corners are asked,
+# and the zeros of the other joints with it [rad].
+_ZERO_SIGMA_RAD = 5e-4
+# What may be asked for: the quick one after a lost encoder, or all that the data tell.
+ASKED: Mapping[str, tuple[str, ...]] = {
+    "offsets": ("offsets",),
+    "kinematics": ("geometry", "eccentricity"),
+    "elastic": ("elastic",),
+    "thermal": tuple(LEVELS),
+    "auto": tuple(LEVELS),
+}
+# Those that ask for no level of the geometry.
+_ALL = ("auto", "thermal")
+
+
+@dataclass(frozen=True)
+class Level:
+    """What a level of the arm's model makes of the views.
+
+    Attributes:
+        name: `nominal`, or a name among `LEVELS`.
+        unknowns: How many columns it carries.
+        inside: Residuals of the target's pose in the fit.
+        left_out: Residuals of stops that are left out in turn.
+        likelihood_ratio: Twice the gain in log-likelihood over the nominal arm.
+        sizes: How many sizes of errors were estimated for it, one a block.
+    """
+
+    name: str
+    unknowns: int
+    inside: Rms
+    left_out: Rms
+    likelihood_ratio: float
+    sizes: int
+
+    def document(self) -> dict[str, Any]:
+        """Its figures as calibration.json has them."""
+        figures = {
+            "level": self.name,
+            "unknowns": self.unknowns,
+            "rms_mm": self.inside.mm,
+            "rms_deg": self.inside.deg,
+            "held_out_mm": self.left_out.mm,
+            "held_out_deg": self.left_out.deg,
+            "likelihood_ratio": self.likelihood_ratio,
+        }
+        return {name: it for name, it in figures.items() if it is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """The level of the arm's model that the views speak for.
+
+    Attributes:
+        level: Its name; `nominal` where none explains more than chance.
+        levels: All that were tried, the nominal arm first.
+        errors: Its errors by block.
+        was_asked: Whether the user named the level.
+        fits: The fits of the nominal arm and of that level.
+        views: (m,) by which view each residual of these goes.
+    """
+
+    level: str
+    levels: tuple[Level, ...]
+    errors: Mapping[str, ArmErrors]
+    was_asked: bool
+    fits: tuple[LevelFit, LevelFit]
+    views: tuple[int, ...] = ()
+
+    def left_out(self) -> list[dict[str, Any]]:
+        """How far stops that are left out in turn are off by both arms, by view."""
+        before, after = (np.linalg.norm(it.left_out.reshape(-1, 2, 3), axis=2) for it in self.fits)
+        return list(unseen_rows(self.views, before, after, self.fits[0].has_rotation))
+
+    def document(self) -> dict[str, Any]:
+        """The levels that were compared, as calibration.json has them."""
+        return {"level": self.level, "levels": [it.document() for it in self.levels]}
+
+
+def unseen_rows(
+    views: Sequence[int], before: FloatArray, after: FloatArray, turned: Mask
+) -> Iterator[dict[str, Any]]:
+    """Writes how far views that no fit has seen are off by the nominal arm and by the calibrated.
+
+    Args:
+        views: (m,) the views.
+        before: (m, 2) by the one, rotation [rad] and distance [m].
+        after: (m, 2) by the other.
+        turned: (m,) whether a rotation was measured.
+    """
+    columns = zip(views, before.tolist(), after.tolist(), turned.tolist(), strict=True)
+    for view, (was_rad, was_m), (now_rad, now_m), has_rotation in columns:
+        row = {"view": view, "nominal_mm": 1e3 * was_m, "mm": 1e3 * now_m}
+        if has_rotation:
+            row |= {"nominal_deg": np.rad2deg(was_rad).item(), "deg": np.rad2deg(now_rad).item()}
+        yield row
+
+
+def choose_level(
+    problem: Problem,
+    state: State,
+    robot: str,
+    bases: Mapping[str, FloatArray],
+    asked: str,
+    stated: Problem | None = None,
+    noise: Noise | None = None,
+) -> Kinematics:
+    """Chooses how much of a robot's arm to free.
+
+    A level is taken where it is likelier than all others by more than chance, with the price of its
+    unknowns in the likelihood, and predicts stops that are left out better than the nominal arm.
+
+    Args:
+        problem: The observations, without errors of this arm.
+        state: The answer with the nominal arm.
+        robot: The robot.
+        bases: (s, 6, p) by stop, how the flange moves with the errors of each block.
+        asked: A key of `ASKED`.
+        stated: The same observations with a lost zero where the model has it, where `problem` has
+            it where it is; None where none is lost. Then offsets are what is taken at the least.
+        noise: The noise's levels to start from; those from above where None.
+    """
+    with one_blas_thread():
+        arm = ArmTrials(problem, state, robot, bases, noise)
+        fits = {NOMINAL: fit_level(arm)}
+        fits |= {name: fit_level(arm, blocks) for name, blocks in LEVELS.items()}
+        if stated is not None:
+            nominal = fit_level(ArmTrials(stated, state, robot, bases, noise))
+            fits = _with_lost_zero(fits, problem, stated, nominal, bases)
+    found = {name: fit for name, fit in fits.items() if fit is not None}
+    levels = tuple(_level(name, fit) for name, fit in found.items())
+    least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
+    best = _best([it for it in levels if it.name in (*least, *ASKED[asked])])
+    with one_blas_thread():
+        chosen = resized(arm, found[best.name])
+    levels = tuple(
+        _level(it, chosen) if it == best.name else was
+        for it, was in zip(found, levels, strict=True)
+    )
+    return Kinematics(best.name, levels, chosen.errors, asked not in _ALL, (found[NOMINAL], chosen))
+
+
+def _with_lost_zero(
+    fits: Mapping[str, LevelFit | None],
+    problem: Problem,
+    stated: Problem,
+    nominal: LevelFit | None,
+    bases: Mapping[str, FloatArray],
+) -> dict[str, LevelFit | None]:
+    """The levels beside the arm as it was stated, with what the zero explains in all others."""
+    zeroed = fits[NOMINAL]
+    if nominal is None or zeroed is None:
+        return dict(fits)
+    gain = 2.0 * (_unlikeliness(stated, nominal) - _unlikeliness(problem, zeroed))
+    found = {
+        name: None if fit is None else replace(fit, gain=fit.gain + gain)
+        for name, fit in fits.items()
+    }
+    if found["offsets"] is None:
+        errors = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
+        found["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
+    return found | {NOMINAL: nominal}
+
+
+def _unlikeliness(problem: Problem, fit: LevelFit) -> float:
+    return robot_levels(problem, fit.fit.state, starting_noise(problem), from_above=True)[1]
+
+
+def _best(levels: Sequence[Level]) -> Level:
+    """The likeliest level that predicts better than the first one, by more than chance each.
+
+    The price of all its columns is in a level's likelihood, but for that of their size. Of two
+    levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
+    offsets would leave links that are off by as little out of the covariance.
+    """
+    best = levels[0]
+    for level in levels[1:]:
+        better = level.left_out.mm < levels[0].left_out.mm
+        margin = SIGNIFICANT if level.sizes > best.sizes else 0.0
+        if better and level.likelihood_ratio - best.likelihood_ratio > margin:
+            best = level
+    return best
+
+
+def _level(name: str, fit: LevelFit) -> Level:
+    """Writes a fit as figures."""
+    inside, left_out = (_rms(it, fit.has_rotation) for it in (fit.inside, fit.left_out))
+    return Level(name, fit.size, inside, left_out, fit.gain, len(fit.errors))
+
+
+def _rms(residuals: FloatArray, turned: Mask) -> Rms:
+    turns, shifts = (np.sum(it**2, axis=1) for it in (residuals[turned, :3], residuals[:, 3:]))
+    deg = float(np.rad2deg(np.sqrt(np.mean(turns)))) if turned.any() else None
+    return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
+
+
+def check_level(asked: str) -> None:
+    """Refuses a level that is none.
+
+    Raises:
+        DataError: It is not known.
+    """
+    levels = (*ASKED, "hand-eye")
+    if asked not in levels:
+        raise DataError(f"level {asked!r} is not one of {', '.join(levels)}.")
+
+
+def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
+    """Refuses a level that the session cannot give.
+
+    Args:
+        asked: The level.
+        can: Whether there are joint angles that belong to the robot's model and poses.
+        misread: What is wrong with those that there are, and what to do.
+
+    Raises:
+        DataError: There are no joint angles that belong to a known model.
+    """
+    if asked in ("offsets", "kinematics", "elastic") and not can:
+        raise DataError(
+            f"level {asked!r} needs the joint angles of every view and a model of the robot that "
+            "they belong to.",
+            culprits=["level"],
+            next_step=misread or "Record q1_rad ..., and name [robot] model in session.toml.",
+        )
+
+
+def doubts(kinematics: Kinematics) -> Iterator[str]:
+    """Says where another level explains the views far better than the one that was asked for."""
+    best = _best(kinematics.levels)
+    chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
+    if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
+        yield (
+            f"The views speak for more than the arm's {chosen.name}: with its {best.name} stops "
+            f"left out are predicted to {figure(best.left_out.mm)} mm instead of "
+            f"{figure(chosen.left_out.mm)} mm. Leave --level out."
+        )
+
+
+def findings(kinematics: Kinematics) -> Iterator[str]:
+    """Says what was found, for the verdict."""
+    if kinematics.level == NOMINAL and kinematics.was_asked:
+        yield (
+            "The arm stays as stated: what was asked to be found of it explains the views no "
+            "better than chance, or there are too few stops to tell."
+        )
+    nominal = kinematics.levels[0]
+    chosen = next(it for it in kinematics.levels if it.name == kinematics.level)
+    if chosen is not nominal:
+        yield (
+            f"The arm was calibrated along ({chosen.name}): stops left out are predicted to "
+            f"{figure(chosen.left_out.mm)} mm, with the nominal arm to "
+            f"{figure(nominal.left_out.mm)} mm. The transforms go with this arm: take its poses "
+            "(calibration.base_from_flange), not the controller's."
+        )

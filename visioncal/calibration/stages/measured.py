@@ -1,0 +1,136 @@
+"""What a session knows of frames beforehand, and what it did to the answer, in words."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray
+from visioncal.estimation.observability import SIGMA_LIMIT_M
+from visioncal.estimation.parts import FramePrior, State
+from visioncal.estimation.problem import Problem
+from visioncal.session.tables import PriorTable
+
+_COMPONENTS = ("x_m", "y_m", "z_m")
+# What was measured is contradicted by so many standard deviations.
+_CONTRADICTION = 3.0
+
+
+def prior_of(name: str, table: PriorTable) -> FramePrior:
+    """Reads `[prior.A_from_B]`: the components that it states, and the rotation where it does."""
+    first, _, second = name.partition("_from_")
+    values = [getattr(table, it) for it in _COMPONENTS]
+    axes = tuple(axis for axis, value in enumerate(values) if value is not None)
+    places = tuple(float(values[axis]) for axis in axes)
+    if table.quaternion_xyzw is None or table.sigma_rad is None:
+        return FramePrior(first, second, axes, places, table.sigma_m)
+    rotation = Rotation.from_quat(table.quaternion_xyzw).as_matrix()
+    return FramePrior(first, second, axes, places, table.sigma_m, rotation, table.sigma_rad)
+
+
+@dataclass(frozen=True)
+class Component:
+    """A measured component beside what the views alone say of it [m]."""
+
+    label: str
+    stated_m: float
+    sigma_m: float
+    seen_m: float
+    seen_sigma_m: float
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the views would do without."""
+        return self.seen_sigma_m < SIGMA_LIMIT_M
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the views say otherwise, by more than both may be off."""
+        return self.is_told and self.contradiction > _CONTRADICTION
+
+    @property
+    def contradiction(self) -> float:
+        """How far the views alone are from it, in units of what both are known to."""
+        apart_m = abs(self.seen_m - self.stated_m)
+        return float(apart_m / np.hypot(self.sigma_m, self.seen_sigma_m))
+
+    @classmethod
+    def beside(
+        cls, label: str, stated_m: float, sigma_m: float, off_m: float, found_sigma_m: float
+    ) -> "Component":
+        """Takes what was measured out of an answer again.
+
+        Args:
+            label: Of which frame it is.
+            stated_m: What was measured [m].
+            sigma_m: Its standard deviation [m].
+            off_m: How far the answer is from it [m].
+            found_sigma_m: What the answer is known to [m].
+        """
+        own = max(found_sigma_m**-2.0 - sigma_m**-2.0, 0.0)
+        spread = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
+        # Both together are their mean, each weighted with its information.
+        seen = stated_m + off_m + off_m * (spread / sigma_m) ** 2
+        return cls(label, stated_m, sigma_m, float(seen), float(spread))
+
+    @property
+    def remark(self) -> str:
+        """Says that the answer rests on it."""
+        alone = "leave it open"
+        if self.is_told:
+            alone = f"tell it to {figure(1e3 * self.seen_sigma_m)} mm"
+        return (
+            f"The measured {self.label} = {1e3 * self.stated_m:g} mm was used, known to "
+            f"{figure(1e3 * self.sigma_m)} mm; the views alone {alone}."
+        )
+
+    @property
+    def doubt(self) -> str:
+        """Says that the views contradict it."""
+        return (
+            f"The measured {self.label} = {1e3 * self.stated_m:g} mm, known to "
+            f"{figure(1e3 * self.sigma_m)} mm, is contradicted by the views, which alone say "
+            f"{1e3 * self.seen_m:.4g} mm to {figure(1e3 * self.seen_sigma_m)} mm; it is not used. "
+            "Measure it again, or leave it out."
+        )
+
+
+def components(
+    problem: Problem,
+    state: State,
+    spread: FloatArray,
+    priors: Sequence[FramePrior],
+) -> tuple[Component, ...]:
+    """The measured components of priors beside what the observations alone say of them.
+
+    Args:
+        problem: The observations in the fit.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
+        priors: Priors, in the problem or left out of it.
+    """
+    return tuple(it for prior in priors for it in _components(prior, problem, state, spread))
+
+
+def _components(
+    prior: FramePrior, problem: Problem, state: State, spread: FloatArray
+) -> Iterator[Component]:
+    away, slopes = problem.prior_rows(prior, state)
+    used = {it.name for it in problem.priors}
+    sigmas = np.sqrt(np.einsum("dp,pq,dq->d", slopes, spread, slopes)) * prior.sigma_m
+    # Behind those of the rotation, which no word is said of.
+    places = slice(len(away) - len(prior.axes), len(away))
+    for axis, stated, off, sigma in zip(
+        prior.axes,
+        prior.values_m,
+        (away[places] * prior.sigma_m).tolist(),
+        sigmas[places].tolist(),
+        strict=True,
+    ):
+        label = f"{_COMPONENTS[axis]} of {prior.name}"
+        if prior.name in used:
+            yield Component.beside(label, stated, prior.sigma_m, off, sigma)
+        else:
+            yield Component(label, stated, prior.sigma_m, stated + off, sigma)

@@ -1,0 +1,329 @@
+"""What a pick errs by where the views looked, and whether that is near enough.
+
+A pick: the camera sees a thing as the views saw their target, and the robot goes to where it is.
+Where the robot arrives differs from the thing by
+
+    calibration   the chain from the robot's base to the camera and the lens: the errors of all
+                  unknowns together, through the same slopes that the fit has. What is open about
+                  the board counts by what it did to these; the thing is another
+    look          the robot's noise at the look, where it carries the camera
+    arm           errors that follow the arm's posture and were not calibrated
+    pick          the noise of the flange when it goes there; a tool's length adds to it
+    left out      as far as views that were left out of the fit err by more than is predicted of
+                  them and than chance explains
+
+No camera finds a thing without noise; that is the task's own, and not among them. Where the arm
+errs with its posture, calibrated or not, the place is compared with where the chain as a whole puts
+it: what its first and last link do looks the same in all views, the frames of camera and target
+have taken it up, and an arm that picks does it again.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.validate import HeldOut
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import adjoint, invert, skew
+from visioncal.core.types import FloatArray, IntArray, Need
+from visioncal.estimation.arm import ArmErrors, misfit_slopes
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.tolerance_probability import chance_within, radius_within
+from visioncal.results import NeedMet, Picker
+from visioncal.session.frames import thing_name
+
+# Of a need that is met, so many picks land within it; from the other on, most do.
+GOOD, CHECK = 0.95, 0.5
+# Left-out views of a sound cell err by more than this chance lets them in one session of a hundred.
+_CHANCE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Picks:
+    """Picks by one robot of what one camera sees.
+
+    Attributes:
+        camera: The camera's frame.
+        robot: The robot.
+        parts: (k, 6, 6) covariance by source, of rotation [rad] and place [m] in the robot's base,
+            at k places.
+        freedom: Degrees of freedom that the noise was estimated with.
+        distance_m: How far the camera was from the places, on average.
+    """
+
+    camera: str
+    robot: str
+    parts: Mapping[str, FloatArray]
+    freedom: float
+    distance_m: float
+
+    @property
+    def spreads(self) -> FloatArray:
+        """(k, 6, 6) of all sources together."""
+        return np.asarray(np.sum(list(self.parts.values()), axis=0))
+
+    def probability(self, need: Need) -> float:
+        """The chance that a pick at one of the places lands within a need."""
+        turn_rad = np.inf if need.deg is None else float(np.deg2rad(need.deg))
+        shift_m = np.inf if need.mm is None else 1e-3 * need.mm
+        return chance_within(self.spreads, turn_rad, shift_m, self.freedom)
+
+    def without(self, source: str) -> "Picks":
+        """Picks that do not err by one of the sources."""
+        parts = {name: it for name, it in self.parts.items() if name != source}
+        return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
+
+    @property
+    def good_for_mm(self) -> float:
+        """The least need of places alone that would be met [mm]."""
+        return 1e3 * radius_within(self.spreads, GOOD, self.freedom)
+
+    @property
+    def budget_mm(self) -> dict[str, float]:
+        """Standard deviation of the place by source, and as a `total` [mm]."""
+        every = {**self.parts, "total": self.spreads}
+        squares = {name: np.trace(it[:, 3:, 3:], axis1=1, axis2=2) for name, it in every.items()}
+        return {name: 1e3 * float(np.sqrt(it.mean())) for name, it in squares.items()}
+
+
+def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) -> NeedMet | None:
+    """How likely picks land within a need; None where nothing is needed or predicted.
+
+    Args:
+        need: What the task needs.
+        picks: Those of each camera and robot.
+        whole: Whether pairs are told apart.
+    """
+    if need is None or not picks:
+        return None
+    pairs = [
+        Picker(thing_name(it.camera, "camera"), it.robot, it.probability(need)) for it in picks
+    ]
+    return NeedMet(need, min(it.probability for it in pairs), tuple(pairs) if whole else ())
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What picks are predicted from.
+
+    Attributes:
+        problem: The n observations of the fit.
+        state: The answer.
+        noise: Its levels.
+        covariance: (p, p) of the unknowns, with all that counts beside the noise.
+        held_out: The observations' residuals by fits without their stops.
+        middles: (3,) of each target, in its frame [m]; of others, their origin.
+        freedom: Degrees of freedom of each robot's noise.
+        arms: The robots' arms, at the problem's stops.
+        of_boards: The problem's columns of boards' shapes.
+        whole: The observations of all pairs, merged or not, that the fit was made from.
+        inflation: By how much the covariance was multiplied because neighbouring stops err alike.
+    """
+
+    problem: Problem
+    state: State
+    noise: Noise
+    covariance: FloatArray
+    held_out: HeldOut
+    middles: Mapping[str, FloatArray]
+    freedom: Mapping[str, float]
+    arms: Mapping[str, RobotArm]
+    of_boards: IntArray
+    whole: Problem
+    inflation: float = 1.0
+
+
+def picks_of(fitted: Fitted, need: Need | None = None) -> tuple[Picks, ...]:
+    """Predicts picks, for each camera and each robot that parts it from what it sees.
+
+    Args:
+        fitted: The fit.
+        need: Where they count; where the views looked without.
+    """
+    problem = fitted.problem
+    pairs: dict[tuple[str, str], list[int]] = {}
+    for group in problem.groups:
+        observer = problem.observations.observers[int(group.rows[0])].partition("@")[0]
+        for step in group.path:
+            if step.robot:
+                pairs.setdefault((observer, step.robot), []).extend(group.rows.tolist())
+    return tuple(
+        _picks(_part(fitted, sorted(rows)), camera, robot, need)
+        for (camera, robot), rows in pairs.items()
+    )
+
+
+def _part(fitted: Fitted, rows: Sequence[int]) -> Fitted:
+    """What some of the observations tell of picks."""
+    chosen = np.isin(np.arange(len(fitted.problem)), rows)
+    held = fitted.held_out
+    kept = replace(held, away_m=held.away_m[chosen], away_rad=held.away_rad[chosen])
+    return replace(fitted, problem=fitted.problem.subset(chosen), held_out=kept)
+
+
+def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
+    """Picks of what one camera sees by one robot, from the observations that it parts."""
+    problem, state, noise = fitted.problem, fitted.state, fitted.noise
+    seen, tree = problem.observations, problem.tree
+    branch = next(name for name, it in tree.branches.items() if it.robot == robot)
+    base, arm = tree.branches[branch].parent, fitted.arms.get(robot)
+    in_base = _in_base(problem, state, base)
+    middles = np.array(
+        [fitted.middles.get(it.partition("@")[0], np.zeros(3)) for it in seen.observed]
+    )
+    carries = np.array([_is_between(problem, it, base, robot) for it in seen.observers])
+    calibrated = arm is not None and arm.model is not None
+    errors = None if arm is None or calibrated else arm.errors
+    unfitted = errors if errors is not None and not errors.is_estimated else None
+    level = np.diag(np.repeat(noise.robots[problem.robots.index(robot)], 3) ** 2)
+    whole = calibrated or unfitted is not None
+    if whole:
+        # The whole chain, in the targets' frames: the noise of its flanges is in it.
+        looking, at_m = problem, middles
+    else:
+        looking, at_m = _to_base(fitted, base, in_base), _carried(in_base, middles)
+        if need is not None and need.at != "views":
+            at_m = np.where(carries[:, None], at_m, np.array(need.at))
+    linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
+    if unfitted is not None:
+        off = unfitted.sigma * misfit_slopes(fitted.whole, state, noise, robot, unfitted)
+        # Errors that follow the posture are why neighbours err alike.
+        covariance = covariance - fitted.inflation * off @ off.T
+        parts["arm"] = _left_by_arm(fitted, robot, unfitted, off)
+    elif errors is not None:
+        parts["arm"] = _of_arm(problem, robot, errors)
+    parts["calibration"] = linear.spread(covariance)
+    if problem.is_combined:
+        # Noise of both as one counts as the robot's, where it carries the camera.
+        turned = adjoint(in_base)
+        look = carries[:, None, None] * (turned @ level @ np.swapaxes(turned, 1, 2))
+    else:
+        look = looking.total_covariance(linear, noise) - looking.covariance(noise)
+    parts["look"] = look
+    placed = {name: _at_points(it, at_m) for name, it in parts.items()}
+    # Of a whole chain before a camera that stands still, it is among the chain's already.
+    goes = carries | (not whole)
+    placed["pick"] = np.where(goes[:, None, None], _of_flange(problem, robot, in_base, level), 0.0)
+    placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
+    return Picks(
+        camera,
+        robot,
+        {name: it for name, it in placed.items() if it.any()},
+        fitted.freedom.get(robot, np.inf),
+        float(np.linalg.norm(_carried(problem.measured(state), middles), axis=1).mean()),
+    )
+
+
+def _of_flange(problem: Problem, robot: str, in_base: FloatArray, level: FloatArray) -> FloatArray:
+    """(n, 6, 6) the noise of a flange at its own origin.
+
+    Where the noise of robot and camera is one, it is that of targets: what the flange's rotation
+    does to them by their distance is in that of their place.
+    """
+    found = np.broadcast_to(level, (len(problem), 6, 6)).copy()
+    if problem.is_combined:
+        flange_m = problem.poses[robot][problem.observations.stops, :3, 3]
+        lever_m2 = np.sum((in_base[:, :3, 3] - flange_m) ** 2, axis=1)
+        # About three axes alike, a rotation moves a point by two of its components.
+        own = np.maximum(level[3, 3] - level[0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
+        found[:, 3:, 3:] = own[:, None, None] * np.eye(3)
+    return found
+
+
+def _is_between(problem: Problem, observer: str, base: str, robot: str) -> bool:
+    return any(it.robot == robot for it in problem.tree.path(observer, base))
+
+
+def _in_base(problem: Problem, state: State, base: str) -> FloatArray:
+    """(n, 4, 4) `base_from_target` as each observation has it."""
+    found = np.zeros((len(problem), 4, 4))
+    for group in problem.groups:
+        observer = problem.observations.observers[int(group.rows[0])]
+        found[group.rows] = problem.between(base, observer, state, group.rows)
+    return np.asarray(found @ problem.measured(state))
+
+
+def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
+    """The observations as if they were of the base itself, by way of what they saw.
+
+    What a lens does to the measured poses of targets then moves the base instead.
+    """
+    problem = fitted.problem
+    carry, effects = adjoint(in_base), []
+    for it in problem.effects:
+        at = problem.effect_columns[it.name]
+        of_thing = ~np.isin(np.arange(at.start, at.stop), fitted.of_boards)
+        seen = None if it.by_sensor is None else carry @ it.by_sensor * of_thing
+        effects.append(replace(it, by_sensor=seen))
+    return replace(
+        problem,
+        observations=replace(
+            problem.observations,
+            observed=(base,) * len(problem),
+            measured=problem.measured(fitted.state) @ invert(in_base),
+            has_rotation=np.ones(len(problem), dtype=bool),
+        ),
+        effects=tuple(effects),
+        points=frozenset(),
+        with_repeats=False,
+    )
+
+
+def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """(n, 3) points by (n, 4, 4) poses."""
+    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3])
+
+
+def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
+    """(n, 6, 6) of rotation and of (n, 3) points, by those of their frame's twist."""
+    slopes = np.broadcast_to(np.eye(6), spreads.shape).copy()
+    slopes[:, 3:, :3] = -skew(points_m)
+    return np.asarray(slopes @ spreads @ np.swapaxes(slopes, 1, 2))
+
+
+def _left_by_arm(fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray) -> FloatArray:
+    """(n, 6, 6) what errors that a fit takes for noise leave of each observation.
+
+    Args:
+        fitted: The fit.
+        robot: Whose they are.
+        errors: They.
+        off: (p, q) by how much the fit is off with each of them, in its own size.
+    """
+    problem, state = fitted.problem, fitted.state
+    widened = problem.with_effects([*problem.effects, errors.effect(robot)])
+    values = np.concatenate([state.values, np.zeros(off.shape[1])])
+    slopes = widened.linear(replace(state, values=values), ideal=True).jacobian
+    size = problem.size
+    left = slopes[:, :, :size] @ off - errors.sigma * slopes[:, :, size:]
+    return np.asarray(left @ np.swapaxes(left, 1, 2))
+
+
+def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
+    """(n, 6, 6) what errors that follow the posture make of a place, as a twist of the base."""
+    stops = problem.observations.stops
+    slopes = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
+    return np.asarray(slopes @ np.swapaxes(slopes, 1, 2))
+
+
+def _unpredicted(fitted: Fitted) -> FloatArray:
+    """(6, 6) by how much left-out views err more than is predicted, and than chance lets them."""
+    problem, noise = fitted.problem, fitted.noise
+    linear = problem.linear(fitted.state, ideal=True)
+    expected = linear.spread(fitted.covariance) + problem.total_covariance(linear, noise)
+    held, found = fitted.held_out, np.zeros((6, 6))
+    for away, axes in ((held.away_rad, slice(0, 3)), (held.away_m, slice(3, 6))):
+        known = np.isfinite(away)
+        if not known.any():
+            continue
+        among = expected[known][:, axes, axes]
+        variance = np.trace(among, axis1=1, axis2=2)
+        mean, shown = float(variance.mean()), float(np.mean(away[known] ** 2))
+        # A mean of sums of squares is about chi-square, with so many degrees (Satterthwaite 1946).
+        count = float(variance.sum()) ** 2 / float(np.sum(among**2))
+        if shown > mean * chi2_limit(_CHANCE, count) / count:
+            found[axes, axes] = (shown - mean) / 3.0 * np.eye(3)
+    return found

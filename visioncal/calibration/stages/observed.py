@@ -1,0 +1,219 @@
+"""What was observed in a session, by one camera and one robot or by many."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Self
+
+from visioncal.calibration.stages.clock import Clocked, Pair
+from visioncal.calibration.stages.dense import Dense
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.types import Corners, FloatArray, Progress, Rejection
+from visioncal.estimation.scene import Scene
+from visioncal.results import HELD_BACK, CameraResult
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.session.tables import CameraTable
+
+# So many views of one reason are named.
+_LISTED = 40
+
+
+@dataclass(frozen=True, eq=False)
+class CameraLook:
+    """What one camera gave.
+
+    Attributes:
+        table: What the session says of it.
+        corners: What was found in its images, by view; those of several boards are numbered
+            through.
+        resolution: Size of its images [px].
+        lens: Its intrinsics; None where it has no view to measure them by.
+        pixel_px: Noise of a corner's coordinate [px].
+    """
+
+    table: CameraTable
+    corners: Mapping[int, Corners]
+    resolution: tuple[int, int] | None = None
+    lens: CameraResult | None = None
+    pixel_px: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What was observed in a session.
+
+    Attributes:
+        session: What was recorded.
+        progress: Told of long work.
+        cameras: What each camera with images gave, by its frame.
+        poses: The target's pose by view; several candidates until they are chosen from.
+        reasons: Why a view cannot be used, by view.
+        robots: What its rows report of each robot, by the name that rows give it.
+        clocks: How the clocks of cameras and robots go together, where robots' streams are used.
+        warnings: What the user should know, in sentences.
+        notes: What is good to know and no reason for doubt.
+        dense: How corners are fitted by all pixels around them; None for the template's.
+    """
+
+    session: Session
+    progress: Progress | None = None
+    cameras: Mapping[str, CameraLook] = field(default_factory=dict)
+    poses: Mapping[int, ViewPoses] = field(default_factory=dict)
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    robots: Mapping[str, Reported] = field(default_factory=dict)
+    clocks: Mapping[Pair, Clocked] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    dense: Dense | None = None
+
+    def noting(self, rejections: Iterable[Rejection], warnings: Iterable[str] = ()) -> Self:
+        """Adds rejected views, of which the first reason counts, and warnings."""
+        reasons = {it.view: it.reason for it in rejections} | dict(self.reasons)
+        return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))
+
+    def with_camera(self, frame: str, look: CameraLook) -> Self:
+        """Takes over what one camera gave."""
+        return replace(self, cameras={**self.cameras, frame: look})
+
+    def with_robot(self, name: str, reported: Reported) -> Self:
+        """Takes over what is known of one robot."""
+        return replace(self, robots={**self.robots, name: reported})
+
+    @cached_property
+    def corners(self) -> Mapping[int, Corners]:
+        """What was found in the images of all cameras, by view."""
+        return {view: it for look in self.cameras.values() for view, it in look.corners.items()}
+
+    @cached_property
+    def timed(self) -> Session:
+        """The session with what robots' streams have at the times of rows that wait for them."""
+        if not self.clocks:
+            return self.session
+        found = {view.number: view for it in self.clocks.values() for view in it.views}
+        views = tuple(found.get(it.number, it) for it in self.session.views)
+        return replace(self.session, views=views)
+
+    @cached_property
+    def spared(self) -> Mapping[int, str]:
+        """Why views of sweeps are not needed, by view."""
+        return {view: why for it in self.clocks.values() for view, why in it.spared.items()}
+
+    @property
+    def lenses(self) -> Mapping[str, CameraResult]:
+        """The intrinsics of each camera, by its frame, where they are known."""
+        return {frame: look.lens for frame, look in self.cameras.items() if look.lens is not None}
+
+    @property
+    def scenes(self) -> Mapping[str, Scene]:
+        """What each camera whose corners have poses looks at, and with what, by its frame."""
+        boards, tables = self.session.boards, {it: at.table for it, at in self.cameras.items()}
+        return {
+            frame: Scene(
+                tuple(boards.values()),
+                lens.camera,
+                lens.estimated,
+                tables[frame].intrinsics,
+                tables[frame].matrix_sigma_px,
+                tuple(boards),
+            )
+            for frame, lens in self.lenses.items()
+            if boards and self.cameras[frame].pixel_px is not None
+        }
+
+    @property
+    def reported(self) -> Reported:
+        """What rows report of the only robot."""
+        return next(iter(self.robots.values()), Reported({}))
+
+    @property
+    def base_from_flange(self) -> Mapping[int, FloatArray]:
+        """(4, 4) by view, as the only robot reported it."""
+        return self.reported.base_from_flange
+
+    @property
+    def robot(self) -> Robot | None:
+        """The nominal model of the only robot, where the session names a known one."""
+        matched = self.reported.matched
+        return None if matched is None else matched.robot
+
+    @property
+    def camera(self) -> CameraResult | None:
+        """The intrinsics of the only camera, where there are images."""
+        return next(iter(self.lenses.values()), None)
+
+    @property
+    def pixel_px(self) -> float | None:
+        """Noise of a coordinate of the only camera's corners [px]."""
+        return next((it.pixel_px for it in self.cameras.values()), None)
+
+    def with_noise(self, pixel_px: float) -> Self:
+        """Takes over the noise of the corners."""
+        cameras = {it: replace(look, pixel_px=pixel_px) for it, look in self.cameras.items()}
+        return replace(self, cameras=cameras)
+
+    @property
+    def poses_of_one_board(self) -> Mapping[int, ViewPoses]:
+        """The poses of the board that most views show: those of different ones do not compare."""
+        shown = [it.board for it in self.poses.values()]
+        most = max(sorted(set(shown)), key=shown.count, default=0)
+        return {view: it for view, it in self.poses.items() if it.board == most}
+
+    @cached_property
+    def held_back(self) -> frozenset[int]:
+        """The views that the session keeps from every fit (`role = holdout`)."""
+        return frozenset(view.number for view in self.session.views if view.holdout)
+
+    @property
+    def lost_views(self) -> tuple[str, ...]:
+        """The rejected views and those held back, grouped by their reason, in words."""
+        held = dict.fromkeys(sorted(self.held_back - self.reasons.keys()), HELD_BACK)
+        return by_reason({**self.reasons, **held})
+
+
+def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
+    """Groups views by why they cannot be used, in words: the commonest reason first."""
+    views = defaultdict(list)
+    for view, reason in reasons.items():
+        views[reason].append(view)
+    grouped = sorted(views.items(), key=lambda item: -len(item[1]))
+    return tuple(
+        f"view{'s' if len(it) > 1 else ''} {some_of([*map(str, it)], _LISTED)}: {reason}"
+        for reason, it in grouped
+    )
+
+
+def all_held_back(seen: Observed) -> DataError:
+    """What to raise where the session keeps every usable view from the fit."""
+    return DataError(
+        f"session {seen.session.name!r}: all views that could be used are held back (role = "
+        "holdout), and none is left to fit.",
+        next_step="Clear role in the rows that the fit may use.",
+    )
+
+
+def nothing_seen(seen: Observed) -> DataError:
+    """What to raise where no view shows anything to calibrate by."""
+    if seen.corners and seen.corners.keys() <= seen.held_back:
+        return all_held_back(seen)
+    if not any(view.image or view.has_corners for view in seen.session.views):
+        return DataError(
+            f"session {seen.session.name!r}: there are neither images nor measured poses.",
+            next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
+        )
+    few = [it for it in seen.lost_views if "too few corners" in it]
+    if few:
+        return DataError(
+            f"session {seen.session.name!r}: no view shows enough of the target.",
+            next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
+            "corners enough.",
+        )
+    return DataError(
+        f"session {seen.session.name!r}: no view shows the target.",
+        next_step="Look at an image: is the board in it, and is it the one that the session "
+        "declares?",
+    )

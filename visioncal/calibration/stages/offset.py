@@ -1,0 +1,191 @@
+"""The offset between the clocks of camera and robot: what is known of it, and in words."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.calibration.stages.image_delays import FoundDelay
+from visioncal.calibration.stages.motion import Motion
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.clock import ClockFit
+from visioncal.estimation.clock_correlation import Match
+from visioncal.session import View
+
+# Angles that go along by less are of other motions; a larger sigma [s] is no answer.
+LEAST_CORRELATION, LARGEST_SIGMA_S, _ANY_SIGMA_S = 0.5, 0.01, 1.0
+# Fewer views at rest make no calibration.
+FEWEST_VIEWS = 3
+# A stated offset that is off by so many sigmas, and by this share of a frame, is told.
+_STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
+
+ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """How far the camera's clock is ahead of the robot's, and what that rests on.
+
+    Attributes:
+        camera_minus_robot_s: The offset [s].
+        sigma_s: Its standard deviation [s]; 0 where views at rest make it immaterial.
+        method: Told by the motion, or by its turning alone; stated by the session; of no
+            consequence, for views at rest.
+        stated_s: What the session states [s]; None where it states nothing.
+        frames: How many frames in motion told it.
+        correlation: Of the angles by which camera and robot turned; None where none was found.
+        speeds: (6,) how fast the flange moved, by view, in its own frame [rad/s, m/s].
+        delays: Times within the images that were looked for.
+    """
+
+    camera_minus_robot_s: float
+    sigma_s: float
+    method: ClockMethod
+    stated_s: float | None
+    frames: int
+    correlation: float | None
+    speeds: Mapping[int, FloatArray]
+    delays: tuple[FoundDelay, ...] = ()
+
+    def known_s(self, *, erring: bool = False) -> float:
+        """How well the offset is known beside the views that are used [s].
+
+        These are in the fit themselves: of the motion, the share of frames that are no such views
+        tells besides.
+
+        Args:
+            erring: Whether errors of the arm are unknowns of that fit. The motion told the offset
+                of an arm as stated, whose errors are the same ones in all frames.
+        """
+        if self.method != "motion":
+            return self.sigma_s
+        share = 0.0 if erring else max(0.0, 1.0 - len(self.speeds) / self.frames)
+        return 1.0 / max(1.0 / LARGEST_SIGMA_S, float(np.sqrt(share)) / self.sigma_s)
+
+    def document(self) -> dict[str, object]:
+        """What calibration.json says of it."""
+        known: dict[str, object] = {
+            "camera_minus_robot_s": self.camera_minus_robot_s,
+            "method": self.method,
+        }
+        if self.method != "rest":
+            known["sigma_s"] = self.sigma_s
+        if self.stated_s is not None:
+            known["stated_s"] = self.stated_s
+        if self.frames:
+            known["frames"] = self.frames
+        if self.correlation is not None:
+            known["correlation"] = self.correlation
+        for it in self.delays:
+            known |= it.document()
+        return known
+
+
+def told_words(fit: ClockFit, match: Match, stream: str) -> str:
+    """Says what the motion tells."""
+    return (
+        f"The camera's clock is {1e3 * fit.offset_s:+.2f} ms ahead of the robot's (sigma "
+        f"{1e3 * fit.sigma_s:.2g} ms), as {fit.frames} frames and streams/{stream}.csv tell by "
+        "their motion (the turning of both goes along with a correlation of "
+        f"{match.correlation:.2f})."
+    )
+
+
+def turning_words(match: Match) -> str:
+    """Says what the turning alone tells."""
+    return (
+        f"The camera's clock is {1e3 * match.offset_s:+.1f} ms ahead of the robot's (sigma "
+        f"{1e3 * match.sigma_s:.2g} ms), as the turning of both tells (correlation "
+        f"{match.correlation:.2f}). It tells no better, because the chain of frames does not close "
+        "over the motion: check how the poses are to be read."
+    )
+
+
+def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[str]:
+    """Says so where what the session states is not what the motion tells."""
+    if clock.stated_s is None:
+        return
+    away_s = abs(clock.stated_s - clock.camera_minus_robot_s)
+    frame_s = float(np.median(np.diff([view.stamp_s or 0.0 for view in views])))
+    if away_s > max(_STATED_SIGMAS * clock.sigma_s, _STATED_SHARE * frame_s):
+        yield (
+            f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
+            f"motion tells {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
+            f"{1e3 * clock.sigma_s:.2g} ms), which was taken. Correct session.toml, or look at how "
+            "the stamps are made."
+        )
+
+
+def why_untold(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
+    """Says why the motion does not tell the offset."""
+    best = max(matches, key=lambda it: it.correlation, default=None)
+    if best is None:
+        return "camera and robot are not seen to turn together for long enough"
+    if best.correlation < LEAST_CORRELATION:
+        return (
+            f"the turning of robot and camera goes along with a correlation of "
+            f"{best.correlation:.2f} at best ({LEAST_CORRELATION} is needed), so they are not of "
+            "the same motion, or it was too slow"
+        )
+    if best.at_end:
+        return (
+            f"the turning of robot and camera goes along best {best.offset_s:+.2f} s apart, where "
+            "the search ends"
+        )
+    if not fits or fits[0].sigma_s > _ANY_SIGMA_S:
+        return "the motion is too even: any offset explains it"
+    if fits[0].sigma_s > LARGEST_SIGMA_S:
+        return (
+            f"the motion tells the offset to {1e3 * fits[0].sigma_s:.2g} ms only "
+            f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
+        )
+    several = " and ".join(f"{1e3 * it.offset_s:+.0f}" for it in fits)
+    return f"the motion repeats itself: offsets of {several} ms explain it alike"
+
+
+def no_offset(
+    motion: Motion, views: Sequence[View], resting: Mask, why: str
+) -> DegenerateError | DataError:
+    """What to raise where there is no way to the robot's poses."""
+    stamps_s = np.array([view.stamp_s for view in views], dtype=float)
+    begin_s, end_s = motion.flange.stamps_s[[0, -1]]
+    if not len(views):
+        return DataError(
+            "No view has both a time and a pose of the target.",
+            culprits=["views.csv: stamp_s"],
+            next_step="Fill in stamp_s where the target is in the image.",
+        )
+    if not motion.flange.covers(stamps_s).any():
+        return DataError(
+            f"No view lies within streams/{motion.name}.csv: it goes from {begin_s:.6f} to "
+            f"{end_s:.6f} s, the views from {stamps_s[0]:.6f} to {stamps_s[-1]:.6f} s.",
+            culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
+            next_step="Stamp both with clocks that differ by seconds at most, or state about what "
+            "they differ by: [clock] camera_minus_robot_s.",
+        )
+    return DegenerateError(
+        f"clock: the offset between the clocks of camera and robot is not told by {len(views)} "
+        f"views, of which {int(resting.sum())} were taken at rest: {why}.",
+        culprits=[f"streams/{motion.name}.csv", "views.csv: stamp_s"],
+        next_step="Sweep the robot to and fro, about different axes, with the target in view; or "
+        f"take {FEWEST_VIEWS} views or more at rest; or state [clock] camera_minus_robot_s.",
+    )
+
+
+def speed_words(clock: Clock, speeds: FloatArray, inside: int) -> str:
+    """How fast the flange moved at most in the views that are used, and what that costs."""
+    if not len(speeds):
+        return "No view lies within the stream."
+    fastest_mm, fastest_deg = (
+        1e3 * float(np.linalg.norm(speeds[:, 3:], axis=1).max()),
+        float(np.rad2deg(np.linalg.norm(speeds[:, :3], axis=1).max())),
+    )
+    return (
+        f"{len(speeds)} of {inside} views with a time are used, taken while the flange moved by up "
+        f"to {figure(fastest_mm)} mm/s and {figure(fastest_deg)} deg/s: what is open about the "
+        f"clocks makes {figure(clock.sigma_s * fastest_mm)} mm and "
+        f"{figure(clock.sigma_s * fastest_deg)} deg of it, and counts in the covariance."
+    )

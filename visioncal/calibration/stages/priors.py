@@ -1,0 +1,86 @@
+"""What a session knows of a cell's frames beforehand: `[prior.A_from_B]`, and what became of it."""
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from visioncal.calibration.stages.measured import components, prior_of
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import FloatArray
+from visioncal.estimation.parts import FramePrior, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.tree import Tree
+from visioncal.session.tables import PriorTable
+
+
+def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
+    """Reads the priors of a cell's frames.
+
+    Args:
+        tables: `[prior.A_from_B]` by its name: where frame B is in frame A.
+        tree: The frames.
+
+    Raises:
+        DataError: A frame is unknown, or a robot moves one of the two before the other.
+    """
+    return tuple(_prior(name, table, tree) for name, table in tables.items())
+
+
+def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
+    found = prior_of(name, table)
+    first, second = found.first, found.second
+    label = f"session.toml: prior.{name}"
+    for frame in (first, second):
+        if frame not in tree.branches:
+            known = [it for it in tree.branches if it != frame]
+            raise DataError(
+                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(known)}.",
+                culprits=[label],
+                next_step=did_you_mean(frame, known)
+                or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
+            )
+    moved_by = [it.robot for it in tree.path(first, second) if it.robot]
+    if moved_by or first == second:
+        why = f"robot {moved_by[0]} moves one before the other" if moved_by else "they are one"
+        raise DataError(
+            f"{label}: {first} and {second} have no fixed place in each other: {why}.",
+            culprits=[label],
+            next_step="State where two frames are that stand in the cell, or on one flange.",
+        )
+    return found
+
+
+def most_contradicted(problem: Problem, state: State, spread: FloatArray) -> FramePrior | None:
+    """The prior that the observations contradict most; None where they contradict none.
+
+    Args:
+        problem: The observations in the fit.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
+    """
+    found = [
+        (it.contradiction, at)
+        for at, prior in enumerate(problem.priors)
+        for it in components(problem, state, spread, [prior])
+        if it.is_contradicted
+    ]
+    return problem.priors[max(found)[1]] if found else None
+
+
+def prior_words(
+    problem: Problem, state: State, spread: FloatArray, stated: Iterable[FramePrior]
+) -> Iterator[tuple[str, bool]]:
+    """Says what became of priors, and whether that is a reason for doubt.
+
+    Args:
+        problem: The observations in the fit, with the priors that these do not contradict.
+        state: The answer.
+        spread: (p, p) covariance of the unknowns.
+        stated: All priors.
+    """
+    used = {it.name for it in problem.priors}
+    for prior in stated:
+        found = components(problem, state, spread, [prior])
+        if prior.name in used:
+            yield from ((it.remark, False) for it in found)
+        elif found:
+            yield max(found, key=lambda it: it.contradiction).doubt, True

@@ -1,0 +1,325 @@
+"""Readings of a measuring instrument: places of points on the flange, or poses of a probe."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from visioncal.calibration.stages.observed import Observed, nothing_seen
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import figure
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, IntArray, Rejection
+from visioncal.estimation.positions import (
+    Mounting,
+    Places,
+    find_mounting,
+    residuals,
+)
+from visioncal.session import Session, View
+from visioncal.session.instruments import Instrument, instrument_names, stated_instrument
+from visioncal.session.kinds import is_read, is_seen, name_of
+
+# No tracker reads so far [m].
+_FARTHEST_M = 160.0
+# Labels are exchanged where a stop's points lie so many times farther from where the others of
+# the stop put them than is usual, and as usual, give or take, once they are changed back.
+_OFF, _USUAL = 5.0, 2.0
+# Readings agree to no better than this [m]: exact ones would otherwise be judged by rounding.
+_LEAST_M = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What an instrument read.
+
+    Attributes:
+        instrument: Its noise.
+        names: The points in the order in which they first appear; one, perhaps without a name.
+        read_m: (3,) by view, in the instrument's frame [m].
+        points: Which of the points, by view.
+        probes: (4, 4) `instrument_from_probe` by view, where poses were read; else None.
+        rejections: Rows that are of no use.
+    """
+
+    instrument: Instrument
+    names: tuple[str, ...]
+    read_m: Mapping[int, FloatArray]
+    points: Mapping[int, int]
+    probes: Mapping[int, FloatArray] | None
+    rejections: tuple[Rejection, ...]
+
+    @property
+    def are_poses(self) -> bool:
+        """Whether the probe's rotation was read, too."""
+        return self.probes is not None
+
+    @property
+    def sigma_m(self) -> float:
+        """Noise of a coordinate that was read, typically [m]."""
+        return float(np.median(self.instrument.sigmas_m(np.array(list(self.read_m.values())))))
+
+    def places(
+        self, views: Sequence[int], base_from_flange: Mapping[int, FloatArray], stops: IntArray
+    ) -> Places:
+        """What was read of points in some views; the (m,) stops are numbered from 0."""
+        read = np.array([self.read_m[view] for view in views]).reshape(-1, 3)
+        return Places(
+            np.array([base_from_flange[view] for view in views]).reshape(-1, 4, 4),
+            read,
+            np.array([self.points[view] for view in views], dtype=np.int64),
+            stops,
+            self.instrument.sigmas_m(read),
+        )
+
+
+def read_instrument(session: Session) -> Readings:
+    """Collects an instrument's readings, and checks them.
+
+    Raises:
+        DataError: The instrument's noise is not known, readings are in millimetres, some have a
+            rotation and some none, or a point's name is missing or misspelt.
+    """
+    rows = [view for view in session.views if view.reading_m is not None]
+    _check_unit(rows)
+    are_poses, instrument = _are_poses(rows), _instrument(session, rows)
+    names, rejections = _names(rows, are_poses=are_poses)
+    kept = [view for view in rows if view.number not in {it.view for it in rejections}]
+    missing = [
+        Rejection(view.number, "no reading of the instrument: meas_x_m ... are empty")
+        for view in session.views
+        if view.reading_m is None
+    ]
+    return Readings(
+        instrument,
+        names,
+        {view.number: _read(view) for view in kept},
+        {view.number: names.index(_name(view)) for view in kept},
+        {view.number: _probe(view) for view in kept} if are_poses else None,
+        (*missing, *rejections),
+    )
+
+
+def read_instruments(session: Session) -> dict[int, ViewPoses]:
+    """What all instruments of a cell read, by view; of places alone, the rotation is any.
+
+    Raises:
+        DataError: An instrument's noise is not known, or its readings are in millimetres.
+    """
+    rows: dict[str, list[View]] = {}
+    for it in session.observations:
+        if is_read(it.view) and not is_seen(it.view):
+            rows.setdefault(it.seer, []).append(it.view)
+    found = {}
+    for mine in rows.values():
+        _check_unit(mine)
+        instrument = _instrument(session, mine)
+        for view in mine:
+            found[view.number] = _sighting(view.number, _probe(view), instrument)
+    return found
+
+
+def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses:
+    """A probe (4, 4) as an instrument saw it."""
+    spread = np.zeros((6, 6))
+    spread[range(3), range(3)] = (instrument.sigma_rad or 0.0) ** 2
+    spread[range(3, 6), range(3, 6)] = instrument.sigmas_m(probe[None, :3, 3])[0] ** 2
+    return ViewPoses(view, None, probe[None], (0,), spread[None], np.zeros((1, 6, 0)))
+
+
+def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...]:
+    """Readings of one robot's points whose names are exchanged.
+
+    Args:
+        seen: What is known, with where the robot stood.
+        readings: Of places.
+
+    Raises:
+        DataError: No view can be used.
+        DegenerateError: There are too few stops.
+    """
+    station = {it.view.number: it.station for it in seen.session.observations}
+    poses = seen.base_from_flange
+    views = [it for it in readings.read_m if it in poses and it not in seen.held_back]
+    if not views:
+        raise nothing_seen(seen)
+    stops = np.unique([station[it] for it in views], return_inverse=True)[1]
+    _check_stops(readings, stops)
+    places = readings.places(views, poses, stops)
+    with one_blas_thread():
+        mounting, _ = find_mounting(places)
+    return tuple(_exchanged(readings, views, places, mounting))
+
+
+def _read(view: View) -> FloatArray:
+    read = view.reading_m
+    return np.zeros(3) if read is None else read
+
+
+def _probe(view: View) -> FloatArray:
+    """(4, 4) where the probe was read; of a place alone its rotation is any."""
+    pose, matrix = view.instrument_from_probe(), np.eye(4)
+    if pose is not None:
+        return np.asarray(pose.as_matrix())
+    matrix[:3, 3] = _read(view)
+    return matrix
+
+
+def _name(view: View) -> str:
+    return view.text.get("point", "").strip()
+
+
+def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
+    """The instrument that read some rows."""
+    table = session.instruments.get(name_of(session.declaration, "instrument", rows[0]))
+    if table is None:
+        raise DataError(
+            "session.toml: rows have an instrument's readings (meas_x_m ...), but nothing says "
+            "how good they are.",
+            culprits=["session.toml: instrument"],
+            next_step="Add [instrument] with sigma_m (and sigma_per_m), or with one of these as "
+            f"its name: {', '.join(instrument_names())}.",
+        )
+    found = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
+    if found.sigma_rad is None and any(it.instrument_from_probe() is not None for it in rows):
+        raise DataError(
+            f"session.toml: rows have rotations of a probe (meas_qx ...), but how good they are "
+            f"is not known of the instrument {table.name!r}.",
+            culprits=["session.toml: instrument.sigma_rad"],
+            next_step="State sigma_rad in [instrument], or leave the columns meas_qx ... out.",
+        )
+    return found
+
+
+def _check_unit(rows: Sequence[View]) -> None:
+    far = float(np.median([np.linalg.norm(_read(view)) for view in rows]))
+    if far > _FARTHEST_M:
+        raise DataError(
+            f"views.csv: the median distance of the readings (meas_x_m, meas_y_m, meas_z_m) from "
+            f"the instrument is {far:.4g} m, and no instrument reads farther than "
+            f"{_FARTHEST_M:g} m.",
+            culprits=["views.csv: meas_x_m, meas_y_m, meas_z_m"],
+            next_step="It looks like millimetres: multiply these columns by 0.001.",
+        )
+
+
+def _are_poses(rows: Sequence[View]) -> bool:
+    turned = [view.instrument_from_probe() is not None for view in rows]
+    if any(turned) and not all(turned):
+        without = [str(it.number) for it, there in zip(rows, turned, strict=True) if not there]
+        raise DataError(
+            f"views.csv: {sum(turned)} of {len(rows)} readings have the probe's rotation "
+            f"(meas_qx ...); view{'s' if len(without) > 1 else ''} {some_of(without)} have none.",
+            culprits=[f"views.csv: view {it}" for it in without],
+            next_step="Fill it in everywhere, or leave its columns out.",
+        )
+    return all(turned)
+
+
+def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], list[Rejection]]:
+    """The points' names, and rows whose point tells nothing.
+
+    Raises:
+        DataError: A name is missing or misspelt, or several probes were read.
+    """
+    by_name = defaultdict(list)
+    for view in rows:
+        by_name[_name(view)].append(view.number)
+    if len(by_name) > 1 and "" in by_name:
+        others = [name for name in by_name if name]
+        raise DataError(
+            f"views.csv: readings name their point ({some_of(others)}), but those of "
+            f"view{'s' if len(by_name['']) > 1 else ''} {some_of(list(map(str, by_name[''])))} "
+            "do not.",
+            culprits=[f"views.csv: view {it}, point" for it in by_name[""]],
+            next_step="Fill the column point in everywhere.",
+        )
+    if are_poses and len(by_name) > 1:
+        raise DataError(
+            f"views.csv: poses of {len(by_name)} probes ({some_of(list(by_name))}) were read; one "
+            "is read in a session.",
+            culprits=["views.csv: point"],
+            next_step="Split the session, or leave the columns meas_qx ... out: places of several "
+            "points are read.",
+        )
+    alone = {name: views[0] for name, views in by_name.items() if len(views) == 1}
+    rejections = [_alone(name, view, by_name) for name, view in alone.items()]
+    if len(alone) == len(by_name):
+        return tuple(by_name), []
+    return tuple(name for name in by_name if name not in alone), rejections
+
+
+def _alone(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejection:
+    known = [it for it, views in others.items() if len(views) > 1]
+    hint = did_you_mean(name, known)
+    if hint:
+        raise DataError(
+            f"views.csv: view {view} reads a point {name!r} that no other row names; the points "
+            f"are {some_of(known)}.",
+            culprits=[f"views.csv: view {view}, point"],
+            next_step=hint,
+        )
+    return Rejection(view, f"its point {name!r} was read once, which tells nothing of the chain")
+
+
+def _check_stops(readings: Readings, stops: IntArray) -> None:
+    """Refuses fewer stops than tell where instrument and points are, with any to spare."""
+    count, points = len(np.unique(stops)), len(readings.names)
+    needed = 4 if points == 1 else 3
+    if count >= needed:
+        return
+    what = "point on the flange" if points == 1 else f"{points} points on the flange"
+    raise DegenerateError(
+        f"instrument: {count} usable stop{'s' if count != 1 else ''} of the robot; at least "
+        f"{needed} are needed to tell where the instrument stands and where the {what} "
+        f"{'is' if points == 1 else 'are'}.",
+        culprits=["the instrument's place", f"the {what}"],
+        next_step="Read at more stops, with the flange turned about different axes; 20 to 30 "
+        "calibrate the arm too.",
+    )
+
+
+def _exchanged(
+    readings: Readings, views: Sequence[int], places: Places, mounting: Mounting
+) -> Iterator[Rejection]:
+    """Finds stops at which the names of two points are exchanged.
+
+    Where the arm puts the flange wrongly, all points of a stop are off alike: what counts is how
+    they lie to each other.
+    """
+    off = residuals(places, mounting)
+    stops = [np.flatnonzero(places.stops == stop) for stop in range(places.stops.max() + 1)]
+    rows_of = [rows for rows in stops if len(rows) > 1]
+    if not rows_of:
+        return
+    usual = max(float(np.median([_apart(off[rows]) for rows in rows_of])), _LEAST_M)
+    for rows in rows_of:
+        if _apart(off[rows]) < _OFF * usual:
+            continue
+        for one, other in combinations(rows.tolist(), 2):
+            back = off[rows] - _change(places, mounting, rows, one, other)
+            if _apart(back) < _USUAL * usual:
+                names = [readings.names[places.points[it]] for it in (one, other)]
+                words = (
+                    f"the points {names[0]} and {names[1]} are exchanged at this stop: changed "
+                    f"back, its points agree to {figure(1e3 * _apart(back))} mm, not "
+                    f"{figure(1e3 * _apart(off[rows]))} mm"
+                )
+                yield from (Rejection(views[it], words) for it in (one, other))
+                break
+
+
+def _change(places: Places, mounting: Mounting, rows: IntArray, one: int, other: int) -> FloatArray:
+    """What the residuals (r, 3) of a stop's rows lose when two rows exchange their points."""
+    step = mounting.on_flange[places.points[other]] - mounting.on_flange[places.points[one]]
+    sign = (rows == one).astype(float) - (rows == other)
+    return np.asarray(sign[:, None] * step)
+
+
+def _apart(off: FloatArray) -> float:
+    """Root mean square of how far (r, 3) residuals lie from their mean [m]."""
+    return float(np.sqrt(np.mean(np.sum((off - off.mean(axis=0)) ** 2, axis=1))))

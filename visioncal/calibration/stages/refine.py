@@ -1,0 +1,321 @@
+"""Stage 6: what all views share besides the edges: the lens, and the board as it really is."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.side import FramesSide
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Corners, FloatArray, IntArray
+from visioncal.estimation.appearance import (
+    Appearance,
+    Compressed,
+    Free,
+    compress,
+)
+from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.joint import (
+    Fitted,
+    MeasuredScale,
+    Scores,
+    Side,
+    again,
+    chance_limit,
+    contradicted_lens,
+    measured_scale,
+    moved_surprise,
+    settle,
+)
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
+from visioncal.estimation.parts import State
+from visioncal.estimation.solve import covariance_of, left_out_residuals
+
+
+def free_of(seen: Seen) -> Free:
+    """Lens and boards of the only camera, and what is open about them."""
+    looks, known = seen.looks, seen.known
+    ((name, problem),) = looks.problems.items()
+    return Free(
+        Appearance(looks.camera(name), looks.values[looks.boards]),
+        problem.basis,
+        problem.positions,
+        seen.free,
+        seen.held,
+        known.information,
+        known.pull,
+    )
+
+
+def refined(
+    side: FramesSide, looks: Looks, frames: Mapping[str, FloatArray]
+) -> tuple[Fitted, FramesSide]:
+    """Fits lenses, boards and frames to all corners together; see `chosen`.
+
+    Once these are as the corners ask for, the residuals tell the noise of each view, and all is
+    fitted once more by it.
+
+    Args:
+        side: The frames' side.
+        looks: The corners, and lenses and boards as they are stated.
+        frames: Where the unknown frames are thought to be.
+
+    Returns:
+        The fit, and the side with the errors of its arms.
+    """
+    answer, side = _equally_weighed(side, looks, frames)
+    looks = answer.looks.weighed(answer.seen)
+    if any(
+        it.stack is not answer.looks.problems[name].stack for name, it in looks.problems.items()
+    ):
+        answer = again(answer, side, answer.moving, looks)
+    return answer, side
+
+
+def _equally_weighed(
+    side: FramesSide, looks: Looks, frames: Mapping[str, FloatArray]
+) -> tuple[Fitted, FramesSide]:
+    """Fits all with the weights that the corners have.
+
+    Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
+    passed for another lens or board: all is then chosen once more with them free. Errors of any
+    arm's shape tell which values are free, but are not estimated. Their size is that under the
+    stated lenses and boards: a board that changes its size with the arm hides a part of it.
+    """
+    stated = settle(looks, side, looks.first, frames)
+    answer = chosen(side, stated)
+    found = side.with_errors(answer)
+    if not any(it.is_significant for it in found.errors):
+        return answer, found
+    under_stated = side.with_errors(stated)
+    erring = (under_stated if under_stated.errors else found).freed(freely=True)
+    answer = chosen(erring, _still_asked_for(erring, stated, answer))
+    estimating = erring.freed(freely=False)
+    if all(it.is_estimated for it in erring.errors):
+        return answer, estimating
+    fitted = settle(answer.looks, estimating, answer.moving, answer.frames)
+    return fitted, estimating.with_errors(fitted)
+
+
+def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
+    """The fit with errors of arms free, and of what was set free before what is still asked for.
+
+    Before, noise was as large as these errors: what they had passed for is as stated again, and
+    what really is another is clear now.
+    """
+    wide = settle(answer.looks, erring, answer.moving, answer.frames)
+    looks = answer.looks
+    freed = [looks.shape_of(it) for it in looks.printed] + [
+        looks.lens_of(it) for it in looks.problems
+    ]
+    kept = [
+        it
+        for it in freed
+        if np.isin(it, answer.moving).all()
+        and not np.isin(it, stated.moving).any()
+        and moved_surprise(wide, it) > chance_limit(len(it))
+    ]
+    sizes, wide = _still_other_sizes(erring, wide)
+    places = np.concatenate([stated.moving, *kept, *sizes])
+    unstated = places[np.isinf(looks.prior_sigma[places])]
+    restated = stated.looks.without_prior(unstated.tolist())
+    restated = restated.with_values(places, wide.looks.values[places])
+    return settle(restated, erring, np.unique(places), answer.frames)
+
+
+def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitted]:
+    """The scales of boards that are others than stated, and the fit with these alone free.
+
+    What all boards have in common, links of arms may have, too, and free together none is clear:
+    the least clear one is as stated, and the rest are measured anew beside it.
+    """
+    looks = wide.looks
+    free = [it for it in looks.printed if np.isin(looks.scale_of(it), wide.moving).all()]
+    while free:
+        measured = [measured_scale(erring, wide, board) for board in free]
+        least = min(measured, key=lambda it: abs(it.scale) / it.sigma)
+        if least.is_another:
+            break
+        free.remove(least.board)
+        place = looks.scale_of(least.board)
+        held = wide.looks.with_values(place, looks.stated[place])
+        wide = again(wide, erring, np.setdiff1d(wide.moving, place), held)
+    return [looks.scale_of(it) for it in free], wide
+
+
+def chosen(side: Side, fitted: Fitted) -> Fitted:
+    """Sets free what the data speak for.
+
+    The boards' bends, given intrinsics together with them, and the boards' scales are set free
+    where corners and chains speak for it with more than noise can say, the frames stay determined,
+    and views that are left out do not speak against it. What is held although the corners speak
+    against it, and a scale that is held, count by their priors in the covariance.
+
+    Args:
+        side: The frames' side.
+        fitted: The fit with what is free from the start.
+    """
+    answer = fitted
+    for moving in _shapes(side, fitted):
+        wider = _freed(side, moving, fitted)
+        if _is_determined(wider, fitted) and not _predicts_worse(wider, fitted):
+            answer = wider
+            break
+    contested = _contested(side, answer)
+    if contested:
+        answer = again(answer, side, answer.moving, answer.looks.contesting(contested))
+    return _resized(side, answer)
+
+
+def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
+    """Fits with more values free; a confident wrong prior is worse than none."""
+    wider = again(fitted, side, moving)
+    looks = wider.looks
+    wrong = [
+        looks.lens_of(it)
+        for it in looks.problems
+        if np.isin(looks.lens_of(it), moving).all() and contradicted_lens(wider, it)
+    ]
+    if not wrong:
+        return wider
+    return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
+
+
+def _resized(side: Side, answer: Fitted) -> Fitted:
+    """Sets the boards' scales free where the robot measures others than are stated.
+
+    One after the other: a board that is off misleads about the others, too.
+    """
+    for _ in answer.looks.printed:
+        other = _wrongly_sized(side, answer)
+        if other is None:
+            return answer
+        looks = answer.looks
+        place = looks.scale_of(other.board)
+        if other.contradicts:
+            looks = looks.without_prior(place.tolist())
+        resized = again(answer, side, np.union1d(answer.moving, place), looks)
+        if not _is_determined(resized, answer):
+            return answer
+        answer = resized
+    return answer
+
+
+def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
+    """The board whose size is held and farthest from what the robot measures, if any is beyond."""
+    looks = answer.looks
+    held = [it for it in looks.printed if looks.scale_of(it)[0] not in answer.moving]
+    measured = [measured_scale(side, answer, board) for board in held]
+    # An arm whose links may all be too long is hard to tell from a board that is too large.
+    other = [it for it in measured if (it.contradicts if side.has_errors else it.is_another)]
+    return max(other, key=lambda it: abs(it.scale) / it.sigma, default=None)
+
+
+def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
+    """Whether the views still determine all frames to what is accepted, errors of arms aside."""
+    after, before = _worst(wider), _worst(fitted)
+    limits = np.tile([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], len(after) // 2)
+    # What was not determined before is no fault of lens and board.
+    return bool(np.all((after < limits) | (before >= limits)))
+
+
+def _worst(fitted: Fitted) -> FloatArray:
+    """(2 e,) the largest sigma of each unknown frame's rotation [rad] and place [m]."""
+    looks, fit = fitted.problem.effects[:1], fitted.fit
+    problem = fitted.problem.with_effects(looks)
+    values = fit.state.values[: sum(map(len, looks))]
+    spread = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
+    places = np.arange(6 * len(problem.unknown)).reshape(-1, 3)
+    return np.sqrt([np.linalg.eigvalsh(spread[np.ix_(it, it)])[-1] for it in places])
+
+
+def _contested(side: Side, answer: Fitted) -> list[str]:
+    """Cameras whose intrinsics are held, and explain the corners worse than chance does."""
+    looks, moving = answer.looks, answer.moving
+    held = [it for it in looks.problems if not np.isin(looks.lens_of(it), moving).all()]
+    if not held or not looks.has_spare_corners:
+        return []
+    bent = np.union1d(moving, looks.shape)
+    lenses = {it: looks.lens_of(it) for it in held}
+    scores = Scores.of(side, answer, np.concatenate([bent, *lenses.values()]))
+    least = scores.gain(bent)
+    return [
+        name
+        for name, lens in lenses.items()
+        if scores.gain(np.union1d(bent, lens)) - least > chance_limit(len(lens))
+    ]
+
+
+def remade(views: Sequence[ViewPoses], free: Free, sigma_px: float) -> tuple[ViewPoses, ...]:
+    """Makes the poses of views anew that had no part in the fit.
+
+    Args:
+        views: The views, each with its one pose and its corners.
+        free: Lens and board.
+        sigma_px: Noise of a corner's coordinate [px].
+    """
+    if not views:
+        return ()
+    stack = CornerStack.of(_corners(views), free.positions)
+    starts = np.array([view.cam_from_target[0] for view in views])
+    with one_blas_thread():
+        compressed = compress(stack, free.basis, free.appearance, starts)
+    return tuple(
+        _remade(view, compressed, free.columns, sigma_px, at) for at, view in enumerate(views)
+    )
+
+
+def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
+    """The bends, with given intrinsics or without, where they explain significantly more."""
+    looks, now = fitted.looks, fitted.moving
+    if not looks.has_spare_corners:
+        return
+    bent = np.union1d(now, looks.shape)
+    stated = {
+        name: np.setdiff1d(looks.lens_of(name), bent)
+        for name, it in looks.problems.items()
+        if it.scene.mode != "hold"
+    }
+    scores = Scores.of(side, fitted, np.concatenate([bent, *stated.values()]))
+    gain_bent = scores.gain(bent)
+    gains = {
+        name: scores.gain(np.union1d(bent, lens)) - gain_bent - chance_limit(len(lens))
+        for name, lens in stated.items()
+        if len(lens)
+    }
+    # The one that is asked for least is done without first.
+    asked = sorted((name for name, it in gains.items() if it > 0.0), key=lambda it: -gains[it])
+    while asked:
+        yield np.unique(np.concatenate([bent, *(stated[it] for it in asked)]))
+        asked.pop()
+    if len(bent) > len(now) and gain_bent > chance_limit(len(bent) - len(now)):
+        yield bent
+
+
+def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
+    """Whether views that are left out are predicted worse, in position and in rotation."""
+    errors = [
+        left_out_residuals(it.problem, it.fit.state, it.fit.noise).reshape(-1, 2, 3)
+        for it in (wider, fitted)
+    ]
+    more, less = (np.mean(it**2, axis=(0, 2)) for it in errors)
+    return bool(np.all(more > less))
+
+
+def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
+    return {it.view: it.corners for it in views if it.corners is not None}
+
+
+def _remade(
+    view: ViewPoses, compressed: Compressed, columns: IntArray, sigma_px: float, at: int
+) -> ViewPoses:
+    spread = floored_sigma_px(sigma_px) ** 2 * covariance(compressed.information[at])
+    return replace(
+        view,
+        cam_from_target=compressed.cam_from_target[at][None],
+        covariance=spread[None],
+        by_shared=compressed.by_shared[at][None, :, columns],
+    )

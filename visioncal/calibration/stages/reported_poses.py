@@ -1,0 +1,133 @@
+"""Where the robot says that its flange was: poses as reported, or joints through the model."""
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from visioncal.calibration.guess.joints import JointReading
+from visioncal.calibration.stages.joints import Matched, match_joints
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, pose_difference
+from visioncal.core.types import FloatArray, Rejection
+from visioncal.robot import Robot
+from visioncal.session import Session
+
+# The robot stands still while a stop's images are taken; controllers report it with some noise.
+_ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
+
+
+def moved_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
+    """Poses (m, 4, 4) of what is on the flange of one model, on that of another."""
+    on_flange = invert(before.base_from_flange(q)) @ poses
+    return np.asarray(after.base_from_flange(q) @ on_flange)
+
+
+@dataclass(frozen=True, eq=False)
+class Reported:
+    """What a robot's rows report of it.
+
+    Attributes:
+        base_from_flange: (4, 4) by view.
+        rejections: Views without a pose.
+        warnings: What does not fit together, in words.
+        notes: What is good to know of it.
+        matched: The joints beside the poses; None without a model.
+    """
+
+    base_from_flange: Mapping[int, FloatArray]
+    rejections: tuple[Rejection, ...] = ()
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    matched: Matched | None = None
+
+    @cached_property
+    def joints_rad(self) -> Mapping[int, FloatArray] | None:
+        """(n,) joint angles by view [rad]; None where a view with a pose lacks them."""
+        if self.matched is None or not self.base_from_flange:
+            return None
+        there = self.matched.joints_rad
+        known = {view: there[view] for view in self.base_from_flange if view in there}
+        return known if len(known) == len(self.base_from_flange) else None
+
+    def without(self, views: Collection[int]) -> Self:
+        """Leaves out some views."""
+        kept = {it: pose for it, pose in self.base_from_flange.items() if it not in views}
+        return replace(self, base_from_flange=kept)
+
+    def with_zero(self, zero: JointReading) -> Self:
+        """Takes a joint's zero for where it is, and the poses for those of the arm then."""
+        before, joints = self.matched, self.joints_rad
+        if before is None or joints is None:
+            return self
+        after = replace(before, zero=zero)
+        views = list(self.base_from_flange)
+        q = np.array([joints[it] for it in views])
+        poses = np.array([self.base_from_flange[it] for it in views])
+        moved = moved_arm(poses, q, before.arm, after.arm)
+        return replace(self, base_from_flange=dict(zip(views, moved, strict=True)), matched=after)
+
+
+def reported_poses(session: Session, robot: Robot | None) -> Reported:
+    """Collects `base_from_flange` of each view.
+
+    A reported pose comes first; where a view has joints only, the robot's model gives the pose.
+
+    Args:
+        session: The session.
+        robot: Its nominal robot, where it names a known one.
+
+    Returns:
+        The poses, and whether joints and poses belong together.
+
+    Raises:
+        DataError: Joints are all there is, and they are not as many as the robot's; or rows that
+            are said to be of one stop lie apart.
+    """
+    matched = None if robot is None else match_joints(session.views, robot)
+    rejections = []
+    poses: dict[int, FloatArray] = {}
+    for view in session.views:
+        pose, joints = view.base_from_flange(), view.joints_rad
+        if pose is not None:
+            poses[view.number] = np.asarray(pose.as_matrix())
+        elif joints is None or matched is None or matched.misread:
+            rejections.append(Rejection(view.number, _no_pose(joints, matched)))
+        else:
+            poses[view.number] = matched.pose(joints)
+    if not session.is_network:
+        # Of a whole cell, such rows are of a state of their own.
+        _check_stops(session, poses)
+    told = ((), ()) if matched is None else (matched.warnings, matched.notes)
+    return Reported(poses, tuple(rejections), *told, matched)
+
+
+def _no_pose(joints: FloatArray | None, matched: Matched | None) -> str:
+    if joints is None:
+        return "no pose of the robot: x_m to qw are empty"
+    if matched is None:
+        return "no pose of the robot: it has joint angles, but the session names no known robot"
+    return "no pose of the robot: its joint angles are misread, as those of views with poses show"
+
+
+def _check_stops(session: Session, poses: Mapping[int, FloatArray]) -> None:
+    """Refuses declared stops whose rows lie apart: one pose of the robot would stand for all."""
+    rows = defaultdict(list)
+    for view in session.views:
+        if view.stop is not None and view.number in poses:
+            rows[view.stop].append(view.number)
+    for stop, views in rows.items():
+        away = [pose_difference(poses[views[0]], poses[view]) for view in views]
+        mm, deg = np.max(away, axis=0)
+        if mm > _ONE_STOP_MM or deg > _ONE_STOP_DEG:
+            named = ", ".join(map(str, views))
+            raise DataError(
+                f"views.csv: the rows of stop {stop} (views {named}) have poses of the robot up to "
+                f"{mm:.4g} mm and {deg:.3g} deg apart; those of one stop lie within "
+                f"{_ONE_STOP_MM:g} mm and {_ONE_STOP_DEG:g} deg.",
+                culprits=[f"views.csv: view {view}" for view in views],
+                next_step="Remove the stop numbers, or correct the poses.",
+            )

@@ -1,0 +1,155 @@
+"""Where the robots stood: what their rows report, and whether joints belong to what is seen."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from visioncal.calibration.stages.joint_consistency import (
+    contradicted_joints,
+    guess_seen_joints,
+    lost_zero,
+    misread_joints,
+)
+from visioncal.calibration.stages.joints import Matched
+from visioncal.calibration.stages.motion import is_open
+from visioncal.calibration.stages.observed import Observed
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.reported_poses import Reported, reported_poses
+from visioncal.core.types import Mount, Rejection
+from visioncal.robot import Robot
+from visioncal.session import Observation, Session, frame_name
+from visioncal.session.kinds import is_seen, name_of
+
+T = TypeVar("T", bound=Observed)
+
+
+def read_robots(seen: T) -> T:
+    """Takes up what rows report of the robots, by way of which something was observed.
+
+    Raises:
+        DataError: Joints are all there is, and they are not as many as the robot's; or rows that
+            are said to be of one stop lie apart.
+    """
+    session, found = seen.timed, {}
+    for name in session.robots:
+        document = session.robot_documents.get(name)
+        mine = tuple(
+            it
+            for it in session.views
+            if name_of(session.declaration, "robot", it) == name
+            and not (seen.clocks and is_open(it))
+        )
+        model = None if document is None else Robot.from_document(document)
+        reported = reported_poses(replace(session, views=mine), model)
+        found[name] = _with_stops(session, name, reported)
+        seen = seen.noting((), _of_robot(session, name, reported.warnings))
+        notes = (*seen.notes, *_of_robot(session, name, reported.notes))
+        seen = replace(seen, notes=notes)
+    rows = [it for it in session.observations if it.view.number not in seen.spared]
+    return replace(seen, robots=found).noting(_lost(session, rows, found))
+
+
+def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
+    """Fills in, where a row does not tell where its robot stood, what another of its stop tells."""
+    poses, matched = dict(reported.base_from_flange), reported.matched
+    joints = {} if matched is None else dict(matched.joints_rad)
+    for it in session.observations:
+        view, row = it.view.number, it.robots[name].number if name in it.robots else None
+        if row in poses and view not in poses:
+            poses[view] = poses[row]
+            joints |= {view: joints[row]} if row in joints else {}
+    if matched is not None:
+        matched = replace(matched, joints_rad=joints)
+    return replace(reported, base_from_flange=poses, matched=matched)
+
+
+def _lost(
+    session: Session, rows: Sequence[Observation], found: Mapping[str, Reported]
+) -> Iterator[Rejection]:
+    """Why where a robot stood is not known for an observation."""
+    reasons = {name: {it.view: it.reason for it in at.rejections} for name, at in found.items()}
+    for row in rows:
+        for name in (*row.lacks, *row.robots):
+            if row.view.number in found[name].base_from_flange:
+                continue
+            why = reasons[name].get(row.robots.get(name, row.view).number, "")
+            of = f" ({name})" if len(session.robots) > 1 else ""
+            if not why or (name in row.lacks and row.view.stop is not None):
+                why, of = f"no row of its stop tells where {name or 'the robot'} stood", ""
+            yield Rejection(row.view.number, f"{why}{of}")
+
+
+def _of_robot(session: Session, robot: str, told: tuple[str, ...]) -> Iterator[str]:
+    """Names, of several robots, the one that sentences are of."""
+    for words in told:
+        several = len(session.robots) > 1
+        yield f"Robot {robot}: {words[0].lower()}{words[1:]}" if several else words
+
+
+def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
+    """Refuses joints that only fit what the cameras see where they are read otherwise.
+
+    Args:
+        seen: What is known.
+        drops: Whether to leave out readings whose pose and joints contradict each other, where the
+            joints are right.
+        takes: Whether a lost zero is taken for where it is.
+
+    Raises:
+        DataError: They do.
+    """
+    for name, reported in seen.robots.items():
+        if reported.matched is not None:
+            seen = _checked(seen, name, reported, reported.matched, (drops, takes))
+    return seen
+
+
+def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tuple[bool, bool]) -> T:
+    session, joints, (drops, takes) = seen.session, reported.joints_rad or {}, how
+    mount, poses = _of_one_pair(seen, name)
+    views = [it for it in poses if it in joints]
+    if not views:
+        return seen
+    doubted = matched.contradicting
+    sound = [it for it in views if it not in doubted and it not in seen.held_back]
+    looks = {view: poses[view].cam_from_target[0] for view in views}
+    rows = np.array([looks[view] for view in sound])
+    q = np.array([joints[view] for view in sound]).reshape(len(sound), matched.robot.joint_count)
+    guess = guess_seen_joints(matched.arm, q, rows, mount)
+    if drops:
+        both = {it: (reported.base_from_flange[it], looks[it]) for it in views if it in doubted}
+        lost = tuple(contradicted_joints(matched, guess, both, mount))
+        reported = reported.without({it.view for it in lost})
+        seen = seen.noting(lost).with_robot(name, reported)
+    if guess is None or not guess.stands_out:
+        return seen
+    zero = guess.zero
+    if zero is None:
+        mine = [it for it in session.views if it.number in reported.base_from_flange]
+        has_poses = any(it.base_from_flange() is not None for it in mine)
+        error = misread_joints(guess, matched.robot, has_poses=has_poses)
+        raise error.within(f"robot {name}") if len(session.robots) > 1 else error
+    taken = takes and matched.zero is None
+    words = (lost_zero(guess, zero, taken=taken),)
+    seen = seen.noting((), _of_robot(session, name, words))
+    return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
+
+
+def _of_one_pair(seen: Observed, robot: str) -> tuple[Mount, dict[int, ViewPoses]]:
+    """The poses of the camera and the target with the most views by way of one robot alone.
+
+    Those of different ones do not compare.
+    """
+    pairs: dict[tuple[str, int], dict[int, ViewPoses]] = {}
+    for it in seen.timed.observations:
+        view = it.view.number
+        if view in seen.poses and is_seen(it.view) and [*it.robots, *it.lacks] == [robot]:
+            poses = seen.poses[view]
+            pairs.setdefault((it.seer, poses.board), {})[view] = poses
+    if not pairs:
+        return "eye-in-hand", {}
+    camera, board = max(sorted(pairs), key=lambda it: len(pairs[it]))
+    on_flange = seen.session.frames[camera] == frame_name("flange", robot)
+    return "eye-in-hand" if on_flange else "eye-to-hand", pairs[camera, board]

@@ -1,0 +1,113 @@
+"""The frames' side of the joint fit, of one robot and one camera or of many."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from visioncal.calibration.stages.arms import RobotArm, effects_of
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.core.types import Corners, Mask
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.effects.lenses import Looks, Seen
+from visioncal.estimation.joint import Fitted
+from visioncal.estimation.parts import Effect, Noise
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
+
+
+@dataclass(frozen=True, eq=False)
+class FramesSide:
+    """What the joint fit has beside corners, lenses and boards; see `joint.Side`.
+
+    Attributes:
+        observed: All n observations.
+        used: (n,) those that the fit is made from.
+        views: (n,) the view of each.
+        arms: The robots' arms, and which of their errors were found.
+        effects: All effects but lenses, boards and arms.
+        noise: Its levels to start from; None for those from above.
+        freely: Whether all errors that were found are free, and not those alone that are estimated.
+    """
+
+    observed: Problem
+    used: Mask
+    views: Sequence[int]
+    arms: Mapping[str, RobotArm]
+    effects: Sequence[Effect] = ()
+    noise: Noise | None = None
+    freely: bool = False
+
+    @property
+    def errors(self) -> tuple[ArmErrors, ...]:
+        """The errors of arms that were found."""
+        return tuple(it.errors for it in self.arms.values() if it.errors is not None)
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether errors of an arm are free."""
+        return any(it.frees_errors(freely=self.freely) for it in self.arms.values())
+
+    @property
+    def has_links(self) -> bool:
+        """Whether those of an arm's own links are."""
+        return self.has_errors and any(it.of_links for it in self.errors)
+
+    def problem(self, seen: Seen) -> Problem:
+        """The problem of the observations that agree, repeated ones sharing an error."""
+        return replace(self.whole(seen), with_repeats=True).subset(self.used)
+
+    def whole(self, seen: Seen) -> Problem:
+        """The problem of all observations, with poses as lenses and boards make them."""
+        places, problem = {view: at for at, view in enumerate(seen.views)}, self.observed
+        rows = np.array([places.get(it, -1) for it in self.views], dtype=np.int64)
+        mine, before = rows >= 0, problem.observations
+        measured, spread = before.measured.copy(), before.covariance.copy()
+        measured[mine], spread[mine] = seen.looks.poses[rows[mine]], seen.spread[rows[mine]]
+        arms = effects_of(self.arms, freely=self.freely)
+        return replace(
+            problem, observations=replace(before, measured=measured, covariance=spread)
+        ).with_effects([seen.effect(rows), *self.effects, *arms])
+
+    def with_errors(self, fitted: Fitted) -> Self:
+        """Looks for errors of the arms; see `joint.Side`."""
+        free = {name for name, it in self.arms.items() if it.frees_errors(freely=self.freely)}
+        arms = {
+            name: it if name in free else it.with_errors(fitted.problem, fitted.fit)
+            for name, it in self.arms.items()
+        }
+        return replace(self, arms=arms)
+
+    def freed(self, *, freely: bool) -> Self:
+        """Frees errors of the arms; see `joint.Side`."""
+        return replace(self, freely=freely)
+
+    def looks(self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]) -> Looks:
+        """Corners, and lenses and boards as they are stated.
+
+        Args:
+            scenes: What each camera looks at, by its frame.
+            views: Its views, each with its one pose.
+        """
+        shares, problems, poses = self._shares, {}, {}
+        for frame, scene in scenes.items():
+            corners: dict[int, Corners] = {
+                it.view: it.corners for it in views[frame] if it.corners is not None
+            }
+            problems[frame] = CornerProblem.of(scene, corners, shares)
+            poses[frame] = np.array(
+                [it.cam_from_target[0] for it in views[frame] if it.view in corners]
+            )
+        return Looks.of(problems, poses)
+
+    @property
+    def _shares(self) -> dict[int, float]:
+        """As how much of a view each counts for lenses and boards: those of one stop as one."""
+        seen, tree = self.observed.observations, self.observed.tree
+        pairs = list(zip(seen.observers, seen.observed, strict=True))
+        parted = {it: any(step.robot for step in tree.path(*it)) for it in set(pairs)}
+        rows = zip(self.views, pairs, seen.stops.tolist(), strict=True)
+        return repeat_shares(
+            {it: (pair, stop if parted[pair] else None) for it, pair, stop in rows}
+        )

@@ -1,0 +1,265 @@
+"""Whether temperatures explain how the views move in the course of a session."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from visioncal.calibration.stages.thermal_fit import Stops, ThermalFit, fit_thermal, uninformative
+from visioncal.calibration.stages.thermal_inputs import inputs_of
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.files import some_of
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import Solution, starting_noise
+from visioncal.robot import Robot
+from visioncal.robot.thermal import Inputs
+from visioncal.session import Session
+
+LEVEL = "thermal"
+NO_JOINTS = "the joint angles of every view, a known model of the robot and the joint fit"
+# Views may be so far before the first and behind the last sample [s].
+_BEYOND_S = 300.0
+# Joints that are within this of a posture are in it [rad].
+_SAME_RAD = 1e-3
+# The course that is told is drawn by so many points.
+_DRAWN = 200
+_ADVICE = (
+    "Begin with a cold robot, let it work for an hour or more, and look at the same few reference "
+    "views every five to ten minutes."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Heat:
+    """What heats an arm, and when it was looked at.
+
+    Attributes:
+        session: The session that records it.
+        robot: The robot's name there.
+        joints: How many joints it has.
+        views: (m,) by which view each of the m stops goes at which it was.
+        stamps_s: (m,) when that was taken [s]; NaN where that is not known.
+    """
+
+    session: Session
+    robot: str
+    joints: int
+    views: IntArray
+    stamps_s: FloatArray
+
+    def at(self, rows: IntArray) -> Self:
+        """Returns it for some of the stops."""
+        return replace(self, views=self.views[rows], stamps_s=self.stamps_s[rows])
+
+    @cached_property
+    def _read(self) -> tuple[Inputs | None, str]:
+        return inputs_of(self.session, self.joints, self.robot)
+
+    @property
+    def inputs(self) -> Inputs | None:
+        """Temperatures or currents; None where they were not recorded at all of the stops."""
+        return None if self.lacking else self._read[0]
+
+    @property
+    def lacking(self) -> str:
+        """What is missing, in words; empty where nothing is."""
+        inputs, missing = self._read
+        if inputs is None:
+            return missing
+        timeless = self.views[np.isnan(self.stamps_s)].tolist()
+        if timeless:
+            return f"view {timeless[0]} has no stamp_s"
+        first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
+        stamps = self.stamps_s
+        if stamps.min() < first_s - _BEYOND_S or stamps.max() > last_s + _BEYOND_S:
+            return (
+                f"{inputs.kind} are told from {first_s:.10g} to {last_s:.10g} s, and views were "
+                f"taken from {stamps.min():.10g} to {stamps.max():.10g} s"
+            )
+        return ""
+
+
+def heating(heat: Heat | None, asked: str) -> Inputs | None:
+    """What heats an arm; None where that is not asked for, or the session does not tell.
+
+    Args:
+        heat: What is known of it; None where the arm's joints are not known.
+        asked: How far the arm is to be calibrated.
+
+    Raises:
+        DataError: The level asks for it, and the session lacks what it takes.
+        DegenerateError: The level asks for it, and all views were taken about equally warm.
+    """
+    if asked not in ("auto", LEVEL):
+        return None
+    inputs = None if heat is None else heat.inputs
+    if heat is None or inputs is None:
+        if asked == LEVEL:
+            raise _missing(NO_JOINTS if heat is None else heat.lacking)
+        return None
+    why = uninformative(inputs, heat.stamps_s)
+    if why and asked == LEVEL:
+        raise DegenerateError(
+            f"thermal: {why}: the views do not tell how the arm drifts.",
+            culprits=["temperatures"],
+            next_step=_ADVICE,
+        )
+    return None if why else inputs
+
+
+def _missing(missing: str) -> DataError:
+    return DataError(
+        f"level {LEVEL!r} needs to know what heats the arm: {missing}.",
+        culprits=["level"],
+        next_step="Record temp1_c ... or current1_a ... with stamp_s in streams/NAME.csv, and "
+        "stamp_s, q1_rad ... with every view.",
+    )
+
+
+def find_drift(
+    problem: Problem, start: State, stops: Stops, inputs: Inputs, nominal: Robot
+) -> ThermalFit:
+    """Fits an arm's drift with the frames and, where they are off, its links.
+
+    Args:
+        problem: The observations, with the arm as reported.
+        start: Where to start.
+        stops: Where it was observed, and when.
+        inputs: What heats it.
+        nominal: Its model.
+    """
+    robot, poses = stops.robot, problem.poses[stops.robot]
+    model = ArmModel.of(nominal, stops.q, poses[stops.places])
+    basis = np.zeros((len(poses), 6, model.size_of("links")))
+    basis[stops.places] = model.columns("links", stops.q)
+    noise = starting_noise(problem)
+    links = find_arm_errors(problem, start, noise, robot, basis, of_links=True)
+    if links is not None:
+        problem = problem.with_effects([*problem.effects, links.effect(robot)])
+        start = State(start.edges, problem.start_values)
+    return fit_thermal(problem, start, model.robot, stops, inputs, nominal)
+
+
+def is_found(fit: ThermalFit) -> bool:
+    """Whether drift explains the views by more than chance."""
+    return fit.gain > SIGNIFICANT
+
+
+def findings(fit: ThermalFit) -> Iterator[str]:
+    """Says what was found, for the verdict."""
+    if not is_found(fit):
+        yield (
+            f"The joints warmed up by {figure(float(fit.rises_k.max()))} K, and the views show no "
+            "drift with it beyond chance: none is compensated."
+        )
+        return
+    yield (
+        f"The arm drifts with its temperature: residuals of {figure(1e3 * fit.before_m)} mm become "
+        f"{figure(1e3 * fit.after_m)} mm. Its transforms are those of the arm as it was at the "
+        "start; give temperatures to calibration.base_from_flange and to visioncal correct."
+    )
+    # Currents tell a gain and a growth by their product alone.
+    measured = fit.model.heating.kind == "temperatures"
+    counted = ("growth", "drift") if measured else ("drift",)
+    names = [it for it in fit.not_told if it.startswith(counted)]
+    if names:
+        yield (
+            f"The views do not tell {some_of(names, 6)}: what is known of arms, steel and "
+            "aluminium stands for these."
+        )
+
+
+def drift_document(
+    fit: ThermalFit, stops: Stops, views: Sequence[int], problem: Problem, solved: Solution
+) -> dict[str, Any]:
+    """Writes a drift's coefficients and its course, as calibration.json has it.
+
+    Args:
+        fit: The drift.
+        stops: Where the arm stood, and when.
+        views: (m,) by which views these stops go.
+        problem: The observations that agree.
+        solved: Their fit.
+    """
+    return fit.model.document() | {
+        "not_told": list(fit.not_told),
+        "residual_mm": {"without": 1e3 * fit.before_m, "with": 1e3 * fit.after_m},
+        "likelihood_ratio": fit.gain,
+        "rises_k": fit.rises_k.tolist(),
+        "trained_s": float(np.ptp(stops.stamps_s)),
+        "course": _course(fit, _typical(stops.q)),
+        "seen": _seen(fit, stops, views, problem, solved.state),
+    }
+
+
+def drift_by_view(fit: ThermalFit, stops: Stops, views: Sequence[int]) -> list[dict[str, float]]:
+    """How far the flange had drifted at (m,) views, and the largest rise of a link."""
+    moved = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
+    rises = fit.model.rises(fit.links_c(stops)).max(axis=1)
+    return [
+        {"view": view, "drift_mm": 1e3 * drift, "rise_k": rise}
+        for view, drift, rise in zip(views, moved.tolist(), rises.tolist(), strict=True)
+    ]
+
+
+def _course(fit: ThermalFit, q: FloatArray) -> list[dict[str, float]]:
+    """How far the flange has drifted at (n,) joint angles, and how surely that is known."""
+    model, inputs = fit.model, fit.inputs
+    at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _DRAWN)
+    links = model.heating.links_c(inputs, at_s)
+    rows = np.tile(q, (len(at_s), 1))
+    moved = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
+    sigma = model.sigma_m(rows, links, model.heating.slopes(inputs, at_s))
+    rises = model.rises(links).max(axis=1)
+    return [
+        {"stamp_s": at, "drift_mm": 1e3 * drift, "sigma_mm": 1e3 * spread, "rise_k": rise}
+        for at, drift, spread, rise in zip(
+            at_s.tolist(), moved.tolist(), sigma.tolist(), rises.tolist(), strict=True
+        )
+    ]
+
+
+def _seen(
+    fit: ThermalFit, stops: Stops, views: Sequence[int], problem: Problem, state: State
+) -> list[dict[str, float]]:
+    """How far the stops in the typical posture see the flange to have moved, by their first view.
+
+    What is left of a stop is taken for its flange's, and counted along the drift's direction: its
+    length alone would grow with noise.
+    """
+    problem = replace(problem, is_combined=False)
+    linear, pair = problem.linear(state), ArmPair.of(problem, state, stops.robot)
+    of, members = problem.units
+    slots = (members[of[pair.rows]] == problem.robots.index(stops.robot)).argmax(axis=1)
+    where, first = np.unique(problem.observations.stops[pair.rows], return_index=True)
+    alike = np.abs(stops.q - _typical(stops.q)).max(axis=1) < _SAME_RAD
+    _, chosen, among = np.intersect1d(np.where(alike, stops.places, -1), where, return_indices=True)
+    if not len(chosen):
+        return []
+    rows, slots = pair.rows[first[among]], slots[first[among]]
+    errors = linear.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
+    left = -np.linalg.solve(errors, linear.residuals[rows, :, None])[:, 3:, 0]
+    moved = fit.motion(stops)[chosen, :3, 3]
+    # Where it has hardly moved it has no direction: that of the farthest stop serves them all.
+    lengths = np.linalg.norm(moved, axis=1)
+    far = moved[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
+    seen = lengths + left @ far
+    return [
+        {"view": views[at], "stamp_s": float(stops.stamps_s[at]), "drift_mm": 1e3 * drift}
+        for at, drift in zip(chosen.tolist(), seen.tolist(), strict=True)
+    ]
+
+
+def _typical(q: FloatArray) -> FloatArray:
+    """(n,) the posture that most of (s, n) stops are in; of several, the one that most are near."""
+    alike = [int((np.abs(q - it).max(axis=1) < _SAME_RAD).sum()) for it in q]
+    away = np.abs(q - np.median(q, axis=0)).sum(axis=1)
+    return np.asarray(q[np.lexsort((away, -np.array(alike)))[0]])

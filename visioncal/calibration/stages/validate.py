@@ -1,0 +1,128 @@
+"""Predicts each observation from a fit that was made without its stop."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import distances
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.estimation.parts import State
+from visioncal.estimation.problem import Problem
+from visioncal.vision.camera import project
+
+# Up to here every stop is left out by itself; beyond, ten groups say the same.
+_MOST_FOLDS_OF_ONE = 30
+_FOLDS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Residuals of observations that the fit had not seen.
+
+    Attributes:
+        method: How they were left out, in words.
+        away_m: (n,) distance between where the observation and the fit place what it saw [m]; NaN
+            where the others do not place it.
+        away_rad: (n,) the same in rotation [rad]; NaN where places alone were read.
+        rms_px: (n,) reprojection error through the chain [px]; NaN without corners.
+    """
+
+    method: str
+    away_m: FloatArray
+    away_rad: FloatArray
+    rms_px: FloatArray
+
+
+def validate(
+    problem: Problem,
+    refit: Callable[[Problem], State],
+    pixels: Callable[[IntArray, State], FloatArray],
+    of: str = "",
+) -> HeldOut:
+    """Leaves stops out, one by one or in ten groups, and predicts what was observed there.
+
+    Args:
+        problem: The n observations in the fit.
+        refit: Fits a part of them.
+        pixels: Reprojection errors (m,) [px] of some observations (m,) at a state.
+        of: What is fitted, as a part of the method's words.
+
+    Returns:
+        The residuals. What the others do not place has none.
+    """
+    stops = np.unique(problem.observations.stops, return_inverse=True)[1]
+    needs = _needs(problem)
+    count = int(stops.max()) + 1
+    folds = count if count <= _MOST_FOLDS_OF_ONE else _FOLDS
+    # Strides, so that a group's stops are not neighbours.
+    fold = stops % folds
+    away_m, away_rad, rms_px = (np.full(len(problem), np.nan) for _ in range(3))
+    with one_blas_thread():
+        for left_out in range(folds):
+            kept = fold != left_out
+            known = needs[kept].any(axis=0)
+            held = ~kept & ~(needs & ~known).any(axis=1)
+            if not held.any():
+                continue
+            state = refit(problem.subset(kept))
+            away_m[held], away_rad[held] = apart(problem.subset(held), state)
+            rms_px[held] = pixels(np.flatnonzero(held), state)
+    method = "leave-one-out" if folds == count else f"{folds}-fold"
+    unit = "views" if count == len(problem) else "stops"
+    return HeldOut(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
+
+
+def _needs(problem: Problem) -> Mask:
+    """(n, u) the unknown frames on the way of each observation."""
+    needs = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
+    for group in problem.groups:
+        frames = [problem.unknown[it.frame] for it in group.path if it.frame in problem.unknown]
+        needs[group.rows[:, None], frames] = True
+    return needs
+
+
+def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
+    """How far (n,) [m] and (n,) [rad] observations are from what is predicted.
+
+    Args:
+        problem: The observations.
+        state: The unknowns.
+    """
+    away_m, turned = distances(problem.measured(state), problem.predicted(state))
+    seen = problem.observations
+    # The rotation of what is only a point is a matter of choice.
+    chosen = np.isin(seen.observed, list(problem.points))
+    return away_m, np.where(seen.has_rotation & ~chosen, turned, np.nan)
+
+
+def chain_rms_px(
+    seen: Sequence[Corners | None],
+    poses: FloatArray,
+    cameras: Sequence[Camera | None],
+    positions: FloatArray,
+) -> FloatArray:
+    """Reprojection error of each view's corners, (m,) [px]; NaN where there are none.
+
+    Args:
+        seen: (m,) each view's corners.
+        poses: (m, 4, 4) `cam_from_target` as the chain predicts it.
+        cameras: (m,) each view's camera, where it has corners.
+        positions: (c, 3) all corners, each on its target [m].
+    """
+    rms = np.full(len(poses), np.nan)
+    for at, (pose, camera, it) in enumerate(zip(poses, cameras, seen, strict=True)):
+        if it is not None and camera is not None:
+            away = predict_corners(camera, pose, positions[it.ids]) - it.px
+            # A corner behind the camera counts as a whole image away.
+            away = np.nan_to_num(away, nan=float(max(camera.resolution)))
+            rms[at] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    return rms
+
+
+def predict_corners(
+    camera: Camera, cam_from_target: FloatArray, positions: FloatArray
+) -> FloatArray:
+    """Projects a target's (n, 3) corners [m] at a pose, to (n, 2) [px]."""
+    return project(camera, positions @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])

@@ -1,0 +1,25 @@
+"""Whether a calibration still holds, what has changed if not, and when to calibrate again."""
+
+from visioncal.calibration.verification.check import Check, Suspect, verify
+from visioncal.calibration.verification.document import to_document
+from visioncal.calibration.verification.messages import sentences
+from visioncal.calibration.verification.policy import (
+    Outcome,
+    Trigger,
+    facts_of,
+    load_policy,
+    outcomes,
+)
+
+__all__ = [
+    "Check",
+    "Outcome",
+    "Suspect",
+    "Trigger",
+    "facts_of",
+    "load_policy",
+    "outcomes",
+    "sentences",
+    "to_document",
+    "verify",
+]

@@ -1,0 +1,235 @@
+"""What a calibration rests on, as a later look at the same cell needs it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import adjoint, invert, log
+from visioncal.core.types import FloatArray, Target
+from visioncal.estimation.appearance import (
+    BOARD_NAMES,
+    Appearance,
+    Free,
+    board_prior,
+    boards_basis,
+)
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.chain import edge_names
+from visioncal.estimation.parts import Noise, State
+from visioncal.results import Calibration
+from visioncal.results.edge import read_covariance
+from visioncal.robot import Robot, WeightFunctions
+from visioncal.vision.targets import numbered_positions, target_from_document
+
+# A scale that is known by more degrees of freedom is as good as known.
+_MOST_FREEDOM = 1e6
+
+ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
+
+
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """The fit of a calibration: its unknowns, their covariance, and the noise.
+
+    Attributes:
+        calibration: Whose.
+        targets: What was printed, by the session's names for it; that of an only one is empty.
+        boards: (b,) places among the targets, of those that were placed.
+        state: The edges of the camera and of these boards, and the k values of what all stops
+            share: lens and boards, then the arm.
+        covariance: (6 + 6 b + k, 6 + 6 b + k) of edges and values.
+        looks: (l,) which values of lens and board are among them.
+        arm: What the last of them are errors of.
+        arm_size: How many these are.
+        model: The calibrated arm, where they are of its model.
+    """
+
+    calibration: Calibration
+    targets: Mapping[str, Target]
+    boards: tuple[int, ...]
+    state: State
+    covariance: FloatArray
+    looks: tuple[int, ...]
+    arm: ArmKind
+    arm_size: int
+    model: ArmModel | None
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> "Footing":
+        """Reads it from a calibration.
+
+        Raises:
+            DataError: The calibration does not say it: an instrument made it, or an older version.
+        """
+        if calibration.mount == "instrument":
+            raise DataError(
+                f"calibration {calibration.session_name!r} was made with a measuring instrument; "
+                "only one with a camera can be verified.",
+                next_step="Calibrate the new readings, and compare both with visioncal diff.",
+            )
+        document = calibration.stages.get("joint_fit")
+        if document is None:
+            raise DataError(
+                f"calibration {calibration.session_name!r} does not hold the covariance of its "
+                "fit (joint_fit): an older version made it.",
+                next_step="Calibrate its recording again: visioncal calibrate recording.rrd -o "
+                "FOLDER.",
+            )
+        try:
+            return _read(calibration, document)
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(
+                f"calibration {calibration.session_name!r}: joint_fit cannot be read: {error!r}.",
+                culprits=["joint_fit"],
+                next_step="Calibrate its session again.",
+            ) from error
+
+    @property
+    def free(self) -> Free | None:
+        """Lens and board as the calibration found them; None without a camera or a target."""
+        camera = self.calibration.camera
+        if camera is None or not self.targets:
+            return None
+        targets, size = tuple(self.targets.values()), len(self.looks)
+        return Free(
+            Appearance(camera.camera, _shape(self.calibration, self.targets)),
+            boards_basis(targets),
+            numbered_positions(targets),
+            np.array(self.looks, dtype=np.int64),
+            np.zeros(size, dtype=bool),
+            np.zeros((size, size)),
+            np.zeros(size),
+        )
+
+    def noise(self, *, from_corners: bool) -> Noise:
+        """The noise of one stop: of the flange, or with that of the camera's poses as one.
+
+        A level that the calibration knows badly is taken for what its 95 % interval allows.
+        """
+        stated, stages = self.calibration.noise, self.calibration.stages
+        of = "robot" if from_corners else "combined"
+        if f"{of}_rotation_deg" not in stated:
+            # Poses of another origin than the calibration's: as they scattered there in all.
+            rms = self.calibration.rms
+            deg, mm = (rms.deg or 0.0) / np.sqrt(3), rms.mm / np.sqrt(3)
+            return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
+        intervals = stages.get("uncertainty", {}).get("noise_95", {})
+        deg, mm = (
+            max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
+            for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
+        )
+        return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that the noise was estimated with, at most as many as matter."""
+        return min(self.calibration.noise_dof, _MOST_FREEDOM)
+
+    def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "Footing":
+        """The same with an only board that lies somewhere else.
+
+        Args:
+            z: (4, 4) about where.
+            sigmas: (6,) how roughly that is known.
+        """
+        spread = self.covariance.copy()
+        spread[6:12], spread[:, 6:12] = 0.0, 0.0
+        spread[6:12, 6:12] = np.diag(sigmas**2)
+        moved = replace(self.state, edges=np.stack([self.state.edges[0], z]))
+        return replace(self, state=moved, covariance=spread)
+
+
+def _read(calibration: Calibration, document: Mapping[str, Any]) -> Footing:
+    names = document["boards"]
+    x_name, z_name = edge_names(calibration.mount)
+    placed = [calibration.edges[f"{z_name}_{it}" if it else z_name].matrix for it in names]
+    targets = {
+        name: target_from_document(it, name or "target") for name, it in document["targets"].items()
+    }
+    spread, looks = read_covariance(document, "covariance", (-1, -1)), tuple(document["looks"])
+    arm = document.get("arm", {"of": "none", "values": []})
+    size = len(arm["values"])
+    slopes = _slopes(np.array(placed), len(looks), size)
+    if spread.shape != (slopes.shape[1],) * 2:
+        raise ValueError(f"covariance has the shape {spread.shape}")
+    return Footing(
+        calibration,
+        targets,
+        tuple(list(targets).index(it) for it in names) if targets else (0,),
+        State(
+            np.stack([calibration.edges[x_name].matrix, *placed]),
+            np.concatenate([np.zeros(len(looks)), np.array(arm["values"], dtype=float)]),
+        ),
+        slopes @ spread @ slopes.T,
+        looks,
+        arm["of"],
+        size,
+        _model(calibration.calibrated_robot, arm),
+    )
+
+
+def _slopes(placed: FloatArray, looks: int, arm: int) -> FloatArray:
+    """How edges and values move with the unknowns as they are written.
+
+    Written are the camera's edge and the first board's, then lens and boards, then where each
+    further board lies from the first, and the arm.
+
+    Args:
+        placed: (b, 4, 4) the boards' edges.
+        looks: How many values are of lens and boards.
+        arm: How many are of the arm.
+    """
+    edges, behind = 6 + 6 * len(placed), 6 * len(placed) + 6 + looks
+    slopes = np.zeros((edges + looks + arm, behind + arm))
+    slopes[:12, :12] = np.eye(12)
+    slopes[edges : edges + looks, 12 : 12 + looks] = np.eye(looks)
+    slopes[edges + looks :, behind:] = np.eye(arm)
+    for row, carried in enumerate(adjoint(invert(placed[1:]) @ placed[0])):
+        # z_k exp(d_k) = z_1 exp(d_1) exp(-d) target_1_from_target_k
+        mine, at = slice(12 + 6 * row, 18 + 6 * row), 12 + looks + 6 * row
+        slopes[mine, 6:12], slopes[mine, at : at + 6] = carried, -carried
+    return slopes
+
+
+def _model(arm: Robot | None, document: Mapping[str, Any]) -> ArmModel | None:
+    """The arm's model at what was found, so that no errors are left to be added.
+
+    Its geometry is in the arm; what goes by the loads of a stop is in the values.
+    """
+    if document["of"] != "model" or arm is None:
+        return None
+    reported = np.array(document["flange_from_reported"], dtype=float)
+    mounted = np.zeros((arm.joint_count + 1, 6))
+    mounted[-1] = log(invert(reported))
+    count = len(document["values"])
+    yielding, parts = document.get("yielding"), document.get("weight_functions")
+    shape = (4 * arm.joint_count, -1)
+    return ArmModel(
+        arm.corrected(mounted),
+        reported,
+        document["weights"],
+        np.array(document.get("by_stop", np.zeros(count)), dtype=float),
+        float(document.get("torque_nm", 1.0)),
+        None if yielding is None else np.array(yielding, dtype=bool),
+        None
+        if parts is None
+        else WeightFunctions(tuple(np.array(it, dtype=float).reshape(shape) for it in parts)),
+    )
+
+
+def _shape(calibration: Calibration, targets: Mapping[str, Target]) -> FloatArray:
+    """(s,) what the targets were found to be like; those that were not looked at are as stated."""
+    stages = calibration.stages
+    found = {**stages.get("boards", {}), **stages.get("rigs", {})}
+    found[""] = stages.get("board", stages.get("rig", {}))
+    shapes: list[FloatArray] = []
+    for name, target in targets.items():
+        stated = np.zeros(len(board_prior(target)))
+        shape = found.get(name, {}).get("shape")
+        if isinstance(shape, Mapping):
+            shape = [shape[it] for it in BOARD_NAMES]
+        shapes.append(stated if shape is None else stated + np.ravel(shape))
+    return np.concatenate(shapes)

@@ -1,0 +1,154 @@
+"""What may have happened to a cell since it was calibrated: the causes that a check compares."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.prediction import Seen
+from visioncal.core.transforms import adjoint, invert, log
+from visioncal.core.types import FloatArray
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.model_evidence import TURN_PER_M, Cause
+from visioncal.estimation.observability import FEWEST_VIEWS
+from visioncal.robot import Robot
+
+CAMERA, BOARD, BOTH, JOINT, LENGTH, NOISE, VIEW = (
+    "camera",
+    "board",
+    "camera_and_board",
+    "joint",
+    "arm_length",
+    "robot_noise",
+    "view",
+)
+# What a robot's scatter may have grown by.
+_FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
+_KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
+
+
+def causes_of(seen: Seen, footing: Footing, *, board_placed_anew: bool) -> tuple[Cause, ...]:
+    """The single causes that a check of these stops compares.
+
+    Args:
+        seen: The stops.
+        footing: What the calibration rests on.
+        board_placed_anew: Whether the board's place is nothing to be checked.
+    """
+    camera = _camera(seen)
+    boards = () if board_placed_anew else tuple(_boards(seen, footing))
+    return (
+        camera,
+        *boards,
+        *(_both(camera, it) for it in boards if _tell_both(seen, footing)),
+        *_joints(seen, footing),
+        _noise(seen),
+        *_views(seen, footing),
+    )
+
+
+def kind_of(cause: str) -> str:
+    """The kind of a cause: `joint` of `joint 3`."""
+    return cause.partition(" ")[0]
+
+
+def _camera(seen: Seen) -> Cause:
+    """The camera's edge: a twist on its right, seen from the target's side."""
+    moved = adjoint(invert(seen.problem.observations.measured))
+    return _cause(CAMERA, seen, _KNOCK, by_sensor=moved)
+
+
+def _boards(seen: Seen, footing: Footing) -> Iterator[Cause]:
+    """Each board's edge: a twist on its right."""
+    names, away = tuple(footing.targets) or ("",), log(seen.away(footing))
+    for at, board in enumerate(footing.boards):
+        mine = seen.boards == at
+        if not mine.any():
+            continue
+        by_sensor, start = np.where(mine[:, None, None], -np.eye(6), 0.0), away[mine].mean(axis=0)
+        yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
+
+
+def _tell_both(seen: Seen, footing: Footing) -> bool:
+    """Whether camera and board at once are worth a thought: they fit any two stops."""
+    return len(footing.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
+
+
+def _both(camera: Cause, board: Cause) -> Cause:
+    """Camera and board at once: nothing is left of the old hand-eye calibration but the arm."""
+    return Cause(
+        BOTH,
+        np.concatenate([camera.by_sensor, board.by_sensor], axis=2),
+        np.concatenate([camera.by_flange, board.by_flange], axis=2),
+        np.concatenate([camera.units, board.units]),
+        np.concatenate([camera.start, np.zeros(len(board.units))]),
+    )
+
+
+def _joints(seen: Seen, footing: Footing) -> Iterator[Cause]:
+    """One offset a joint, and one stretch of all lengths."""
+    model, q = _arm(seen, footing), seen.joints_rad
+    if model is None or q is None:
+        return
+    offsets, robot = model.columns("offsets", q), model.robot
+    for joint in range(robot.joint_count):
+        unit = 1.0 if robot.chain.prismatic[joint] else TURN_PER_M
+        column = offsets[:, :, joint : joint + 1]
+        yield _cause(f"{JOINT} {joint + 1}", seen, np.array([unit]), by_flange=column)
+    yield _cause(LENGTH, seen, np.ones(1), by_flange=_stretch(robot, q)[:, :, None])
+
+
+def _arm(seen: Seen, footing: Footing) -> ArmModel | None:
+    """The arm that offsets are of; the nominal one where none was calibrated."""
+    robot, matched = footing.calibration.calibrated_robot, seen.known.reported.matched
+    if footing.model is not None or robot is None:
+        return footing.model
+    reported = np.eye(4) if matched is None else matched.flange_from_reported
+    return ArmModel(robot, reported, {}, np.zeros(0))
+
+
+def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
+    """(m, 6) how the flange moves when all of an arm's lengths grow by as much as they are."""
+    placements = robot.chain.placements
+    # A placement's offset lies in the frame before it; its twist acts behind it.
+    twists = np.zeros((len(placements), 6))
+    twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
+    return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
+
+
+def _noise(seen: Seen) -> Cause:
+    return replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
+
+
+def _views(seen: Seen, footing: Footing) -> Iterator[Cause]:
+    """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
+    if seen.stops < 2:
+        return
+    away, placed = log(seen.away(footing)), footing.state.edges[1:][seen.boards]
+    for stop in range(seen.stops):
+        mine = seen.problem.observations.stops == stop
+        first = int(np.argmax(mine))
+        # All boards of a stop move together.
+        carried = adjoint(invert(placed) @ placed[first])
+        by_sensor = np.where(mine[:, None, None], -carried, 0.0)
+        yield _cause(f"{VIEW} {seen.views[first][0]}", seen, _KNOCK, by_sensor, start=away[first])
+
+
+def _cause(
+    name: str,
+    seen: Seen,
+    units: FloatArray,
+    by_sensor: FloatArray | None = None,
+    by_flange: FloatArray | None = None,
+    start: FloatArray | None = None,
+) -> Cause:
+    still = np.zeros((len(seen.problem), 6, len(units)))
+    resting = np.zeros((seen.stops, 6, len(units)))
+    return Cause(
+        name,
+        still if by_sensor is None else by_sensor,
+        resting if by_flange is None else by_flange,
+        units,
+        np.zeros(len(units)) if start is None else start,
+    )

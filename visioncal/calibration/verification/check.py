@@ -1,0 +1,230 @@
+"""Whether a calibration still holds, by a few stops, and what has changed if it does not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtrc
+
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.calibration.verification.causes import BOTH, CAMERA, NOISE, causes_of, kind_of
+from visioncal.calibration.verification.prediction import Seen, asked_of_boards, see_again
+from visioncal.core.errors import DataError
+from visioncal.core.quantiles import f_limit
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import log, mean_transform
+from visioncal.core.types import FloatArray, Progress
+from visioncal.estimation.model_evidence import (
+    Belief,
+    Cause,
+    Explained,
+    explain,
+    undone,
+    with_change,
+)
+from visioncal.results import Calibration, picked
+from visioncal.session import Session
+from visioncal.session.choosing import Choice
+
+# A change is told where it makes the stops so many times as likely as none. Chance does that in one
+# check of as many at most, by Markov's inequality: the ratio is one on average.
+EVIDENCE = 100.0
+# A cause that makes the stops so many times less likely than the best one is told apart from it.
+_TOLD_APART = 20.0
+# Noise leaves more than this unexplained by the right cause in one check of a thousand.
+_UNEXPLAINED = 1e-3
+# A board that was placed anew may lie anywhere near where it is seen [rad and m].
+_ANYWHERE = np.repeat([1.0, 1.0], 3)
+# Fewer stops hardly tell one cause from another.
+FEW_STOPS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A change that may have happened.
+
+    Attributes:
+        name: `camera`, `board` (with its name where there are several), `joint 3`, `arm_length`,
+            `robot_noise`, or `view 7`.
+        probability: Its share among all changes, given the stops.
+        explained: What the stops say under it.
+    """
+
+    name: str
+    probability: float
+    explained: Explained
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What a few stops say about a calibration.
+
+    Attributes:
+        calibration: The one that was checked.
+        seen: The stops.
+        footing: What the calibration rests on.
+        away: (m, 6) where each sight places its board, from where it was (rotation [rad],
+            translation [m]), in its frame.
+        left: (m, 6) the same with the likeliest change undone, where one was found.
+        log_evidence: Logarithm of how many times as likely the stops are with a change as without.
+        misfit: Squared distance of the stops from the prediction, in units of sigma.
+        freedom: What that is on average where nothing has changed.
+        p_value: How often chance makes it at least as large.
+        suspects: All changes that were compared, the likeliest first.
+        named: Those that cannot be told from the likeliest, itself the first; empty where nothing
+            has changed.
+        explained: Whether the likeliest leaves no more unexplained than noise does.
+        camera_sigma: (6,) standard deviations to which a moved camera would be seen, all about the
+            camera's axes [rad, m].
+    """
+
+    calibration: Calibration
+    seen: Seen
+    footing: Footing
+    away: FloatArray
+    left: FloatArray
+    log_evidence: float
+    misfit: float
+    freedom: int
+    p_value: float
+    suspects: tuple[Suspect, ...]
+    named: tuple[Suspect, ...]
+    explained: bool
+    camera_sigma: FloatArray
+
+    @property
+    def passed(self) -> bool:
+        """Whether the calibration still holds as far as the stops tell."""
+        return bool(self.log_evidence < np.log(EVIDENCE))
+
+
+def verify(
+    session: Session,
+    calibration: Calibration,
+    *,
+    camera: str | None = None,
+    robot: str | None = None,
+    target: str | None = None,
+    board_placed_anew: bool = False,
+    progress: Progress | None = None,
+) -> Check:
+    """Checks a calibration by a few new stops of its cell.
+
+    Several threads may do so at once, as with `calibrate`.
+
+    Args:
+        session: Five stops or more, with the same board where it was; nothing of it is fitted.
+        calibration: The one that is to hold.
+        camera: Which camera is meant, where session or calibration is of a whole cell.
+        robot: Which robot, likewise.
+        target: Which target, likewise.
+        board_placed_anew: Whether the board was put elsewhere meanwhile, so that its place tells
+            nothing.
+        progress: Told of long work.
+
+    Raises:
+        DataError: The session is of another cell, or the calibration does not say enough.
+    """
+    is_its_own = session.digest() == calibration.session_sha256
+    session, calibration = picked(session, calibration, Choice(camera, robot, target))
+    # What the calibration has left out contradicts it now as it did then.
+    without = {it.view: it.reason for it in calibration.views if is_its_own and not it.used}
+    footing = Footing.of(calibration)
+    seen = see_again(session, footing, progress, without)
+    return check(seen, footing, board_placed_anew=board_placed_anew)
+
+
+def check(seen: Seen, footing: Footing, *, board_placed_anew: bool = False) -> Check:
+    """Compares what may have changed by stops that have been looked at; see `verify`."""
+    if board_placed_anew:
+        if len(footing.boards) > 1:
+            raise DataError(
+                "verify: the calibration has several boards; where one was placed anew it is not "
+                "known which of them still stand where they were.",
+                next_step="Leave --board-moved out: each board is compared by itself, and the one "
+                "that moved is named. Or verify with views of the boards that stayed.",
+            )
+        moved = mean_transform(seen.away(footing))
+        footing = footing.placed_anew(footing.state.edges[1] @ moved, _ANYWHERE)
+    belief = Belief(
+        footing.state,
+        footing.covariance,
+        footing.noise(from_corners=seen.from_corners),
+        footing.freedom,
+    )
+    causes = causes_of(seen, footing, board_placed_anew=board_placed_anew)
+    with one_blas_thread():
+        nothing = explain(seen.problem, belief)
+        found = [explain(seen.problem, belief, it) for it in causes]
+    scores = np.array([it.likelihood for it in found]) + np.log(_shares(causes))
+    evidence = float(np.logaddexp.reduce(scores))
+    order = np.argsort(-scores, kind="stable")
+    shares = np.exp(scores - evidence)
+    suspects = tuple(Suspect(causes[it].name, float(shares[it]), found[it]) for it in order)
+    log_evidence = evidence - nothing.likelihood
+    named = () if log_evidence < np.log(EVIDENCE) else _not_told_apart(suspects)
+    camera = next(it for it in suspects if it.name == CAMERA)
+    away = log(seen.away(footing))
+    left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
+    return Check(
+        footing.calibration,
+        seen,
+        footing,
+        away,
+        left,
+        log_evidence,
+        nothing.misfit,
+        nothing.freedom,
+        float(fdtrc(nothing.freedom, footing.freedom, nothing.misfit / nothing.freedom)),
+        suspects,
+        named,
+        _is_explained(suspects[0], footing.freedom),
+        np.sqrt(np.diag(camera.explained.covariance)),
+    )
+
+
+def _left(seen: Seen, belief: Belief, cause: Cause, explained: Explained) -> FloatArray:
+    """(m, 6) where each sight places its board with a change undone, from where it was."""
+    before = undone(seen.problem, cause, explained.values)
+    return log(asked_of_boards(before, with_change(belief.state, cause)))
+
+
+def _shares(causes: Sequence[Cause]) -> FloatArray:
+    """How likely each cause is beforehand: each kind alike, and each of a kind alike."""
+    kinds = [kind_of(it.name) for it in causes]
+    return np.array([1.0 / (len(set(kinds)) * kinds.count(it)) for it in kinds])
+
+
+def _not_told_apart(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
+    """The likeliest, and what explains the stops about as well.
+
+    That is what is about as likely, and what could explain them but for its more unknowns: a
+    turned base looks like a slip of the first joint, however unlikely a turn about just that axis.
+    """
+    best, *others = suspects
+    if best.name in (NOISE, BOTH):
+        return (best,)
+    margin = 2.0 * np.log(_TOLD_APART)
+
+    def price(it: Suspect) -> float:
+        return it.explained.misfit + len(it.explained.values)
+
+    rivals = [
+        it
+        for it in others
+        # Camera and board at once imitate either: that says nothing against it.
+        if it.name != BOTH
+        and (
+            it.probability * _TOLD_APART > best.probability
+            or (it.name != NOISE and price(it) < price(best) + margin)
+        )
+    ]
+    return (best, *rivals)
+
+
+def _is_explained(best: Suspect, freedom: float) -> bool:
+    """Whether a change leaves no more than noise; one that fits anything cannot be judged."""
+    left = best.explained.freedom
+    if best.name == NOISE or left < 1:
+        return True
+    return bool(best.explained.misfit < left * f_limit(_UNEXPLAINED, left, freedom))

@@ -1,0 +1,82 @@
+"""verify.json."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.verification.check import Check, Suspect
+from visioncal.calibration.verification.messages import described, sentences
+from visioncal.calibration.verification.policy import Outcome
+
+SCHEMA = 1
+# Changes that are less likely than this share are not worth a line.
+_LISTED_SHARE = 1e-3
+
+
+def to_document(check: Check, triggers: Sequence[Outcome]) -> dict[str, Any]:
+    """Writes a check as JSON has it; what is not known is absent."""
+    calibration, known = check.calibration, check.seen.known
+    return {
+        "schema": SCHEMA,
+        "passed": check.passed,
+        "calibration": {
+            "session": calibration.session_name,
+            "sha256": calibration.session_sha256,
+            "created": calibration.created,
+        },
+        "session": {"name": known.session.name, "sha256": known.session.digest()},
+        "sentences": list(sentences(check)),
+        "changes": [_change(check, it) for it in check.named],
+        "others": [_change(check, it) for it in listed_suspects(check) if it not in check.named],
+        "explained": check.explained,
+        "log10_evidence": check.log_evidence / float(np.log(10.0)),
+        "misfit": check.misfit,
+        "degrees_of_freedom": check.freedom,
+        "p_value": check.p_value,
+        "camera_sigma": {
+            "rotation_deg": np.rad2deg(check.camera_sigma[:3]).tolist(),
+            "translation_mm": (1e3 * check.camera_sigma[3:]).tolist(),
+        },
+        "stops": [
+            {
+                "views": list(views),
+                "off_mm": 1e3 * float(np.linalg.norm(away[3:])),
+                "off_deg": float(np.rad2deg(np.linalg.norm(away[:3]))),
+                "left_mm": 1e3 * float(np.linalg.norm(left[3:])),
+                "left_deg": float(np.rad2deg(np.linalg.norm(left[:3]))),
+            }
+            for views, away, left in zip(check.seen.views, check.away, check.left, strict=True)
+        ],
+        "not_used": [
+            {"view": view, "reason": reason} for view, reason in sorted(known.reasons.items())
+        ],
+        "warnings": list(check.seen.warnings),
+        "recalibrate": any(it.state == "fired" for it in triggers),
+        "triggers": [_trigger(it) for it in triggers],
+    }
+
+
+def listed_suspects(check: Check) -> tuple[Suspect, ...]:
+    """The changes that are worth a line: those that are named, and others that are not unlikely."""
+    others = (it for it in check.suspects if it not in check.named)
+    return (*check.named, *(it for it in others if it.probability > _LISTED_SHARE))
+
+
+def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
+    return {
+        "cause": suspect.name,
+        "probability": suspect.probability,
+        **described(check, suspect),
+    }
+
+
+def _trigger(outcome: Outcome) -> dict[str, Any]:
+    trigger = outcome.trigger
+    figures = {"limit": trigger.limit, "value": outcome.value}
+    return {
+        "quantity": trigger.quantity,
+        "state": outcome.state,
+        **{name: it for name, it in figures.items() if it is not None},
+        "words": outcome.words,
+    }

@@ -1,0 +1,296 @@
+"""What a check found, in plain sentences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.verification.causes import (
+    BOARD,
+    BOTH,
+    CAMERA,
+    JOINT,
+    LENGTH,
+    NOISE,
+    kind_of,
+)
+from visioncal.calibration.verification.check import FEW_STOPS, Check, Suspect
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import exp, inverse_right_jacobian, skew
+from visioncal.core.types import FloatArray
+from visioncal.estimation.null_space import joint_words, listed
+from visioncal.estimation.observability import axis_words
+from visioncal.vision.targets import corner_positions
+
+# A part of a motion that is less than so many sigmas is not worth a word.
+_WORTH_A_WORD = 3.0
+# A camera that moves by so many sigmas is told from none in nearly every check.
+_SURE = 6.0
+_ALUMINIUM, _STEEL = 23e-6, 12e-6
+_NEXT = {
+    CAMERA: "Fasten the camera, and calibrate again.",
+    BOARD: "Put the board back, or, if it was moved on purpose, verify with --board-moved.",
+    BOTH: "Fasten both, and calibrate again.",
+    JOINT: "Look whether the joint keeps its zero (a coupling that slips does so again), then "
+    "calibrate again.",
+    LENGTH: "Let the arm come to the temperature at which it was calibrated, or calibrate it at "
+    "the one at which it works.",
+    NOISE: "Look for play in mounts and joints, and whether the robot stood still at each image; "
+    "then verify again.",
+}
+_WRONG_VIEW = "Take that stop again: its image and its pose do not belong together."
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far something moved: lengths, their standard deviations, and directions in words.
+
+    Attributes:
+        mm: Distance [mm].
+        sigma_mm: Its standard deviation [mm].
+        along: Its direction.
+        deg: Angle [deg].
+        sigma_deg: Its standard deviation [deg].
+        about: Its axis.
+    """
+
+    mm: float
+    sigma_mm: float
+    along: str
+    deg: float
+    sigma_deg: float
+    about: str
+
+    @property
+    def words(self) -> str:
+        """What of it is beyond noise, in words."""
+        shift = f"by {figure(self.mm)} mm (sigma {figure(self.sigma_mm)}) along {self.along}"
+        turn = f"by {figure(self.deg)} deg (sigma {figure(self.sigma_deg)}) about {self.about}"
+        told = [
+            text
+            for text, value, sigma in (
+                (f"moved {shift}", self.mm, self.sigma_mm),
+                (f"turned {turn}", self.deg, self.sigma_deg),
+            )
+            if value > _WORTH_A_WORD * sigma
+        ]
+        return " and ".join(told) or f"moved {shift}"
+
+
+def sentences(check: Check) -> tuple[str, ...]:
+    """What the check found: whether the calibration holds, what changed, and what to do."""
+    if check.passed:
+        return (_agreement(check), *_doubts(check))
+    best, *others = check.named
+    told = [_changed(check, best)]
+    if others:
+        told.append(_rivals(check, best, others))
+    if not check.explained:
+        told.append(
+            "Alone it does not explain the stops: something else has changed too. Calibrate again."
+        )
+    return (*told, next_step(best.name), *(_doubts(check) if others else ()))
+
+
+def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> str:
+    """What the likeliest change cannot be told from."""
+    named = listed([thing(check, it) for it in others])
+    robot = check.calibration.calibrated_robot
+    if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
+        # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
+        return f"No stops can tell that from {named}: look at both."
+    return (
+        f"These {_stops(check)} cannot tell that from {named}: verify with stops all over the "
+        "workspace."
+    )
+
+
+def next_step(cause: str) -> str:
+    """What to do about a change."""
+    return _NEXT.get(kind_of(cause), _WRONG_VIEW)
+
+
+def described(check: Check, suspect: Suspect) -> dict[str, Any]:
+    """The figures of a change, as JSON has them: millimetres, degrees, shares."""
+    kind = kind_of(suspect.name)
+    values, sigmas = suspect.explained.values, np.sqrt(np.diag(suspect.explained.covariance))
+    if kind == NOISE:
+        return {"noise_factor": suspect.explained.noise_factor}
+    if kind == LENGTH:
+        return {"share": float(values[0]), "sigma": float(sigmas[0])}
+    if kind == JOINT:
+        value, sigma, unit = _joint_figures(check, suspect)
+        return {f"offset_{unit}": value, f"sigma_{unit}": sigma}
+    documents = {name: _motion_document(it) for name, it in motions(check, suspect).items()}
+    return documents if kind == BOTH else documents[suspect.name]
+
+
+def _motion_document(moved: Motion) -> dict[str, Any]:
+    return {
+        "moved_mm": moved.mm,
+        "sigma_mm": moved.sigma_mm,
+        "along": moved.along,
+        "turned_deg": moved.deg,
+        "sigma_deg": moved.sigma_deg,
+        "about": moved.about,
+    }
+
+
+def motions(check: Check, suspect: Suspect) -> dict[str, Motion]:
+    """How far the camera, a board, or the board of one view moved, by their names."""
+    names = (CAMERA, BOARD) if kind_of(suspect.name) == BOTH else (suspect.name,)
+    values, spread = suspect.explained.values, suspect.explained.covariance
+    parts = [slice(6 * at, 6 * at + 6) for at in range(len(names))]
+    return {
+        name: _motion(check, name, values[it], spread[it, it])
+        for name, it in zip(names, parts, strict=True)
+    }
+
+
+def _motion(check: Check, name: str, twist: FloatArray, spread: FloatArray) -> Motion:
+    x, *boards = check.footing.state.edges
+    hand = check.calibration.mount == "eye-in-hand"
+    if name == CAMERA:
+        rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if hand else "base"
+    else:
+        place = _board(check, name)
+        rotation, point = boards[place][:3, :3], _middle(check, place)
+        parent = "base" if hand else "tool"
+    moved = exp(twist)
+    shift = moved[:3, :3] @ point + moved[:3, 3] - point
+    # How the point goes on moving with the twist, by its right perturbation.
+    onward = np.linalg.inv(inverse_right_jacobian(twist))
+    slope = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ onward
+    mm, sigma_mm = _length(shift, slope @ spread @ slope.T)
+    turn, sigma = _length(twist[:3], spread[:3, :3])
+    return Motion(
+        1e3 * mm,
+        1e3 * sigma_mm,
+        f"the {parent}'s {_signed_axis(rotation @ shift)}",
+        float(np.rad2deg(turn)),
+        float(np.rad2deg(sigma)),
+        f"the {parent}'s {_signed_axis(rotation @ twist[:3])}",
+    )
+
+
+def _board(check: Check, name: str) -> int:
+    """The place among the calibration's boards of the one that a cause is about."""
+    kind, _, which = name.partition(" ")
+    footing, seen = check.footing, check.seen
+    if kind == BOARD:
+        names = list(footing.targets)
+        return footing.boards.index(names.index(which)) if which in names else 0
+    return int(seen.boards[[int(which) in it for it in seen.views]][0])
+
+
+def _middle(check: Check, place: int) -> FloatArray:
+    """(3,) middle of one of the calibration's boards, in its frame [m]."""
+    targets = tuple(check.footing.targets.values())
+    if not targets:
+        return np.zeros(3)
+    return np.asarray(corner_positions(targets[check.footing.boards[place]]).mean(axis=0))
+
+
+def _length(vector: FloatArray, spread: FloatArray) -> tuple[float, float]:
+    """Length of a (3,) vector, and its standard deviation along itself."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length if length > 0.0 else np.full(3, 1.0 / np.sqrt(3.0))
+    return length, float(np.sqrt(max(float(along @ spread @ along), 0.0)))
+
+
+def _signed_axis(vector: FloatArray) -> str:
+    """Names a direction with its sign: `-x`, or `direction (-0.71, 0.71, 0.00)`."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+    words = axis_words(along)
+    if len(words) == 1:
+        return words if along["xyz".index(words)] > 0.0 else f"-{words}"
+    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*along)
+
+
+def _changed(check: Check, suspect: Suspect) -> str:
+    kind = kind_of(suspect.name)
+    if kind in (JOINT, LENGTH, NOISE):
+        return f"{_capital(thing(check, suspect))}."
+    moved = motions(check, suspect)
+    if kind in (CAMERA, BOARD, BOTH):
+        return f"{_capital('; '.join(f'the {name} {it.words}' for name, it in moved.items()))}."
+    return (
+        f"{_capital(suspect.name)} alone contradicts the calibration, by "
+        f"{_short(moved[suspect.name])}; the other stops agree with it."
+    )
+
+
+def thing(check: Check, suspect: Suspect) -> str:
+    """A change with its figures, as the part of a sentence."""
+    kind, explained = kind_of(suspect.name), suspect.explained
+    if kind == JOINT:
+        value, sigma, unit = _joint_figures(check, suspect)
+        robot = check.calibration.calibrated_robot
+        joint = int(suspect.name.partition(" ")[2]) - 1
+        named = suspect.name if robot is None else joint_words(joint, robot)
+        sign = "+" if value > 0.0 else "-"
+        return (
+            f"{named} off by {sign}{figure(abs(value))} {unit} (sigma {figure(sigma)}) from what "
+            "it reads: its encoder slipped, or its zero was lost"
+        )
+    if kind == LENGTH:
+        share, sigma = float(explained.values[0]), float(np.sqrt(explained.covariance[0, 0]))
+        kelvins = [f"{abs(share) / it:.0f} K" for it in (_ALUMINIUM, _STEEL)]
+        grown = "longer" if share > 0.0 else "shorter"
+        return (
+            f"all lengths of the arm {grown} by {1e2 * abs(share):.2g} % (sigma {1e2 * sigma:.1g})"
+            f", as {kelvins[0]} do to aluminium and {kelvins[1]} to steel"
+        )
+    if kind == NOISE:
+        return f"the robot scatters about {explained.noise_factor:.0f} times as much as it did"
+    if kind in (CAMERA, BOARD, BOTH):
+        moved = motions(check, suspect)
+        return listed([f"the {name} moved by {_short(it)}" for name, it in moved.items()])
+    return f"{suspect.name} alone being wrong"
+
+
+def _short(moved: Motion) -> str:
+    return f"{figure(moved.mm)} mm and {figure(moved.deg)} deg"
+
+
+def _joint_figures(check: Check, suspect: Suspect) -> tuple[float, float, str]:
+    """Offset of a joint, its standard deviation, and their unit."""
+    joint = int(suspect.name.partition(" ")[2]) - 1
+    robot = check.calibration.calibrated_robot
+    value = float(suspect.explained.values[0])
+    sigma = float(np.sqrt(suspect.explained.covariance[0, 0]))
+    if robot is not None and robot.chain.prismatic[joint]:
+        return 1e3 * value, 1e3 * sigma, "mm"
+    return float(np.rad2deg(value)), float(np.rad2deg(sigma)), "deg"
+
+
+def _agreement(check: Check) -> str:
+    turn, shift = np.sqrt(np.mean(np.sum(check.away.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    chance = f"{figure(100 * check.p_value)} %"
+    sure = _SURE * check.camera_sigma
+    off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
+    return (
+        f"{_capital(_stops(check))} agree with the calibration: off by {off_mm} mm "
+        f"and {off_deg} deg (rms); chance makes it more in {chance} "
+        f"of checks. A camera that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
+        f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
+    )
+
+
+def _doubts(check: Check) -> tuple[str, ...]:
+    if check.seen.stops >= FEW_STOPS:
+        return ()
+    return (
+        f"{_capital(_stops(check))} hardly tell one change from another: take {FEW_STOPS} or more.",
+    )
+
+
+def _stops(check: Check) -> str:
+    count = check.seen.stops
+    return f"{count} stop{'' if count == 1 else 's'}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

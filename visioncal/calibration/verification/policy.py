@@ -1,0 +1,167 @@
+"""When to calibrate again: triggers, as a table says them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table, did_you_mean, read_toml
+from visioncal.results import Calibration
+from visioncal.session import Session
+
+State: TypeAlias = Literal["fired", "quiet", "unknown"]
+
+_FILE = Path(__file__).with_name("policy.toml")
+_DAY_S = 86400.0
+# Quantities that are yes or no, and those that have a limit, with their units.
+_FLAGS = ("failed_check", "collision")
+_UNITS = {"ambient_change_k": "K", "payload_change_kg": "kg", "age_days": "days"}
+_COLUMNS = {"ambient_change_k": "ambient_c", "payload_change_kg": "payload_kg"}
+_LABELS = {
+    "failed_check": "a failed check",
+    "collision": "a collision",
+    "ambient_change_k": "the ambient temperature's change",
+    "payload_change_kg": "the payload's change",
+    "age_days": "the calibration's age",
+}
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """A reason to calibrate again.
+
+    Attributes:
+        quantity: What is looked at.
+        limit: Beyond what it fires; None for what is yes or no.
+    """
+
+    quantity: str
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one trigger.
+
+    Attributes:
+        trigger: Which.
+        state: Whether it fired, or could not be judged.
+        value: The figure that was compared with the limit; None for yes or no, and where unknown.
+        words: Its name, with its figure and limit, or why it is not known.
+    """
+
+    trigger: Trigger
+    state: State
+    value: float | None
+    words: str
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the triggers look at; None where it is not known.
+
+    Attributes:
+        values: The figures by quantity.
+        flags: What is yes or no, by quantity.
+        unknown: Why a figure is not known, by quantity.
+    """
+
+    values: Mapping[str, float]
+    flags: Mapping[str, bool]
+    unknown: Mapping[str, str]
+
+
+def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
+    """Reads a table of triggers.
+
+    Args:
+        path: A file of one's own; the shipped one where None.
+
+    Raises:
+        DataError: It is missing, or a trigger has an unknown quantity or no limit.
+    """
+    file = _FILE if path is None else path
+    rows = read_toml(file, str(file)).get("trigger")
+    if not isinstance(rows, list) or not all(isinstance(it, dict) for it in rows):
+        raise DataError(
+            f"{file}: it holds no [[trigger]].",
+            culprits=[str(file)],
+            next_step='Write [[trigger]], quantity = "age_days", limit = 365.0, and so on.',
+        )
+    return tuple(_trigger(it, f"{file}, trigger {at}") for at, it in enumerate(rows, start=1))
+
+
+def _trigger(row: Mapping[str, Any], label: str) -> Trigger:
+    table = Table(row, label)
+    quantity, known = table.text("quantity"), (*_FLAGS, *_UNITS)
+    if quantity not in known:
+        raise DataError(
+            f"{label}: quantity is {quantity!r}; known are {', '.join(known)}.",
+            culprits=[label],
+            next_step=did_you_mean(quantity, known),
+        )
+    return Trigger(quantity, None if quantity in _FLAGS else table.number("limit", positive=True))
+
+
+def facts_of(
+    session: Session,
+    calibration: Calibration,
+    *,
+    failed: bool,
+    collision: bool,
+    now: datetime | None = None,
+) -> Facts:
+    """Collects what triggers look at.
+
+    Args:
+        session: The check's; its columns `ambient_c` and `payload_kg` are averaged.
+        calibration: The one that was checked, with the conditions of its own views.
+        failed: Whether the stops say that something has changed.
+        collision: Whether one was reported.
+        now: The time; that of the clock where None.
+    """
+    values, unknown = {}, {}
+    before = calibration.stages.get("conditions", {})
+    for quantity, column in _COLUMNS.items():
+        here = [it.numbers[column] for it in session.views if column in it.numbers]
+        if column not in before:
+            unknown[quantity] = f"the views that were calibrated with do not all have {column}"
+        elif not here:
+            unknown[quantity] = f"the check's views have no {column}"
+        else:
+            values[quantity] = abs(float(np.mean(here)) - float(before[column]))
+    age_days = _age_days(calibration.created, now or datetime.now(UTC))
+    if age_days is None:
+        unknown["age_days"] = f"the calibration's time is {calibration.created!r}"
+    else:
+        values["age_days"] = age_days
+    return Facts(values, {"failed_check": failed, "collision": collision}, unknown)
+
+
+def _age_days(created: str, now: datetime) -> float | None:
+    try:
+        then = datetime.fromisoformat(created)
+    except ValueError:
+        return None
+    then = then if then.tzinfo else then.replace(tzinfo=UTC)
+    return round((now - then).total_seconds() / _DAY_S, 1)
+
+
+def outcomes(policy: Sequence[Trigger], facts: Facts) -> tuple[Outcome, ...]:
+    """Says of each trigger whether it fires."""
+    return tuple(_outcome(it, facts) for it in policy)
+
+
+def _outcome(trigger: Trigger, facts: Facts) -> Outcome:
+    quantity, limit, label = trigger.quantity, trigger.limit, _LABELS[trigger.quantity]
+    if limit is None:
+        return Outcome(trigger, "fired" if facts.flags[quantity] else "quiet", None, label)
+    if quantity in facts.unknown:
+        return Outcome(trigger, "unknown", None, f"{label} ({facts.unknown[quantity]})")
+    value = facts.values[quantity]
+    words = f"{label}, {value:.4g} {_UNITS[quantity]} (limit {limit:g})"
+    return Outcome(trigger, "fired" if value > limit else "quiet", value, words)

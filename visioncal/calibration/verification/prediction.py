@@ -1,0 +1,342 @@
+"""A few stops of a session, seen with a calibration's own lens, boards and arm."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from reprlib import repr as shorten
+
+import numpy as np
+
+from visioncal.calibration.pipeline import STAGES
+from visioncal.calibration.pipeline.observed_poses import Looked
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.stages.pose_ambiguity import choose_by
+from visioncal.calibration.verification.calibration_prior import Footing
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, pose_difference
+from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.chain import robot_part
+from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.problem import Problem
+from visioncal.results import CameraResult
+from visioncal.results.session_match import check_mount, check_resolution
+from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.session.boards import COLUMN
+from visioncal.vision.targets import target_document
+
+# Models that place the flange alike to this are of one robot; tables are written with six digits.
+_ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
+_POSTURES = 5
+_STAGES = {it.name: it.run for it in STAGES}
+# Corners that scatter by so many times as much as when they were calibrated with are worth a word.
+_WORTH_A_WORD = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The stops of a session as a calibration sees them.
+
+    Attributes:
+        known: What is known of the session, with the calibration's lens, boards and arm.
+        problem: The m sights of a board at a stop, with the calibration's unknowns.
+        views: (m,) the views of each sight.
+        warnings: What is odd, in sentences.
+    """
+
+    known: Looked
+    problem: Problem
+    views: tuple[tuple[int, ...], ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def stops(self) -> int:
+        """How many stops there are."""
+        return len(self.problem.poses[ROBOT])
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(s, n) joint angles of the stops [rad]; None where not all have them."""
+        return self.known.arm_at_stops.joints_rad
+
+    @property
+    def boards(self) -> IntArray:
+        """(m,) which of the calibration's boards each sight is of."""
+        return np.array([self.problem.unknown[it] - 1 for it in self.problem.observations.observed])
+
+    def away(self, footing: Footing) -> FloatArray:
+        """(m, 4, 4) by how much its board has moved, on its right, as each sight places it."""
+        return asked_of_boards(self.problem, footing.state)
+
+    @property
+    def from_corners(self) -> bool:
+        """Whether the target's poses come from corners, whose noise is known."""
+        return not self.problem.is_combined
+
+
+def see_again(
+    session: Session,
+    footing: Footing,
+    progress: Progress | None = None,
+    without: Mapping[int, str] | None = None,
+) -> Seen:
+    """Looks at a session with what a calibration rests on, and estimates nothing anew.
+
+    Args:
+        session: Of the same cell.
+        footing: The calibration's.
+        progress: Told of long work.
+        without: Views that are not to be looked at, and why not.
+
+    Raises:
+        DataError: It is of another mount, camera, target or robot, lacks joint angles that the
+            calibrated arm needs, or shows nothing.
+    """
+    known = _STAGES["robot"](known_before(session, footing, progress))
+    known = _STAGES["detect"](known)
+    rejected = {it: why for it, why in (without or {}).items() if it not in known.held_back}
+    return seen_by(known.noting(Rejection(*it) for it in rejected.items()), footing)
+
+
+def known_before(session: Session, footing: Footing, progress: Progress | None = None) -> Known:
+    """What is known before anything is looked at: that the session is of the same cell.
+
+    Raises:
+        DataError: It is of another mount, target or robot.
+    """
+    calibration = footing.calibration
+    check_mount(session, calibration)
+    session = _with_its_targets(session, footing)
+    document, robot = session.robot_document, calibration.robot
+    if robot is not None and document is not None:
+        _check_robot(session, Robot.from_document(document), robot)
+    if robot is not None:
+        # As calibrated, with its base in the frame of the poses.
+        session = replace(session, robot_document=robot.document)
+    return Known(session, progress)
+
+
+def seen_by(known: Known, footing: Footing) -> Seen:
+    """Carries on where targets have been detected; see `see_again`."""
+    calibration = footing.calibration
+    for frame, look in known.cameras.items():
+        if look.resolution is None:
+            continue
+        if calibration.camera is None:
+            raise DataError(
+                f"calibration {calibration.session_name!r} holds no camera, and session "
+                f"{known.session.name!r} has images.",
+                next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
+            )
+        check_resolution(known.session, calibration, look.resolution)
+        lens = CameraResult(calibration.camera.camera, estimated=False)
+        known = known.with_camera(frame, replace(look, lens=lens))
+    # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
+    known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clocks={})
+    looked = _posed(_with_arm(Looked.of(known), footing), footing)
+    problem = looked.problem(looked.used)
+    sights = problem.of_one_stop
+    return Seen(
+        looked,
+        problem.merged(),
+        tuple(
+            tuple(np.array(looked.used)[sights == at].tolist()) for at in range(sights.max() + 1)
+        ),
+        tuple(_warnings(looked, footing)),
+    )
+
+
+def asked_of_boards(problem: Problem, state: State) -> FloatArray:
+    """(m, 4, 4) the change of its board's edge, on the right, that each observation asks for."""
+    asked, observed = np.zeros((len(problem), 4, 4)), np.array(problem.observations.observed)
+    for board in set(problem.observations.observed):
+        mine = observed == board
+        asked[mine] = problem.change_of(board, state)[mine]
+    return asked
+
+
+def _with_arm(known: Looked, footing: Footing) -> Looked:
+    """Takes the arm for what the calibration has it for."""
+    known = replace(known, calibrated=replace(known.robot_arm, model=footing.model))
+    if footing.arm in ("none", "poses"):
+        return known
+    if known.robot_arm.joints_rad is None:
+        missing = [it.number for it in known.session.views if it.joints_rad is None]
+        raise DataError(
+            f"session {known.session.name!r}: the calibration is of an arm by its joints, and "
+            + (f"{len(missing)} views have no joint angles." if missing else "its joints differ."),
+            culprits=[f"views.csv: view {it}" for it in missing],
+            next_step="Record q1_rad ... with every view.",
+        )
+    return known
+
+
+def _posed(known: Looked, footing: Footing) -> Looked:
+    """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
+    mount, targets = known.session.mount, tuple(footing.targets.values())
+    x, *placed = footing.state.edges
+    order = {board: at for at, board in enumerate(footing.boards)}
+    views, chosen = [], []
+    for view in (it.number for it in known.session.views):
+        poses = known.poses.get(view)
+        if poses is None or view not in known.base_from_flange or view in known.reasons:
+            continue
+        if poses.board not in order:
+            continue
+        robot = robot_part(known.arm_at([view]).poses, mount)[0]
+        predicted = invert(robot @ x) @ placed[order[poses.board]]
+        views.append(view)
+        chosen.append(choose_by(poses, predicted, targets[poses.board] if targets else None))
+    if not views:
+        raise DataError(
+            f"session {known.session.name!r}: no view shows the target from a known pose of the "
+            "robot.",
+            culprits=known.lost_views,
+        )
+    known = replace(known, used=tuple(views), boards=footing.boards, free=footing.free)
+    known = replace(known, frames=known.framed(footing.state.edges)).posed(chosen)
+    if known.free is not None and all(it.corners is not None for it in chosen):
+        known = known.with_noise(_noise_px(known)).posed(chosen)
+    return _with_errors(known, footing)
+
+
+def _with_errors(known: Looked, footing: Footing) -> Looked:
+    """Adds the arm's errors as unknowns, as the calibration's covariance has them."""
+    if footing.arm == "none":
+        return known
+    arm = known.robot_arm
+    if footing.arm == "poses":
+        arm = replace(arm, joints_rad=None)
+    errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
+    return replace(known, calibrated=replace(arm, errors=errors))
+
+
+def _noise_px(known: Looked) -> float:
+    """Noise of a corner's coordinate around the poses, by lens and boards as calibrated [px]."""
+    corners = {view: it for view, it in zip(known.used, known.seen(known.used), strict=True) if it}
+    free = known.free
+    if free is None or not corners:
+        return known.pixel_px or 0.0
+    shaped = free.positions + free.basis @ free.appearance.board
+    stack = CornerStack.of(corners, shaped)
+    poses = np.array([known.poses[view].cam_from_target[0] for view in corners])
+    left = reproject(stack, free.appearance.camera, poses).residuals
+    return stack.sigma_px(left, 6 * len(corners))
+
+
+def _with_its_targets(session: Session, footing: Footing) -> Session:
+    """Numbers the session's targets as the calibration does, by their names.
+
+    The only one of a session has no name: where several were calibrated with, it is the one among
+    them that is printed alike.
+
+    Raises:
+        DataError: They are others than were calibrated with, or it is not known which of them.
+    """
+    known, shown = footing.targets, session.boards
+    if len(known) < 2 and len(shown) < 2:
+        if any(view.image or view.has_corners for view in session.views):
+            _check_targets(session, footing)
+        return session
+    name = ""
+    if "" in shown:
+        alike = [it for it, target in known.items() if not _differing(target, shown[""])]
+        name = alike[0] if len(alike) == 1 else ""
+    if not name:
+        _check_targets(session, footing)
+    if not shown:
+        raise DataError(
+            f"session {session.name!r} does not say which of the targets that were calibrated with "
+            f"({', '.join(known)}) its rows show.",
+            culprits=["session.toml: targets"],
+            next_step="Declare them as in the calibration's session, and name one in each row's "
+            "column target.",
+        )
+    views = session.views
+    if name:
+        views = tuple(replace(it, text={**it.text, COLUMN: name}) for it in views)
+    return replace(session, target=None, targets=known, views=views)
+
+
+def _differing(ours: Target, theirs: Target) -> list[str]:
+    """The fields in which two targets are printed differently."""
+    one, other = target_document(ours), target_document(theirs)
+    differing = [it for it in {**one, **other} if one.get(it) != other.get(it)]
+    return [it for it in differing if it != "square_sigma_m"]
+
+
+def _check_targets(session: Session, footing: Footing) -> None:
+    """Refuses other targets than were calibrated with; how well a size is known may differ."""
+    if not footing.targets:
+        raise DataError(
+            f"calibration {footing.calibration.session_name!r} was made from measured poses, and "
+            f"does not say of which target; session {session.name!r} has images.",
+            culprits=["session.toml: target"],
+            next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
+        )
+    for name, target in session.boards.items():
+        known = footing.targets.get(name)
+        if known is None:
+            there = ", ".join(it or "one without a name" for it in footing.targets)
+            raise DataError(
+                f"session {session.name!r}: target {name or target.name!r} is none of those that "
+                f"were calibrated with ({there}).",
+                culprits=["session.toml: target"],
+                next_step="Verify with views of that target alone."
+                if "" in footing.targets
+                else "Name the targets as in the calibration's session.",
+            )
+        ours, theirs = target_document(known), target_document(target)
+        for field in _differing(known, target):
+            raise DataError(
+                f"session {session.name!r}: target {name or target.name!r} has {field} = "
+                f"{shorten(theirs.get(field))}, and the calibration was made with "
+                f"{shorten(ours.get(field))}: it is another target.",
+                culprits=[f"target: {field}"],
+                next_step="Verify with the target that was calibrated with, as it was described "
+                "then.",
+            )
+
+
+def _check_robot(session: Session, stated: Robot, known: Robot) -> None:
+    """Refuses another robot; the same model written otherwise passes."""
+    culprit = ["session.toml: robot.model"]
+    if stated.joint_count != known.joint_count:
+        raise DataError(
+            f"session {session.name!r} names robot {stated.name} with {stated.joint_count} joints, "
+            f"and the calibration is of {known.name} with {known.joint_count}.",
+            culprits=culprit,
+            next_step="Name the calibration of this robot.",
+        )
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, known.joint_count))
+    # The calibrated one's base may have been placed by the poses: motions are compared.
+    ours, theirs = (it.base_from_flange(q) for it in (known, stated))
+    between = [invert(it[0]) @ it for it in (ours, theirs)]
+    off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
+    if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
+        raise DataError(
+            f"session {session.name!r} names robot {stated.name}, whose flange is up to "
+            f"{off[0]:.3g} mm and {off[1]:.2g} deg off from the calibrated {known.name}'s: it is "
+            "another robot, or another tip.",
+            culprits=culprit,
+            next_step="Name the robot and tip as in the calibration's session.",
+        )
+
+
+def _warnings(known: Looked, footing: Footing) -> Iterator[str]:
+    """What is odd about the session."""
+    yield from dict.fromkeys(known.warnings)
+    if "thermal" in footing.calibration.stages:
+        cold_c = float(footing.calibration.drift.reference_c.mean())
+        yield (
+            "The calibrated arm drifts with its temperature, and a check takes it for as warm as "
+            f"it was at the start (about {cold_c:.0f} deg C): one at work looks longer, or as if "
+            "its joints had slipped. Verify with the arm as warm as then."
+        )
+    before, now = footing.calibration.noise.get("pixel_px"), known.pixel_px
+    if before is not None and now is not None and now > _WORTH_A_WORD * max(before, 1e-3):
+        yield (
+            f"The corners scatter by {now:.2g} px around the target's poses, and by {before:.2g} "
+            "px when it was calibrated: look whether the lens is clean, sharp and as it was."
+        )

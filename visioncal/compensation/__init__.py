@@ -1,6 +1,0 @@
-"""Compensation: what to tell a nominal controller so that the real arm goes where it is wanted."""
-
-from visioncal.compensation.arms import CalibratedArm
-from visioncal.compensation.correction import WIDEST_RAD, Corrected, correct
-
-__all__ = ["WIDEST_RAD", "CalibratedArm", "Corrected", "correct"]

@@ -1,0 +1,1 @@
+"""What every package uses: errors, plain data, rigid transforms, files, numbers in words."""

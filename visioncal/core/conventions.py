@@ -1,0 +1,306 @@
+"""How others write poses: units, rotations, and the forms of the robots' makers.
+
+One table serves both ways: what `convert` reads, `export` writes.
+"""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.transforms import compose, invert, nearest_rotation
+from visioncal.core.types import FloatArray, IntArray, Mask
+
+# Three written digits leave a quaternion's length within 9e-4 of 1 and a matrix within 8e-4 of a
+# rotation; views.csv has the same limit. What is farther off is read in the wrong form or order.
+_NORM_TOLERANCE = 1e-3
+
+UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 0.0254}
+
+
+@dataclass(frozen=True)
+class RotationForm:
+    """A way to write a rotation as numbers.
+
+    Attributes:
+        name: As the command line has it.
+        words: What it is, for messages.
+        size: How many numbers it takes.
+        read: (n, size) numbers to (n, 3, 3) rotations; NaN where they are none.
+        write: (n, 3, 3) rotations to (n, size) numbers.
+    """
+
+    name: str
+    words: str
+    size: int
+    read: Callable[[FloatArray], FloatArray]
+    write: Callable[[FloatArray], FloatArray]
+
+
+def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
+    """Builds a form whose number i is component `order[i]` of x, y, z, w."""
+    from_xyzw = np.array(order)
+    to_xyzw = np.argsort(from_xyzw)
+
+    def read(numbers: FloatArray) -> FloatArray:
+        # No component of a unit is larger, and squares of the largest numbers overflow.
+        norms = np.linalg.norm(np.clip(numbers, -2.0, 2.0), axis=1)
+        off = np.abs(norms - 1.0) > _NORM_TOLERANCE
+        unit = np.where(off[:, None] | ~np.isfinite(numbers), 0.5, numbers)
+        rotations = Rotation.from_quat(unit[:, to_xyzw]).as_matrix()
+        return _without(rotations, np.asarray(off) | ~_finite_rows(numbers))
+
+    def write(rotations: FloatArray) -> FloatArray:
+        # A quaternion and its negative are one rotation; robots' makers write w >= 0.
+        numbers = Rotation.from_matrix(rotations).as_quat(canonical=True)
+        return np.asarray(numbers[:, from_xyzw])
+
+    return RotationForm(name, words, 4, read, write)
+
+
+def _rotation_vectors(name: str, words: str, unit_rad: float) -> RotationForm:
+    return RotationForm(
+        name,
+        words,
+        3,
+        lambda numbers: _finite(numbers, lambda it: Rotation.from_rotvec(it * unit_rad)),
+        lambda rotations: Rotation.from_matrix(rotations).as_rotvec() / unit_rad,
+    )
+
+
+def _euler(order: str, unit: str) -> RotationForm:
+    """Builds a form of three angles: capitals turn about moving axes, small letters about fixed."""
+    degrees = unit == "deg"
+    about = "moving" if order.isupper() else "fixed"
+
+    def write(rotations: FloatArray) -> FloatArray:
+        with warnings.catch_warnings():
+            # At the singularity one of the endless many triples is as right as any.
+            warnings.simplefilter("ignore", UserWarning)
+            return np.asarray(Rotation.from_matrix(rotations).as_euler(order, degrees=degrees))
+
+    return RotationForm(
+        f"euler-{order}-{unit}",
+        f"Euler angles {order} about {about} axes in {'degrees' if degrees else 'radians'}",
+        3,
+        lambda numbers: _finite(
+            numbers, lambda it: Rotation.from_euler(order, it, degrees=degrees)
+        ),
+        write,
+    )
+
+
+def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
+    def turned(rotations: FloatArray) -> FloatArray:
+        return np.swapaxes(rotations, 1, 2) if transposed else rotations
+
+    def read(numbers: FloatArray) -> FloatArray:
+        rotations = turned(numbers.reshape(-1, 3, 3))
+        there = _finite_rows(rotations.reshape(-1, 9))
+        safe = np.where(there[:, None, None], rotations, np.eye(3))
+        nearest = nearest_rotation(safe)
+        off = np.abs(nearest - safe).max(axis=(1, 2)) > _NORM_TOLERANCE
+        return _without(nearest, np.asarray(off) | ~there)
+
+    return RotationForm(
+        name, words, 9, read, lambda rotations: turned(rotations).reshape(-1, 9).copy()
+    )
+
+
+def _finite(numbers: FloatArray, build: Callable[[FloatArray], Rotation]) -> FloatArray:
+    there = _finite_rows(numbers)
+    return _without(build(np.where(there[:, None], numbers, 0.0)).as_matrix(), ~there)
+
+
+def _finite_rows(numbers: FloatArray) -> Mask:
+    return np.asarray(np.isfinite(numbers).all(axis=1))
+
+
+def _without(rotations: FloatArray, missing: Mask) -> FloatArray:
+    return np.asarray(np.where(missing[:, None, None], np.nan, rotations))
+
+
+def _euler_orders() -> tuple[str, ...]:
+    """The twelve orders of three turns, about moving axes and about fixed ones."""
+    straight = ["".join(it) for it in permutations("XYZ")]
+    repeated = [f"{a}{b}{a}" for a, b in permutations("XYZ", 2)]
+    return tuple(it for order in straight + repeated for it in (order, order.lower()))
+
+
+def _all_forms() -> tuple[RotationForm, ...]:
+    return (
+        _quaternions("quaternion-xyzw", "a quaternion x, y, z, w", (0, 1, 2, 3)),
+        _quaternions("quaternion-wxyz", "a quaternion w, x, y, z", (3, 0, 1, 2)),
+        _rotation_vectors("rotation-vector", "a rotation vector in radians", 1.0),
+        _rotation_vectors(
+            "rotation-vector-deg", "a rotation vector in degrees", float(np.deg2rad(1.0))
+        ),
+        _matrices("matrix", "a rotation matrix by rows", transposed=False),
+        _matrices("matrix-transposed", "a rotation matrix by columns", transposed=True),
+        *(_euler(order, unit) for order in _euler_orders() for unit in ("rad", "deg")),
+    )
+
+
+ROTATION_FORMS: Mapping[str, RotationForm] = {it.name: it for it in _all_forms()}
+
+
+@dataclass(frozen=True)
+class PoseForm:
+    """How a robot's maker or a library writes a pose: a length unit [m] and a rotation."""
+
+    name: str
+    words: str
+    unit: str
+    rotation: str
+
+
+# Universal Robots, "Script manual": p[x, y, z, rx, ry, rz]. KUKA, "System variables": FRAME X, Y,
+# Z, A, B, C with A about Z, then B about Y, then C about X, moving. FANUC and Yaskawa: W, P, R
+# (Rx, Ry, Rz) about fixed X, Y, Z. ABB, "RAPID data types": pos [mm], orient q1 .. q4 = w, x, y, z.
+# Staubli VAL 3: Rx, Ry, Rz about moving axes. Doosan: A, B, C about moving Z, Y, Z. URDF
+# specification: roll, pitch, yaw about fixed x, y, z.
+POSE_FORMS: Mapping[str, PoseForm] = {
+    it.name: it
+    for it in (
+        PoseForm("ur", "Universal Robots p[...]", "m", "rotation-vector"),
+        PoseForm("kuka", "KUKA X, Y, Z, A, B, C", "mm", "euler-ZYX-deg"),
+        PoseForm("fanuc", "FANUC X, Y, Z, W, P, R", "mm", "euler-xyz-deg"),
+        PoseForm("yaskawa", "Yaskawa X, Y, Z, Rx, Ry, Rz", "mm", "euler-xyz-deg"),
+        PoseForm("abb", "ABB pos and orient", "mm", "quaternion-wxyz"),
+        PoseForm("staubli", "Staubli X, Y, Z, Rx, Ry, Rz", "mm", "euler-XYZ-deg"),
+        PoseForm("doosan", "Doosan X, Y, Z, A, B, C", "mm", "euler-ZYZ-deg"),
+        PoseForm("rpy", "URDF xyz and rpy", "m", "euler-xyz-rad"),
+        PoseForm("ros", "ROS position and orientation", "m", "quaternion-xyzw"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What poses written as numbers are taken to mean.
+
+    Attributes:
+        rotation: A name among `ROTATION_FORMS`.
+        unit: A name among `UNITS_M`.
+        inverse: Whether the numbers give the inverse of the pose that is asked for.
+    """
+
+    rotation: str = "quaternion-xyzw"
+    unit: str = "m"
+    inverse: bool = False
+
+    @property
+    def words(self) -> str:
+        """The reading in words."""
+        rotation = ROTATION_FORMS[self.rotation].words
+        return f"{self.unit}, {rotation}{', inverse' if self.inverse else ''}"
+
+
+@dataclass(frozen=True, eq=False)
+class PoseNumbers:
+    """Poses as someone else wrote them, before anything is believed of them.
+
+    Attributes:
+        positions: (n, 3) in the reading's unit; NaN in a row without a pose.
+        rotations: (n, k) in the reading's form.
+        reading: What the file, or the user, says of them.
+        places: (n,) where each stands, for messages: `poses.csv, line 3`.
+    """
+
+    positions: FloatArray
+    rotations: FloatArray
+    reading: Reading
+    places: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def of_poses(cls, poses: FloatArray, places: Sequence[str]) -> "PoseNumbers":
+        """Takes (n, 4, 4) transforms [m], NaN in a row without one."""
+        rotations = poses[:, :3, :3].reshape(-1, 9)
+        return cls(poses[:, :3, 3], rotations, Reading("matrix"), tuple(places))
+
+    @classmethod
+    def written(cls, poses: FloatArray, reading: Reading, places: Sequence[str]) -> "PoseNumbers":
+        """Writes (n, 4, 4) transforms [m] so that a reading gives them again."""
+        meant = invert(poses) if reading.inverse else poses
+        rotations = ROTATION_FORMS[reading.rotation].write(meant[:, :3, :3])
+        return cls(meant[:, :3, 3] / UNITS_M[reading.unit], rotations, reading, tuple(places))
+
+    @classmethod
+    def nowhere(cls, places: Sequence[str]) -> "PoseNumbers":
+        """Rows without poses."""
+        none = np.full((len(places), 7), np.nan)
+        return cls(none[:, :3], none[:, 3:], Reading(), tuple(places))
+
+    @property
+    def there(self) -> Mask:
+        """(n,) which rows have a pose, readable or not."""
+        return _finite_rows(self.positions) & _finite_rows(self.rotations)
+
+    def rows(self, rows: IntArray) -> "PoseNumbers":
+        """Takes some rows, in the order that is given."""
+        return replace(
+            self,
+            positions=self.positions[rows],
+            rotations=self.rotations[rows],
+            places=tuple(self.places[it] for it in rows),
+        )
+
+    def read_as(self, reading: Reading) -> "PoseNumbers":
+        """Returns the same numbers under another reading."""
+        return replace(self, reading=reading)
+
+    def poses(self) -> FloatArray:
+        """Reads the numbers.
+
+        Returns:
+            (n, 4, 4) transforms [m]; NaN in a row without a pose.
+
+        Raises:
+            DataError: Rows have a part of a pose, or are no rotations in this form; they are named.
+        """
+        form = ROTATION_FORMS[self.reading.rotation]
+        if self.rotations.shape[1] != form.size:
+            raise DataError(
+                f"{self.places[0]}: the rotation has {self.rotations.shape[1]} numbers, but "
+                f"{form.words} has {form.size}.",
+                culprits=[self.places[0]],
+            )
+        there = self.there
+        known = np.isfinite(np.hstack([self.positions, self.rotations]))
+        partly = self._places_of(known.any(axis=1) & ~there)
+        if partly:
+            raise DataError(
+                f"{some_of(partly)}: a part of the pose's numbers is missing; all or none are "
+                "needed.",
+                culprits=partly,
+                next_step="Fill in what is missing, or leave the whole pose of that row empty.",
+            )
+        rotations = form.read(self.rotations)
+        wrong = self._places_of(there & ~np.isfinite(rotations).all(axis=(1, 2)))
+        if wrong:
+            raise DataError(
+                f"{some_of(wrong)}: the numbers are not {form.words}.",
+                culprits=wrong,
+                next_step="Name another form of rotation, or other numbers.",
+            )
+        poses = compose(rotations, UNITS_M[self.reading.unit] * self.positions)
+        poses[~there] = np.nan
+        return invert(poses) if self.reading.inverse else poses
+
+    def _places_of(self, rows: Mask) -> list[str]:
+        return [self.places[it] for it in np.flatnonzero(rows)]
+
+
+def write_pose(pose: FloatArray, form: PoseForm) -> FloatArray:
+    """Writes one (4, 4) pose [m] as numbers in a maker's form: position, then rotation."""
+    position = pose[:3, 3] / UNITS_M[form.unit]
+    rotation = ROTATION_FORMS[form.rotation].write(pose[None, :3, :3])[0]
+    return np.concatenate([position, rotation])

@@ -1,0 +1,33 @@
+"""Files of others, read as data: no pickles, no constructors, no entities, and bounded sizes.
+
+Every reader raises DataError that names the file, the line where there is one, what was seen and
+what is needed.
+"""
+
+from visioncal.core.documents.arrays import read_npy, read_npz
+from visioncal.core.documents.jsons import read_json
+from visioncal.core.documents.opencv import read_opencv
+from visioncal.core.documents.stored import Kinds, parse_stored
+from visioncal.core.documents.tables import TextTable, is_number, read_table
+from visioncal.core.documents.values import as_numbers, mapping, number, shown
+from visioncal.core.documents.xmls import Element, read_xml
+from visioncal.core.documents.yamls import read_yaml
+
+__all__ = [
+    "Element",
+    "Kinds",
+    "TextTable",
+    "as_numbers",
+    "is_number",
+    "mapping",
+    "number",
+    "parse_stored",
+    "read_json",
+    "read_npy",
+    "read_npz",
+    "read_opencv",
+    "read_table",
+    "read_xml",
+    "read_yaml",
+    "shown",
+]

@@ -1,0 +1,85 @@
+"""OpenCV's FileStorage, in YAML, XML or JSON, without OpenCV."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from visioncal.core.documents.jsons import read_json
+from visioncal.core.documents.matrices import matrix_from
+from visioncal.core.documents.tables import is_number
+from visioncal.core.documents.xmls import Element, read_xml
+from visioncal.core.documents.yamls import read_yaml
+from visioncal.core.errors import DataError
+
+_MATRICES = ("opencv-matrix", "opencv-nd-matrix")
+
+
+def read_opencv(path: Path) -> Mapping[str, Any]:
+    """Reads what OpenCV's FileStorage wrote, matrices as arrays.
+
+    Args:
+        path: A `.yaml`, `.yml`, `.json` or `.xml`.
+
+    Returns:
+        The values by their names: numbers, text, lists, mappings and (rows, cols) arrays.
+
+    Raises:
+        DataError: It is none of these, or a matrix in it is not whole.
+    """
+    suffix = path.suffix.lower()
+    value: object
+    if suffix == ".xml":
+        value = _from_xml(read_xml(path), str(path))
+    elif suffix == ".json":
+        value = _with_matrices(read_json(path), str(path))
+    else:
+        value = read_yaml(path)
+    if not isinstance(value, Mapping):
+        raise DataError(f"{path}: no names with values, as OpenCV writes.", culprits=[str(path)])
+    return value
+
+
+def _with_matrices(value: object, where: str) -> object:
+    if isinstance(value, Mapping):
+        if value.get("type_id") in _MATRICES:
+            return matrix_from(value, where)
+        return {key: _with_matrices(it, f"{where}: {key}") for key, it in value.items()}
+    return value
+
+
+def _from_xml(element: Element, where: str) -> object:
+    place = f"{where}, line {element.line}"
+    if element.attributes.get("type_id") in _MATRICES:
+        content = {
+            tag: it.text.strip('"') if tag == "dt" else _numbers(it.text, place)
+            for tag, it in _by_tag(element, where).items()
+        }
+        return matrix_from(content, place)
+    if element.children and all(it.tag == "_" for it in element.children):
+        return [_from_xml(it, where) for it in element.children]
+    if element.children:
+        return {tag: _from_xml(it, where) for tag, it in _by_tag(element, where).items()}
+    try:
+        numbers = _numbers(element.text, place)
+    except DataError:
+        return element.text.strip('"')
+    return numbers[0] if len(numbers) == 1 else numbers or ""
+
+
+def _by_tag(element: Element, where: str) -> dict[str, Element]:
+    by_tag: dict[str, Element] = {}
+    for it in element.children:
+        if by_tag.setdefault(it.tag, it) is not it:
+            place = f"{where}, line {it.line}"
+            raise DataError(
+                f"{place}: <{it.tag[:60]}> is there twice; once is needed.", culprits=[place]
+            )
+    return by_tag
+
+
+def _numbers(text: str, where: str) -> list[float]:
+    """Reads numbers between blanks; OpenCV writes `.Nan` and `-.Inf`."""
+    words = text.replace(".N", "N").replace(".I", "I").split()
+    if not all(is_number(it) for it in words):
+        raise DataError(f"{where}: {text[:60]!r}; numbers are needed.", culprits=[where])
+    return [float(it) for it in words]

@@ -1,0 +1,214 @@
+"""A pose in one line, as a robot's pendant shows it or its program has it.
+
+By its marks: URScript's `p[..]`, Doosan's `posx(..)`, RAPID's `[[..],[..]]` and robtargets, and
+values with names before them: X, Y, Z and A, B, C (KUKA), W, P, R (FANUC), q1 to q4 (ABB), Rx, Ry,
+Rz (several makers), qx to qw. Bare numbers tell nothing but their count.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.conventions import POSE_FORMS, UNITS_M, PoseForm, PoseNumbers, Reading
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_UNIT = r"(?:mm|m|deg|rad)"
+_NAMED = re.compile(
+    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*({_NUMBER})\s*({_UNIT})?(?![\w.])"
+)
+_BETWEEN = re.compile(r"[\s\[\]{}(),;]+")
+# What stands around the numbers of a pose, and in which form it is then.
+_MARKED = (
+    ("ur", re.compile(r"(?<!\w)p\s*\[([^\[\]]*)\]")),
+    ("doosan", re.compile(r"(?<!\w)posx\s*\(([^()]*)\)")),
+    ("abb", re.compile(r"\[\s*\[([^\[\]]*\]\s*,\s*\[[^\[\]]*)\]")),
+)
+_NAMED_ROTATIONS: Mapping[tuple[str, ...], tuple[str, ...]] = {
+    ("a", "b", "c"): ("kuka",),
+    ("w", "p", "r"): ("fanuc",),
+    ("q1", "q2", "q3", "q4"): ("abb",),
+    ("qx", "qy", "qz", "qw"): ("ros",),
+    ("rx", "ry", "rz"): ("ur", "yaskawa", "staubli"),
+}
+# By their count alone: seven are the columns of views.csv.
+_BARE_FORMS: Mapping[int, tuple[str, ...]] = {
+    6: ("ur", "kuka", "fanuc", "yaskawa", "staubli", "doosan"),
+    7: ("ros",),
+}
+# No arm reaches so far [m]; no rotation in radians has so large an angle.
+_FAR_M, _TURNED_RAD = 10.0, 2.0 * np.pi + 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class PendantPose:
+    """A pose that was read.
+
+    Attributes:
+        pose: (4, 4) [m].
+        form: The form that it was taken to be in.
+        reading: The units and the rotation that it was taken to be in.
+    """
+
+    pose: FloatArray
+    form: PoseForm
+    reading: Reading
+
+    @property
+    def words(self) -> str:
+        """How it was understood."""
+        return f"{self.form.words} ({self.reading.words})"
+
+
+@dataclass(frozen=True)
+class _Written:
+    """Numbers as they stand, the forms that they may be in, and the units that they say."""
+
+    numbers: tuple[float, ...]
+    forms: tuple[str, ...]
+    length: str | None = None
+    angle: str | None = None
+
+
+def is_marked_pose(line: str) -> bool:
+    """Tells whether a line has the marks or the names of a pose, and not only numbers."""
+    plain = _plain(line)
+    return _marked(plain) is not None or _named(plain) is not None
+
+
+def possible_forms(line: str) -> tuple[str, ...]:
+    """Names the forms of `POSE_FORMS` that a line may be in by its looks; none for no pose."""
+    written = _written(line)
+    return () if written is None else written.forms
+
+
+def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
+    """Reads a pose out of a line.
+
+    Args:
+        line: The line.
+        where: What it is, for messages.
+        form: A name among `POSE_FORMS` where the user says it; what the line itself says must
+            agree.
+
+    Raises:
+        DataError: It is no pose, may be in several forms, or cannot be what it says.
+    """
+    written = _written(line)
+    if written is None:
+        raise DataError(
+            f"{where}: {line.strip()[:80]!r} is no pose that is known.",
+            culprits=[where],
+            next_step="Needed is a line as p[x, y, z, rx, ry, rz], {X .., Y .., Z .., A .., B .., "
+            "C ..}, [[x, y, z], [q1, q2, q3, q4]], X .. Y .. Z .. W .. P .. R .., or x_m y_m z_m "
+            "qx qy qz qw.",
+        )
+    name = _form(written, form, where)
+    chosen = POSE_FORMS[name]
+    reading = _reading(chosen, written)
+    values = np.array([written.numbers])
+    poses = PoseNumbers(values[:, :3], values[:, 3:], reading, (where,)).poses()
+    _check_size(values[0], reading, where)
+    return PendantPose(poses[0], chosen, reading)
+
+
+def _plain(line: str) -> str:
+    return line.replace("°", " deg").replace("\N{MINUS SIGN}", "-")
+
+
+def _written(line: str) -> _Written | None:
+    plain = _plain(line)
+    return _marked(plain) or _named(plain) or _bare(plain)
+
+
+def _marked(line: str) -> _Written | None:
+    for form, pattern in _MARKED:
+        found = pattern.findall(line)
+        # Of two poses in a line nobody tells which is meant.
+        if len(found) == 1:
+            words = re.split(r"[\s,\[\]]+", found[0].strip())
+            if all(re.fullmatch(_NUMBER, it) for it in words):
+                return _Written(tuple(map(float, words)), (form,))
+    return None
+
+
+def _named(line: str) -> _Written | None:
+    found = [(it[1].lower(), it[2], it[3]) for it in _NAMED.finditer(line)]
+    values = {name: float(number) for name, number, _ in found}
+    units = {name: unit for name, _, unit in found if unit}
+    for names, forms in _NAMED_ROTATIONS.items():
+        needed = {"x", "y", "z", *names}
+        if needed <= values.keys():
+            if sum(name in needed for name, _, _ in found) > len(needed):
+                return None  # two poses in a line
+            numbers = tuple(values[it] for it in ("x", "y", "z", *names))
+            lengths = {units[it] for it in "xyz" if it in units}
+            angles = {units[it] for it in names if it in units}
+            # One unit for each, and of the right kind.
+            if len(lengths) > 1 or len(angles) > 1 or lengths - {"m", "mm"} or angles & {"m", "mm"}:
+                return None
+            # Of those who write Rx, Ry, Rz only Universal Robots does so in radians.
+            likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
+            return _Written(numbers, likely, next(iter(lengths), None), next(iter(angles), None))
+    return None
+
+
+def _bare(line: str) -> _Written | None:
+    words = [it for it in _BETWEEN.split(line) if it]
+    if len(words) not in _BARE_FORMS or not all(re.fullmatch(_NUMBER, it) for it in words):
+        return None
+    return _Written(tuple(map(float, words)), _BARE_FORMS[len(words)])
+
+
+def _form(written: _Written, wished: str | None, where: str) -> str:
+    if wished is None and len(written.forms) == 1:
+        return written.forms[0]
+    makers = ", ".join(written.forms)
+    if wished is None:
+        raise DataError(
+            f"{where}: these numbers may be a pose of {makers}.",
+            culprits=[where],
+            next_step="Say which of them it is.",
+        )
+    # Bare numbers may be whatever the user says that they are.
+    is_bare = written.forms in _BARE_FORMS.values()
+    if wished not in POSE_FORMS or not (is_bare or wished in written.forms):
+        raise DataError(
+            f"{where}: it is written as a pose of {makers}, not of {wished!r}.",
+            culprits=[where],
+            next_step=f"The forms are {', '.join(POSE_FORMS)}.",
+        )
+    return wished
+
+
+def _reading(form: PoseForm, written: _Written) -> Reading:
+    """The form's units, but for those that the line itself says."""
+    length = written.length if written.length in UNITS_M else form.unit
+    rotation = form.rotation
+    if written.angle == "deg" and rotation == "rotation-vector":
+        rotation = "rotation-vector-deg"
+    if written.angle == "rad" and rotation.endswith("-deg"):
+        rotation = f"{rotation.removesuffix('-deg')}-rad"
+    return Reading(rotation, length or "m")
+
+
+def _check_size(numbers: FloatArray, reading: Reading, where: str) -> None:
+    """Refuses what is in another unit than it is taken to be."""
+    away_m = UNITS_M[reading.unit] * float(np.abs(numbers[:3]).max())
+    if away_m > _FAR_M:
+        raise DataError(
+            f"{where}: read in {reading.unit}, it is {away_m:.4g} m from the base.",
+            culprits=[where],
+            next_step="Write the unit behind the numbers, as X 400 mm, or name another form.",
+        )
+    is_radian = reading.rotation == "rotation-vector" or reading.rotation.endswith("-rad")
+    turned = float(np.abs(numbers[3:]).max())
+    if is_radian and turned > _TURNED_RAD:
+        raise DataError(
+            f"{where}: an angle of {turned:.4g} is too large for radians.",
+            culprits=[where],
+            next_step="Write the unit behind the numbers, as RX 12.5 deg, or name another form.",
+        )

@@ -1,0 +1,95 @@
+"""XML without document types, so without entities."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+from visioncal.core.documents.bounds import MAX_DEPTH, MAX_VALUES, too_deep, too_many
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes
+
+
+@dataclass
+class Element:
+    """An element.
+
+    Attributes:
+        tag: Its name.
+        line: Where it begins.
+        attributes: Its attributes.
+        text: The text directly inside it, without surrounding blanks.
+        children: The elements in it.
+    """
+
+    tag: str
+    line: int
+    attributes: dict[str, str]
+    text: str = ""
+    children: list["Element"] = field(default_factory=list)
+
+    def child(self, tag: str) -> "Element | None":
+        """Finds the first child of a name; None where there is none."""
+        return next((it for it in self.children if it.tag == tag), None)
+
+
+def read_xml(path: Path) -> Element:
+    """Reads an XML file.
+
+    Returns:
+        Its root.
+
+    Raises:
+        DataError: It is missing, no XML, declares a document type, or is too large or too deep.
+    """
+    data, where = read_bytes(path), str(path)
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    root = Element("", 0, {})
+    stack, texts = [root], [[""]]
+    count = 0
+
+    def counted(values: int) -> None:
+        nonlocal count
+        count += values
+        if count > MAX_VALUES:
+            raise too_many(where)
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        counted(5)  # values' worth of memory
+        if len(stack) > MAX_DEPTH:
+            raise too_deep(f"{where}, line {parser.CurrentLineNumber}")
+        element = Element(tag, parser.CurrentLineNumber, attributes)
+        stack[-1].children.append(element)
+        stack.append(element)
+        texts.append([])
+
+    def end(_: str) -> None:
+        stack.pop().text = "".join(texts.pop()).strip()
+
+    def text(part: str) -> None:
+        # Parts are a few kilobytes each: their words are counted before all are split.
+        counted(len(part.split()))
+        texts[-1].append(part)
+
+    def doctype(*_: object) -> None:
+        raise DataError(
+            f"{where}, line {parser.CurrentLineNumber}: a document type is declared; plain XML "
+            "without entities is needed.",
+            culprits=[where],
+            next_step="Remove the <!DOCTYPE ...>.",
+        )
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.CharacterDataHandler = text
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        words = expat.ErrorString(error.code)
+        raise DataError(
+            f"{where}, line {error.lineno} is no XML: {words}.", culprits=[where]
+        ) from error
+    except (ValueError, LookupError) as error:
+        raise DataError(f"{where} is no XML: {error}.", culprits=[where]) from error
+    return root.children[0]

@@ -1,0 +1,432 @@
+"""Reading and writing of files, and of the small TOML tables that describe boards and robots."""
+
+import difflib
+import hashlib
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from visioncal.core.errors import DataError
+from visioncal.core.temporary_files import aside_file
+
+
+def sha256(data: bytes) -> str:
+    """Computes the SHA-256 digest of `data`, in lower-case hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def write_atomically(path: Path | str, data: bytes | str) -> None:
+    """Writes a file so that a reader sees the old content or the new one, never a part.
+
+    The data goes to a file of another name in the same folder, is flushed to the disk, and takes
+    the place of `path` in one step. Killed before that, it leaves the other file behind, which the
+    next write in that folder removes.
+
+    Args:
+        path: The file to write; its folder must exist.
+        data: Its content; text is written as UTF-8 with its line ends as they are.
+
+    Raises:
+        DataError: The folder is missing or cannot be written.
+    """
+    with written_beside(Path(path)) as aside, aside.open("wb") as file:
+        file.write(data.encode("utf-8") if isinstance(data, str) else data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def written_beside(path: Path) -> Iterator[Path]:
+    """Gives an empty file in the same folder to write to, which takes the place of `path`.
+
+    Where something goes wrong it is removed, and `path` stays as it was.
+
+    Raises:
+        DataError: What is done within cannot be written; it names `path`.
+    """
+    with named_errors(path), aside_file(path.parent) as aside:
+        yield aside
+        aside.replace(path)
+
+
+def flush_folder(folder: Path) -> None:
+    """Waits until the names in a folder are on the disk; Windows has no way to ask for it."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def named_errors(path: Path) -> Iterator[None]:
+    """Turns an error of the operating system into one that names the file.
+
+    Raises:
+        DataError: In its place.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be written: {error.strerror or error}.",
+            culprits=[str(path)],
+            next_step="Choose a folder that exists, can be written, and has room.",
+        ) from error
+
+
+def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
+    """Checks that nothing is overwritten without a word of the user.
+
+    Args:
+        path: What is to be written.
+        force: Whether the user allows that a file is replaced; a folder never is.
+        replaceable: Whether it could be allowed.
+
+    Raises:
+        DataError: `path` is there.
+    """
+    with named_errors(path):
+        # A link that leads nowhere is there, too.
+        there = path.exists() or path.is_symlink()
+        replaceable = replaceable and (path.is_file() or path.is_symlink())
+    if not there or (force and replaceable):
+        return
+    raise DataError(
+        f"{path} exists, and nothing is overwritten.",
+        culprits=[str(path)],
+        next_step="Choose another name, or replace the file with --force."
+        if replaceable
+        else "Choose another name.",
+    )
+
+
+# Up to these sizes files are read [bytes]: a larger one is of another kind, or broken. Thousands of
+# views fill a few megabytes of a table or of JSON; a description is written by hand.
+MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000
+# The largest sensors have 150 million pixels, of 16 bits each where nothing packs them.
+MOST_IMAGE_BYTES = 300_000_000
+# File systems take no longer name [bytes].
+_LONGEST_NAME = 255
+# Matrices in lists in tables need six.
+_DEEPEST = 40
+
+
+def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
+    """Reads a regular file: a pipe might never end, and a device never does.
+
+    Args:
+        path: The file.
+        most: Up to how many bytes it may have.
+
+    Raises:
+        DataError: It is missing, no regular file, too large, or cannot be read.
+    """
+    path = Path(path)
+    why_not = absence(path)
+    if why_not:
+        raise DataError(
+            f"{path} {why_not}.",
+            culprits=[str(path)],
+            next_step="Save what it gives as a file first."
+            if "regular" in why_not
+            else "Check the path and its spelling.",
+        )
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be read: {error.strerror or error}.", culprits=[str(path)]
+        ) from error
+    if len(data) > most:
+        raise DataError(
+            f"{path} has more than {most / 1e6:.0f} MB; a file of its kind is read up to that "
+            "size.",
+            culprits=[str(path)],
+            next_step="Check that it is the right file, or cut it into parts.",
+        )
+    return data
+
+
+def absence(path: Path) -> str:
+    """Says why there is no regular file at a path, after its name; empty where there is one."""
+    if any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_NAME for part in path.parts):
+        return f"has a name longer than {_LONGEST_NAME} bytes, as no file has"
+    try:
+        if path.is_file():
+            return ""
+        return "is no regular file" if path.exists() else "does not exist"
+    except (OSError, ValueError) as error:
+        words = error.strerror if isinstance(error, OSError) and error.strerror else error
+        return f"cannot be read: {words}"
+
+
+def is_inside(path: Path, folder: Path) -> bool:
+    """Tells whether a path that need not exist lies in a folder, wherever links lead."""
+    try:
+        path.exists()  # raises where a part of it is too long
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: links in a circle
+        return False
+
+
+def read_text_inside(folder: Path, name: str, most: int = MOST_BYTES) -> str:
+    """Reads a text file of a folder that someone else may have made; see `read_text`.
+
+    Raises:
+        DataError: As `read_text`, or it is a link that leads out of the folder.
+    """
+    if not is_inside(folder / name, folder):
+        raise DataError(
+            f"{folder / name} is a link that leads out of its folder, and is not followed.",
+            culprits=[str(folder / name)],
+            next_step="Copy the file into the folder.",
+        )
+    return read_text(folder / name, most)
+
+
+def read_text(path: Path | str, most: int = MOST_BYTES) -> str:
+    """Reads a UTF-8 text file, with or without a byte-order mark; line ends stay as they are.
+
+    Raises:
+        DataError: As `read_bytes`, or it is not UTF-8.
+    """
+    return decode_text(read_bytes(path, most), str(path))
+
+
+def decode_text(data: bytes, label: str) -> str:
+    """Decodes UTF-8 with or without a byte-order mark; `label` names its origin in errors.
+
+    Raises:
+        DataError: The bytes are not UTF-8.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise DataError(
+            f"{label}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text.",
+            culprits=[f"{label}, line {line}"],
+            next_step=save_as_utf8("LATIN1"),
+        ) from error
+
+
+def save_as_utf8(encoding: str) -> str:
+    """Words how a text file in another encoding is saved as UTF-8."""
+    return (
+        "Save the file as UTF-8: in Excel as the type `CSV UTF-8`, in an editor with that encoding "
+        f"under `Save as`, or with `iconv -f {encoding} -t UTF-8 OLD > NEW`."
+    )
+
+
+def read_toml(path: Path, label: str) -> dict[str, Any]:
+    """Reads a TOML file; `label` names it in errors.
+
+    Raises:
+        DataError: As `read_text` and `parse_toml`.
+    """
+    return parse_toml(read_text(path, MOST_TOML_BYTES), label)
+
+
+def parse_toml(text: str, label: str) -> dict[str, Any]:
+    """Parses TOML; `label` names its origin in errors.
+
+    Raises:
+        DataError: The text is not TOML; the message gives line and column. Or it is nested deeper
+            than any description is, or has a whole number of more than TOML's 64 bits.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(
+            f"{label} is not valid TOML: {error}.",
+            culprits=[label],
+            next_step='Text is written in "double quotes", lists in [brackets, like, this].',
+        ) from error
+    except RecursionError as error:
+        raise _too_deep(label) from error
+    except ValueError as error:
+        # Python itself refuses whole numbers of thousands of digits, and impossible dates.
+        raise DataError(f"{label} is not valid TOML: {error}.", culprits=[label]) from error
+    _check_toml(document, label)
+    return document
+
+
+def _check_toml(document: dict[str, Any], label: str) -> None:
+    """Checks depth and numbers without recursion; errors name the field."""
+    pending: list[tuple[str, object, int]] = [("", document, 1)]
+    while pending:
+        path, value, depth = pending.pop()
+        if depth > _DEEPEST:
+            raise _too_deep(f"{label}: {path[:80]}")
+        if isinstance(value, dict):
+            pending += [(f"{path}.{key}".lstrip("."), it, depth + 1) for key, it in value.items()]
+        elif isinstance(value, list):
+            pending += [(f"{path}[{at}]", it, depth + 1) for at, it in enumerate(value)]
+        elif isinstance(value, int) and value.bit_length() > 63:
+            raise DataError(
+                f"{label}: {path} has more than the 64 bits of a whole number of TOML.",
+                culprits=[f"{label}: {path}"],
+            )
+
+
+def _too_deep(where: str) -> DataError:
+    return DataError(
+        f"{where}: nested deeper than {_DEEPEST} levels, as no description is.", culprits=[where]
+    )
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Words a hint at the known names nearest to `word`; empty where none is near."""
+    names = {it.lower(): it for it in sorted(known)}
+    near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=0.6)
+    return f"Did you mean {' or '.join(names[it] for it in near)}?" if near else ""
+
+
+def one_line(text: str) -> str:
+    """Replaces by spaces what does not print, such as line ends."""
+    return "".join(it if it.isprintable() else " " for it in text)
+
+
+def natural(path: Path) -> tuple[object, ...]:
+    """Orders names as people do: `view2` before `view10`."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return tuple((int(it), "") if it.isascii() and it.isdecimal() else (-1, it) for it in parts)
+
+
+def some_of(names: Sequence[str], most: int = 8) -> str:
+    """Words a list, cut short: `a, b and 3 more`."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def find_described(
+    name_or_path: str,
+    *,
+    what: str,
+    shipped: Mapping[str, Path],
+    suffixes: tuple[str, ...],
+    folder: Path | None,
+) -> Path:
+    """Finds the file that describes a board or a robot.
+
+    Args:
+        name_or_path: A shipped name, or a path that ends in one of `suffixes`.
+        what: What is looked for, for messages: `target`, `robot`.
+        shipped: The files that come with visioncal, by name.
+        suffixes: The endings by which a path is told from a name.
+        folder: Relative paths start here; the working directory where None.
+
+    Raises:
+        DataError: The name is unknown or the file does not exist.
+    """
+    if name_or_path.lower().endswith(suffixes):
+        path = Path(name_or_path.replace("\\", "/"))
+        path = path if folder is None else folder / path
+        if path.is_file():
+            return path
+        raise DataError(
+            f"The {what} file {path} does not exist.",
+            culprits=[str(path)],
+            next_step="Check the path and its spelling."
+            if folder is None
+            else "Its path is relative to the file that names it.",
+        )
+    if name_or_path in shipped:
+        return shipped[name_or_path]
+    hint = did_you_mean(name_or_path, shipped)
+    raise DataError(
+        f"There is no {what} named {name_or_path!r}; the names are {', '.join(sorted(shipped))}.",
+        culprits=[name_or_path],
+        next_step=f"{hint} A file of your own is named by its path, "
+        f"ending in {' or '.join(suffixes)}.".strip(),
+    )
+
+
+@dataclass(frozen=True)
+class Table:
+    """Typed access to one table of a TOML or JSON document.
+
+    Every method raises DataError, naming the field, where the value is absent without a default,
+    of another type, or out of range.
+
+    Attributes:
+        content: The table as it was read.
+        label: Where it stands, for messages.
+    """
+
+    content: Mapping[str, Any]
+    label: str
+
+    def _value(self, key: str, default: object, needed: str) -> object:
+        value = self.content.get(key, default)
+        if value is None:
+            raise DataError(
+                f"{self.label}: {key} is missing; {needed} is needed.",
+                culprits=[f"{self.label}: {key}"],
+            )
+        return value
+
+    def refuse(self, key: str, value: object, needed: str) -> DataError:
+        """Builds the error for a field whose value does not serve."""
+        return DataError(
+            f"{self.label}: {key} is {value!r}; {needed} is needed.",
+            culprits=[f"{self.label}: {key}"],
+        )
+
+    def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
+        """Reads a finite number, above zero where `positive`."""
+        needed = "a number above 0" if positive else "a number"
+        value = self._value(key, default, needed)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.refuse(key, value, needed)
+        if not math.isfinite(value) or (positive and value <= 0):
+            raise self.refuse(key, value, needed)
+        return float(value)
+
+    def numbers(self, key: str, count: int) -> list[float]:
+        """Reads a list of so many finite numbers."""
+        needed = f"a list of {count} numbers"
+        values = self._value(key, None, needed)
+        if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
+            raise self.refuse(key, values, needed)
+        return [Table({key: value}, self.label).number(key) for value in values]
+
+    def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
+        """Reads a whole number from `low` to `high`."""
+        needed = f"a whole number from {low} to {high}"
+        value = self._value(key, default, needed)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.refuse(key, value, needed)
+        return value
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Reads a text."""
+        value = self._value(key, default, "a text")
+        if not isinstance(value, str):
+            raise self.refuse(key, value, "a text")
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        """Reads true or false."""
+        value = self._value(key, default, "true or false")
+        if not isinstance(value, bool):
+            raise self.refuse(key, value, "true or false")
+        return value
+
+    def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
+        """Reads one of a few words."""
+        needed = " or ".join(f'"{choice}"' for choice in choices)
+        value = self._value(key, default, needed)
+        if value not in choices:
+            raise self.refuse(key, value, needed)
+        return str(value)

@@ -1,0 +1,154 @@
+"""Rigid transforms as arrays: batched SE(3) for inner loops.
+
+Module boundaries speak `scipy.spatial.transform.RigidTransform`; inside the solvers and the
+estimator, batches are plain (m, 4, 4) arrays. Twists are (rotation [rad], translation [m]) and
+perturbations act on the right, in the local frame: `T * exp(twist)`.
+"""
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.core.types import FloatArray
+
+
+def invert(matrices: FloatArray) -> FloatArray:
+    """Inverts rigid transforms.
+
+    Args:
+        matrices: (..., 4, 4) `a_from_b`.
+
+    Returns:
+        (..., 4, 4) `b_from_a`.
+    """
+    inverse = np.zeros_like(matrices)
+    rotation_t = np.swapaxes(matrices[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = rotation_t
+    inverse[..., :3, 3] = -(rotation_t @ matrices[..., :3, 3, None])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Builds (..., 4, 4) transforms from (..., 3, 3) rotations and (..., 3) translations [m]."""
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    matrices = np.zeros((*shape, 4, 4))
+    matrices[..., :3, :3] = rotation
+    matrices[..., :3, 3] = translation
+    matrices[..., 3, 3] = 1.0
+    return matrices
+
+
+def skew(vectors: FloatArray) -> FloatArray:
+    """Builds the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
+    matrices = np.zeros((*vectors.shape, 3))
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    matrices[..., 0, 1], matrices[..., 0, 2] = -z, y
+    matrices[..., 1, 0], matrices[..., 1, 2] = z, -x
+    matrices[..., 2, 0], matrices[..., 2, 1] = -y, x
+    return matrices
+
+
+def exp(twists: FloatArray) -> FloatArray:
+    """Exponential map: (..., 6) twists (rotation [rad], translation [m]) to (..., 4, 4)."""
+    flat = RigidTransform.from_exp_coords(twists.reshape(-1, 6)).as_matrix()
+    return np.asarray(flat, dtype=float).reshape(*twists.shape[:-1], 4, 4)
+
+
+def log(matrices: FloatArray) -> FloatArray:
+    """Logarithm map: (..., 4, 4) transforms to (..., 6) twists, the inverse of `exp`."""
+    flat = RigidTransform.from_matrix(matrices.reshape(-1, 4, 4)).as_exp_coords()
+    return np.asarray(flat, dtype=float).reshape(*matrices.shape[:-2], 6)
+
+
+def adjoint(matrices: FloatArray) -> FloatArray:
+    """Adjoints, which carry twists between frames.
+
+    `a_from_b * exp(twist_b) = exp(adjoint(a_from_b) @ twist_b) * a_from_b`.
+
+    Args:
+        matrices: (..., 4, 4) `a_from_b`.
+
+    Returns:
+        (..., 6, 6) maps of (rotation, translation) twists from frame b to frame a.
+    """
+    rotation = matrices[..., :3, :3]
+    adjoints = np.zeros((*matrices.shape[:-2], 6, 6))
+    adjoints[..., :3, :3] = rotation
+    adjoints[..., 3:, 3:] = rotation
+    adjoints[..., 3:, :3] = skew(matrices[..., :3, 3]) @ rotation
+    return adjoints
+
+
+def inverse_right_jacobian(twists: FloatArray) -> FloatArray:
+    """Derivative of `log(exp(twist) * exp(step))` by the step, at zero.
+
+    The series in the adjoint `ad` of the twist with Bernoulli's numbers (Iserles, Munthe-Kaas,
+    Norsett and Zanna 2000, Lie-group methods, section 2), which converges for rotations under 2 pi
+    and is cut where it is exact to 1e-9 up to 0.5 rad. Beyond, it still points downhill, which is
+    all that a fit needs far from its minimum.
+
+    Args:
+        twists: (..., 6) twists (rotation [rad], translation [m]).
+
+    Returns:
+        (..., 6, 6) derivatives.
+    """
+    ad = np.zeros((*twists.shape[:-1], 6, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = skew(twists[..., :3])
+    ad[..., 3:, :3] = skew(twists[..., 3:])
+    squared = ad @ ad
+    identity = np.eye(6)
+    even = identity / 30240 - squared / 1209600
+    for coefficient in (-1 / 720, 1 / 12, 1.0):
+        even = coefficient * identity + squared @ even
+    return np.asarray(even + ad / 2)
+
+
+def nearest_rotation(matrices: FloatArray) -> FloatArray:
+    """Projects (..., 3, 3) matrices onto the nearest rotations in the Frobenius norm.
+
+    Method: Umeyama (1991), the orthogonal Procrustes solution with its determinant kept at +1.
+    """
+    u, _, vt = np.linalg.svd(matrices)
+    sign = np.ones(matrices.shape[:-1])
+    sign[..., -1] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * sign[..., None, :]) @ vt)
+
+
+def mean_transform(matrices: FloatArray) -> FloatArray:
+    """Mean of (m, 4, 4) transforms: chordal mean rotation and mean translation, as (4, 4)."""
+    return compose(
+        nearest_rotation(matrices[:, :3, :3].mean(axis=0)), matrices[:, :3, 3].mean(axis=0)
+    )
+
+
+def rotation_angle(matrices: FloatArray) -> FloatArray:
+    """Angles [rad] of (..., 3, 3) or (..., 4, 4) rotations, accurate near 0 and near pi."""
+    rotation = matrices[..., :3, :3]
+    sine = 0.5 * np.linalg.norm(
+        np.stack(
+            [
+                rotation[..., 2, 1] - rotation[..., 1, 2],
+                rotation[..., 0, 2] - rotation[..., 2, 0],
+                rotation[..., 1, 0] - rotation[..., 0, 1],
+            ],
+            axis=-1,
+        ),
+        axis=-1,
+    )
+    cosine = 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def distances(poses: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (m,) [m] and (m,) [rad] of (m, 4, 4) poses from another, or from one each."""
+    return (
+        np.linalg.norm(poses[:, :3, 3] - others[..., :3, 3], axis=1),
+        rotation_angle(invert(others) @ poses),
+    )
+
+
+def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """Distance between the origins [mm] and angle [deg] of two (4, 4) poses in one frame."""
+    between = invert(a) @ b
+    return 1e3 * float(np.linalg.norm(between[:3, 3])), float(np.rad2deg(rotation_angle(between)))

@@ -1,0 +1,74 @@
+"""What every closed-form hand-eye solver takes and gives.
+
+A view i pairs a robot pose `R_i` with a camera pose `C_i = cam_from_target`. Two transforms are
+unknown and obey `R_i @ X @ C_i = Z`:
+
+- eye-in-hand: `R_i = base_from_flange`, `X = flange_from_cam`, `Z = base_from_target`;
+- eye-to-hand: `R_i = flange_from_base`, `X = base_from_cam`, `Z = flange_from_target`.
+
+Two views i and j eliminate Z: `A @ X = X @ B` with `A = inv(R_j) @ R_i`, `B = C_j @ inv(C_i)`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.types import FloatArray
+
+FEWEST_VIEWS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """Both unknown transforms.
+
+    Attributes:
+        x: (4, 4) X: `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
+        z: (4, 4) Z: `base_from_target` or `flange_from_target` [m].
+    """
+
+    x: FloatArray
+    z: FloatArray
+
+
+Solver: TypeAlias = Callable[[FloatArray, FloatArray], HandEye]
+
+
+def checked(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Makes sure that the views can be paired and are numbers.
+
+    Args:
+        robot: (m, 4, 4) robot poses `R_i` [m].
+        camera: (m, 4, 4) `cam_from_target` of the same views [m].
+
+    Returns:
+        Both as float64.
+
+    Raises:
+        DataError: The shapes do not fit, or a pose has an entry that is not a finite number.
+        DegenerateError: There are fewer than two views.
+    """
+    robot, camera = np.asarray(robot, dtype=float), np.asarray(camera, dtype=float)
+    if robot.shape != camera.shape or robot.shape[1:] != (4, 4):
+        raise DataError(
+            f"hand-eye: robot poses of shape {robot.shape} and camera poses of shape "
+            f"{camera.shape} cannot be paired; both must be (views, 4, 4)."
+        )
+    if len(robot) < FEWEST_VIEWS:
+        raise DegenerateError(
+            f"hand-eye: {len(robot)} views were given; a relative motion needs at least "
+            f"{FEWEST_VIEWS}, and a full solution 3 with two different rotation axes.",
+            next_step="Add views that are tilted about different axes.",
+        )
+    if not (np.isfinite(robot).all() and np.isfinite(camera).all()):
+        finite = np.isfinite(robot).all(axis=(1, 2)) & np.isfinite(camera).all(axis=(1, 2))
+        rows = ", ".join(str(row) for row in np.flatnonzero(~finite))
+        raise DataError(
+            f"hand-eye: the poses in rows {rows} (counted from 0) are not finite numbers.",
+            culprits=[f"row {row}" for row in np.flatnonzero(~finite)],
+            next_step="Leave these views out, or mend their poses.",
+        )
+    return robot, camera

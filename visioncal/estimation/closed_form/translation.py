@@ -1,0 +1,80 @@
+"""The step that most solvers share: both translations and Z, once X's rotation is known.
+
+The equation is (A_R - I) t_X = R_X t_B - t_A of Tsai and Lenz (1989), eq. 15, which later authors
+share, over all pairs of views. Where rotations agree, a pair's residual is the difference between
+what both views say about the place of one point of the target, so the sum over all pairs is m
+times the scatter of m places about their mean: linear in the number of views.
+
+Noise makes the choice of that point matter. At the target's origin the robot's rotation noise has
+the lever from target to flange; at the camera's centre, to which t_B amounts, the camera's has
+the same lever. Of the points between both, the one is taken that the views place most repeatably.
+"""
+
+import numpy as np
+
+from visioncal.core.transforms import compose, nearest_rotation
+from visioncal.core.types import FloatArray
+from visioncal.estimation.closed_form.handeye import HandEye
+from visioncal.estimation.closed_form.leastsquares import smallest_solution
+
+# A direction that the views turn by less than this (root mean square) shows the robot's noise,
+# which would move X by metres; noise is up to 0.5 mrad, useful motion begins at 10 mrad.
+_SMALLEST_TURN_RAD = 2e-3
+
+
+def mean_camera(camera: FloatArray) -> FloatArray:
+    """The (3,) mean of the camera's centres in the target frame [m] of (m, 4, 4) poses."""
+    m = len(camera)
+    rotation, translation = camera[:, :3, :3], camera[:, :3, 3]
+    return np.asarray(translation.reshape(3 * m) @ rotation.reshape(3 * m, 3) / -m)
+
+
+def complete(
+    robot: FloatArray,
+    camera: FloatArray,
+    rotation_x: FloatArray,
+    rotation_z: FloatArray | None = None,
+) -> HandEye:
+    """Finds what X's rotation leaves open, by least squares over all pairs of views.
+
+    Args:
+        robot: (m, 4, 4) robot poses `R_i` [m].
+        camera: (m, 4, 4) `cam_from_target` [m].
+        rotation_x: (3, 3) rotation of X.
+        rotation_z: (3, 3) rotation of Z; absent, it is the chordal mean of `R_i X C_i`.
+
+    Returns:
+        X and Z. Components of X's translation that the motion does not show are zero.
+    """
+    m = len(robot)
+    turns = robot[:, :3, :3]
+    towards = mean_camera(camera)
+    # Column 0 is for the target's origin; column 1 is what a step from it to the camera adds.
+    seen = np.empty((m, 3, 2))
+    seen[:, :, 0] = camera[:, :3, 3]
+    seen[:, :, 1] = camera[:, :3, :3] @ towards
+    places = turns @ (rotation_x @ seen)
+    places[:, :, 0] += robot[:, :3, 3]
+
+    mean_turn, mean_place = turns.sum(axis=0) / m, places.sum(axis=0) / m
+    spread = (turns - mean_turn).reshape(3 * m, 3)
+    scatter = (places - mean_place).reshape(3 * m, 2)
+    cut = m * _SMALLEST_TURN_RAD**2
+    shifts = -smallest_solution(spread.T @ spread, spread.T @ scatter, cut)
+    step = _steadiest_step(scatter + spread @ shifts)
+
+    translation_x = shifts[:, 0] + step * shifts[:, 1]
+    if rotation_z is None:
+        rotation_z = nearest_rotation((turns @ rotation_x @ camera[:, :3, :3]).sum(axis=0))
+    place = mean_place[:, 0] + step * mean_place[:, 1] + mean_turn @ translation_x
+    translation_z = place - rotation_z @ (step * towards)
+    return HandEye(compose(rotation_x, translation_x), compose(rotation_z, translation_z))
+
+
+def _steadiest_step(scatter: FloatArray) -> float:
+    """The step from 0 to 1 that makes column 0 + step * column 1 of (n, 2) residuals shortest."""
+    square = float(scatter[:, 1] @ scatter[:, 1])
+    if square == 0.0:
+        return 0.5
+    step = -float(scatter[:, 0] @ scatter[:, 1]) / square
+    return min(max(step, 0.0), 1.0)

@@ -1,0 +1,100 @@
+"""Which errors of an arm the stops tell, which any posture would, and what would have to move.
+
+Slopes are taken in units of the noise by rows and of the errors' own size by columns, and the
+frames at both ends of the chain, of which nothing is known, are taken out. A singular value is then
+how much better the stops know a direction than it was known before: over one, it is told.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+
+# Directions that move the pose by less than this share of the best told move nothing.
+LEAST_SHARE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What stops tell of an arm.
+
+    Attributes:
+        columns: How many values are carried: the frames' and the arm's errors.
+        identifiable: How many of them, or of their combinations, any postures tell apart.
+        told: How many of them the stops tell better than they were known before.
+        values: (L,) singular values of the arm's part of what is told, in descending order.
+        missing: (p, k) the k directions of the arm's errors that are identifiable and not told.
+    """
+
+    columns: int
+    identifiable: int
+    told: int
+    values: FloatArray
+    missing: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """How what is seen moves with the frames at both ends and the arm's errors.
+
+    Attributes:
+        frames: (r, f) by the frames.
+        arm: (r, p) by the arm's errors, each in its own size.
+    """
+
+    frames: FloatArray
+    arm: FloatArray
+
+    def free(self) -> tuple[int, FloatArray]:
+        """How many directions of the frames show, and (r, p) what of the arm they cannot imitate.
+
+        Both are exact where nothing is known of the frames.
+        """
+        scale = np.linalg.norm(self.frames, axis=0)
+        shown = scale > LEAST_SHARE * scale.max()
+        basis, sizes, _ = np.linalg.svd(self.frames[:, shown] / scale[shown], full_matrices=False)
+        basis = basis[:, sizes > LEAST_SHARE * sizes[0]]
+        return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
+
+
+def what_is_told(stops: Slopes, anywhere: Slopes) -> Told:
+    """Counts what stops tell, and what any stops could.
+
+    Args:
+        stops: Slopes at the stops.
+        anywhere: Slopes at postures all over the workspace.
+    """
+    most, free = anywhere.free()
+    sizes, turned = right_vectors(free)
+    can = turned[sizes > LEAST_SHARE * sizes[0]]
+    seen, values, here = _told(stops)
+    # What is identifiable and not among what is told; both are spanned by unit vectors.
+    missing = np.linalg.svd(can.T - here.T @ (here @ can.T), full_matrices=False)[0]
+    return Told(
+        columns=stops.frames.shape[1] + stops.arm.shape[1],
+        identifiable=most + len(can) + stops.frames.shape[1] - anywhere.frames.shape[1],
+        told=seen + len(values),
+        values=values,
+        missing=missing[:, : max(len(can) - len(values), 0)],
+    )
+
+
+def count_told(slopes: Slopes) -> int:
+    """How many values and combinations are told better than they were known before."""
+    seen, values, _ = _told(slopes)
+    return seen + len(values)
+
+
+def _told(slopes: Slopes) -> tuple[int, FloatArray, FloatArray]:
+    """Directions of the frames, and values and directions (k, p) of the arm that are told."""
+    seen, free = slopes.free()
+    sizes, turned = right_vectors(free)
+    return seen, sizes[sizes > 1.0], turned[sizes > 1.0]
+
+
+def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Singular values (k,) of an (r, k) matrix, zeros among them, and (k, k) right vectors."""
+    padded = np.vstack([matrix, np.zeros((matrix.shape[1],) * 2)])
+    _, sizes, turned = np.linalg.svd(np.linalg.qr(padded, mode="r"))
+    return sizes, turned

@@ -1,0 +1,169 @@
+"""What of an arm cannot be told, in words: by any stops, and by these."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.estimation.identifiability import LEAST_SHARE, Slopes, right_vectors
+from visioncal.estimation.parameters import Parameter
+from visioncal.robot import Robot, parallel_axes
+
+# Entries of a null direction below this share of its largest are rounding.
+_NOTHING = 1e-6
+# How much of a direction a parameter must make up, as a share of the most, to be named with it.
+_NAMED_SHARE, _MOST_NAMED = 0.5, 3
+_WORDS = {
+    "theta": "offset",
+    "d": "length d",
+    "a": "length a",
+    "alpha": "twist alpha",
+    "beta": "twist beta",
+    "ratio": "gear ratio",
+    "sine": "eccentricity (sine)",
+    "cosine": "eccentricity (cosine)",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Null:
+    """What changes of a table's numbers no stops of the arm can tell.
+
+    Attributes:
+        directions: (r, k) reduced to row echelon form: each but for a few numbers is zero.
+        frames: (12, r) how the frames of the base and of what the arm carries make up for each.
+    """
+
+    directions: FloatArray
+    frames: FloatArray
+
+
+def null_of(slopes: Slopes) -> Null:
+    """Finds what no stops can tell.
+
+    Args:
+        slopes: By the frames and by the table's numbers, at postures all over the workspace.
+    """
+    _, free = slopes.free()
+    sizes, turned = right_vectors(free)
+    directions = _echelon(turned[sizes <= LEAST_SHARE * sizes[0]])
+    made_up = np.linalg.lstsq(slopes.frames, slopes.arm @ directions.T, rcond=LEAST_SHARE)[0]
+    return Null(directions, np.asarray(made_up))
+
+
+def _echelon(rows: FloatArray) -> FloatArray:
+    """Reduced row echelon form of (r, k) independent rows, the largest pivots first."""
+    rows = rows.copy()
+    for at in range(len(rows)):
+        left = np.abs(rows[at:])
+        row, column = divmod(int(np.argmax(left)), left.shape[1])
+        rows[[at, at + row]] = rows[[at + row, at]]
+        rows[at] /= rows[at, column]
+        others = np.arange(len(rows)) != at
+        rows[others] -= np.outer(rows[others, column], rows[at])
+    return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
+
+
+def imitated(numbers: Slopes, arm: Slopes, directions: FloatArray) -> FloatArray:
+    """The least changes of a table's numbers that do what some errors of the arm do.
+
+    Args:
+        numbers: Slopes by the frames and by the table's numbers, at some postures.
+        arm: Slopes by the frames and by the arm's errors, at the same.
+        directions: (p, n) errors of the arm.
+
+    Returns:
+        (k, n) changes of the numbers, in the units of their slopes.
+    """
+    (_, by_numbers), (_, by_arm) = numbers.free(), arm.free()
+    return np.asarray(np.linalg.lstsq(by_numbers, by_arm @ directions, rcond=LEAST_SHARE)[0])
+
+
+def null_words(null: Null, parameters: Sequence[Parameter], robot: Robot) -> Iterator[str]:
+    """Says what no stops can tell, number by number.
+
+    Args:
+        null: What that is.
+        parameters: The table's numbers.
+        robot: The nominal arm.
+    """
+    for rows in _connected(null.directions):
+        involved = np.flatnonzero(null.directions[rows].any(axis=0)).tolist()
+        named = [parameters[at] for at in involved]
+        if len(named) == 1:
+            frame = _frame(null.frames[:, rows[0]])
+            yield f"{_thing(named[0], robot)} cannot be told from the {frame} frame"
+        elif len(rows) < len(named) - 1:
+            left = len(named) - len(rows)
+            yield f"of {_listed(named, robot)} only {left} combinations are told"
+        elif _is_sum(null.directions[rows][:, involved], named):
+            yield f"{_summed(named, robot)}: only their sum is told"
+        else:
+            yield f"{_listed(named, robot)}: only one combination of them is told"
+
+
+def _connected(directions: FloatArray) -> Iterator[list[int]]:
+    """Groups rows that have numbers in common, in the order of their first numbers."""
+    groups: list[tuple[list[int], set[int]]] = []
+    for row, numbers in enumerate(directions):
+        rows, columns = [row], set(np.flatnonzero(numbers).tolist())
+        for group in [it for it in groups if it[1] & columns]:
+            rows, columns = [*group[0], *rows], group[1] | columns
+            groups.remove(group)
+        groups.append((rows, columns))
+    for rows, _ in sorted(groups, key=lambda it: min(it[1])):
+        yield rows
+
+
+def _is_sum(directions: FloatArray, named: Sequence[Parameter]) -> bool:
+    """Whether all that is lost keeps the sum of numbers of one kind."""
+    alike = len({it.kind for it in named}) == 1
+    return alike and bool(np.abs(directions.sum(axis=1)).max() < _NOTHING)
+
+
+def _frame(frames: FloatArray) -> str:
+    """The end of the arm whose frame makes up for a change of it."""
+    base, tool = np.linalg.norm(frames.reshape(2, 6), axis=1)
+    return "tool" if tool > base else "base"
+
+
+def _summed(named: Sequence[Parameter], robot: Robot) -> str:
+    joints = [it.joint for it in named]
+    numbers = ", ".join(str(it + 1) for it in joints)
+    between = parallel_axes(robot)[joints[0] : joints[-1]]
+    why = " (parallel axes)" if between.all() else ""
+    return f"the {_plural(named[0])} of joints {numbers}{why}"
+
+
+def _plural(parameter: Parameter) -> str:
+    first, *rest = _WORDS[parameter.kind].split(" ")
+    return " ".join([f"{first}s", *rest])
+
+
+def _thing(parameter: Parameter, robot: Robot) -> str:
+    return f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
+
+
+def joint_words(joint: int, robot: Robot) -> str:
+    """A joint by its number and its name."""
+    return f"joint {joint + 1} ({robot.joint_names[joint]})"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words one after the other, with an `and` before the last."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _listed(named: Sequence[Parameter], robot: Robot) -> str:
+    return listed([_thing(it, robot) for it in named])
+
+
+def dominant_words(changes: FloatArray, parameters: Sequence[Parameter], robot: Robot) -> str:
+    """Names the numbers that make up most of (k, n) changes of a table, in units of their size."""
+    sizes = np.linalg.norm(changes, axis=1)
+    largest = np.argsort(-sizes, kind="stable")[:_MOST_NAMED].tolist()
+    kept = sorted(at for at in largest if sizes[at] >= _NAMED_SHARE * sizes.max())
+    words = [_thing(parameters[at], robot) for at in kept]
+    return listed([*words, "others"] if len(words) < changes.shape[1] else words)

@@ -1,6 +1,0 @@
-"""Results in other people's formats: one file a family, one entry a format in the registry."""
-
-from visioncal.exports.content import Load, Selection
-from visioncal.exports.registry import EXPORT_FORMATS, Document, document, export
-
-__all__ = ["EXPORT_FORMATS", "Document", "Load", "Selection", "document", "export"]

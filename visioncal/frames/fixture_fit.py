@@ -1,0 +1,240 @@
+"""What all ways to place a fixture by points share: its covariance, its doubts, its words."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.number_format import figure
+from visioncal.core.types import FloatArray, Mask
+from visioncal.estimation.group_outliers import Agreement
+from visioncal.estimation.groups import State
+from visioncal.estimation.observability import Direction
+from visioncal.estimation.placing import worst_of
+from visioncal.frames.measured import MeasuredPoints
+from visioncal.frames.verdicts import (
+    Doubt,
+    disputed,
+    noisy,
+    off_words,
+    placed_name,
+    verdict_of,
+    weak_directions,
+)
+from visioncal.results import Edge, Frame, Observation
+
+
+@dataclass(frozen=True)
+class FixtureOptions:
+    """Where doubt begins and where trust ends: (check, bad) limits.
+
+    Attributes:
+        sigma_mm: Predicted sigma of the fixture's worst offset, amid its points [mm].
+        sigma_deg: The same of its rotation [deg]: 0.1 deg are half a millimetre over 300.
+        noise_mm: Noise of a touch per axis [mm]; a careful hand repeats to 0.1 mm or better.
+        points: Points of a drawing in the fit; with fewer none could be told wrong.
+    """
+
+    sigma_mm: tuple[float, float] = (0.5, 2.0)
+    sigma_deg: tuple[float, float] = (0.1, 0.4)
+    noise_mm: tuple[float, float] = (0.5, 3.0)
+    points: int = 4
+
+
+@dataclass(frozen=True)
+class Words:
+    """How messages speak of what points are measured by.
+
+    Attributes:
+        things: What that is.
+        again: What to do about some that contradict each other, as a sentence.
+        noisy: What makes them noisy and what to do about it, likewise.
+        weak: What to do about a direction that is known badly, likewise.
+        side: From which side they were measured, behind the words `the side that`.
+    """
+
+    things: str = "touches"
+    again: str = "Touch each once more."
+    noisy: str = (
+        "Touch again with a sharp tip, and check the tool; an arm that was never calibrated is "
+        "off by a millimetre from posture to posture."
+    )
+    weak: str = (
+        "Touch points that are farther apart, or more of them; a tip that is known better "
+        "helps where all touches share its error."
+    )
+    side: str = "the tool came from"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is known beside the points.
+
+    Attributes:
+        touch_noise_m: What a touch is known to repeat to, per axis [m]; None where unknown.
+        doubts: Reasons that lie in what the points were measured with.
+        details: Figures of that, for the record.
+        options: Where doubt begins.
+        words: For what the points are measured by.
+    """
+
+    touch_noise_m: float | None = None
+    doubts: tuple[Doubt, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    options: FixtureOptions = field(default_factory=FixtureOptions)
+    words: Words = field(default_factory=Words)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fixture's fit to n points, whatever is known of them.
+
+    Attributes:
+        measured: The points.
+        labels: (n,) what the record calls them.
+        names: (n,) what messages call them: `Touch 3`, `Point P3`.
+        matrix: (4, 4) `base_from_fixture`.
+        covariance: (6, 6) of its right perturbation, what the points share included.
+        centre: (3,) amid the points, in the fixture [m].
+        agrees: (n,) which points the answer was made from.
+        doubtful: (n,) of which some are wrong, while nothing tells which: all are used.
+        explained: Whether what is stated of a touch explains those that are used.
+        reasons: (n,) what is wrong with each; empty where nothing is.
+        residuals_m: (n,) how far off each is [m].
+        noise_m: Noise of a touch per axis [m].
+        sigma_95_m: Its 95 % interval [m]; (0, inf) where nothing tells.
+    """
+
+    measured: MeasuredPoints
+    labels: tuple[str, ...]
+    names: tuple[str, ...]
+    matrix: FloatArray
+    covariance: FloatArray
+    centre: FloatArray
+    agrees: Mask
+    doubtful: Mask
+    explained: bool
+    reasons: tuple[str, ...]
+    residuals_m: FloatArray
+    noise_m: float
+    sigma_95_m: tuple[float, float]
+
+    @property
+    def worst(self) -> tuple[Direction, Direction]:
+        """The worst known offset, amid the points, and the worst known rotation."""
+        return worst_of(self.matrix, self.covariance, "fixture", "base", self.centre)
+
+    def praise(self, things: str) -> str:
+        """What speaks for the answer, as a sentence about touches or other things."""
+        offset, rotation = self.worst
+        return (
+            f"{int(self.agrees.sum())} {things} agree to {figure(1e3 * self.noise_m)} mm per axis, "
+            f"and {offset.words}, the worst direction, is known to {figure(1e3 * offset.sigma)} "
+            f"mm; {rotation.words} to {figure(np.rad2deg(rotation.sigma))} deg."
+        )
+
+
+def reasons_of(
+    agreement: Agreement[State], residuals_m: FloatArray, causes: Sequence[str]
+) -> list[str]:
+    """Says what is wrong with each of n points; empty where nothing is.
+
+    Args:
+        agreement: Of the points.
+        residuals_m: (n,) how far off each is [m].
+        causes: (n,) what makes each one disagree, if it does.
+    """
+    words = []
+    for at in range(len(residuals_m)):
+        off = off_words(
+            float(residuals_m[at]), float(agreement.surprise[at]), float(agreement.limit[at])
+        )
+        if agreement.doubtful[at]:
+            words.append(f"{off}: one of those that contradict each other")
+        else:
+            words.append("" if agreement.agrees[at] else f"{off}: {causes[at]}")
+    return words
+
+
+def fixture_frame(
+    fitted: Fitted,
+    kinds: Sequence[str],
+    method: str,
+    more: Sequence[Doubt],
+    details: Mapping[str, Any],
+    setting: Setting,
+) -> Frame:
+    """Puts the answer together.
+
+    Args:
+        fitted: The fit.
+        kinds: (n,) what was touched; empty where points have no kinds.
+        method: How the answer was obtained, in words.
+        more: Doubts of this method's own.
+        details: Figures of this method's own.
+        setting: What is known beside the points.
+    """
+    doubts = [*_doubts(fitted, setting), *more, *setting.doubts]
+    offset, rotation = fitted.worst
+    used = fitted.residuals_m[fitted.agrees]
+    noise_95 = [1e3 * it for it in fitted.sigma_95_m]
+    return Frame(
+        Edge(fitted.matrix, fitted.covariance),
+        True,
+        method,
+        fitted.measured.source,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        1e3 * float(np.sqrt(np.mean(used**2))),
+        1e3 * fitted.noise_m,
+        _observations(fitted, kinds),
+        verdict_of(doubts, fitted.praise(setting.words.things)),
+        {
+            **({"noise_95_mm": noise_95} if np.isfinite(noise_95).all() else {}),
+            "worst": {
+                "offset": offset.words,
+                "offset_sigma_mm": 1e3 * offset.sigma,
+                "rotation": rotation.words,
+                "rotation_sigma_deg": float(np.rad2deg(rotation.sigma)),
+            },
+            **details,
+            **setting.details,
+        },
+    )
+
+
+def _observations(fitted: Fitted, kinds: Sequence[str]) -> tuple[Observation, ...]:
+    return tuple(
+        Observation(
+            fitted.labels[at],
+            used=bool(fitted.agrees[at]),
+            reason=fitted.reasons[at],
+            kind=kinds[at],
+            residual_mm=1e3 * float(fitted.residuals_m[at]),
+        )
+        for at in range(len(fitted.labels))
+    )
+
+
+def _doubts(fitted: Fitted, setting: Setting) -> list[Doubt]:
+    names = [
+        placed_name(name, place)
+        for name, place in zip(fitted.names, fitted.measured.places, strict=True)
+    ]
+    return [
+        *disputed(names, fitted.reasons, fitted.agrees, fitted.doubtful, setting.words.again),
+        *noisy(
+            1e3 * fitted.noise_m,
+            setting.options.noise_mm,
+            setting.words.noisy,
+            explained=fitted.explained,
+            things=setting.words.things,
+        ),
+        *weak_directions(
+            fitted.worst,
+            setting.options.sigma_mm,
+            setting.options.sigma_deg,
+            setting.words.weak,
+        ),
+    ]

@@ -1,0 +1,111 @@
+"""A fixture from touches of its origin, its x axis and its xy plane."""
+
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+import numpy as np
+
+from visioncal.core.types import Mask
+from visioncal.estimation.features import (
+    FEATURE_KINDS,
+    FeatureFit,
+    FeatureKind,
+    FeatureTouches,
+    fit_features,
+)
+from visioncal.estimation.placing import TOUCH_NOISE_M
+from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame, reasons_of
+from visioncal.frames.measured import MeasuredPoints
+from visioncal.frames.verdicts import Doubt
+from visioncal.results import Frame
+
+# Touches of each feature twice leave so many numbers to spare. Fewer agree too well by chance to
+# tell the noise: a single one is within a tenth of its sigma in one fixture of twelve.
+_TELLING = 6
+_CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
+_THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
+
+
+def featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:
+    """Finds the fixture whose origin, x axis and xy plane were touched.
+
+    Args:
+        measured: Where they were touched.
+        kinds: (n,) what was touched, of `FEATURE_KINDS`.
+        setting: What is known beside.
+
+    Returns:
+        `base_from_fixture`.
+
+    Raises:
+        DataError: A kind is missing, or the touches contradict each other.
+        DegenerateError: They leave a direction open.
+    """
+    touches = FeatureTouches(
+        measured.labels,
+        cast("tuple[FeatureKind, ...]", tuple(kinds)),
+        measured.points,
+        measured.scattered,
+    )
+    expected = setting.touch_noise_m
+    if expected is None and len(measured) == len(FEATURE_KINDS):
+        # One of each kind leaves nothing to tell the noise by.
+        expected = TOUCH_NOISE_M
+    fitted = _fitted(fit_features(touches, expected), measured, setting)
+    counts = ", ".join(f"{kinds.count(it)} {it}" for it in FEATURE_KINDS)
+    return fixture_frame(
+        fitted, kinds, f"{counts} touches", tuple(_doubts(fitted, kinds, setting)), {}, setting
+    )
+
+
+def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted:
+    agreement, matrix = fit.agreement, fit.base_from_fixture
+    noise_m = agreement.fit.sigma
+    if agreement.fit.freedom < _TELLING:
+        noise_m = max(noise_m, _expected_m(setting))
+    agrees = agreement.agrees
+    away = np.linalg.norm(fit.residuals, axis=1)
+    return Fitted(
+        measured,
+        measured.labels,
+        tuple(f"Touch {it}" for it in measured.labels),
+        matrix,
+        measured.carried(fit.by_points, np.full(len(measured), noise_m)),
+        np.asarray((measured.points[agrees].mean(axis=0) - matrix[:3, 3]) @ matrix[:3, :3]),
+        agrees,
+        agreement.doubtful,
+        agreement.explained,
+        tuple(reasons_of(agreement, away, [_CAUSE] * len(measured))),
+        away,
+        noise_m,
+        agreement.fit.sigma_95,
+    )
+
+
+def _doubts(fitted: Fitted, kinds: Sequence[str], setting: Setting) -> Iterator[Doubt]:
+    once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
+    assumed = (
+        f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
+        "assumed: say --touch-noise-mm as it is."
+        if setting.touch_noise_m is None and fitted.noise_m == TOUCH_NOISE_M
+        else ""
+    )
+    if len(once) == len(FEATURE_KINDS):
+        yield Doubt(
+            "Three touches leave nothing to check the fixture with. Touch each feature once more, "
+            f"elsewhere.{assumed}"
+        )
+    elif once:
+        verb = "was" if len(once) == 1 else "were"
+        yield Doubt(
+            f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks. "
+            f"Touch again, elsewhere.{assumed}"
+        )
+
+
+def _expected_m(setting: Setting) -> float:
+    return TOUCH_NOISE_M if setting.touch_noise_m is None else setting.touch_noise_m
+
+
+def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:
+    return sum(it == kind and used for it, used in zip(kinds, agrees.tolist(), strict=True))

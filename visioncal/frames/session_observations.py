@@ -1,0 +1,251 @@
+"""What a session's images show of its target, beside where the robot stood at each."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.stages.detect import detect, image_of
+from visioncal.calibration.stages.observed import by_reason
+from visioncal.calibration.stages.reported_poses import Reported, reported_poses
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, Progress, Rejection, Target
+from visioncal.frames.camera_chain import Eye
+from visioncal.frames.single_view import Parent, Sight, needs_robot
+from visioncal.results import HELD_BACK, Calibration
+from visioncal.results.session_match import check_mount, check_resolution
+from visioncal.robot import Robot
+from visioncal.session import Session, View
+from visioncal.session.loads import loads_of
+
+# A stated lens that differs by more of its focal length is another camera's: an estimate is
+# nearer.
+_OTHER_LENS = 0.03
+_NO_IMAGE = "it has no image"
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The images of a session, as the calibrated camera took them.
+
+    Attributes:
+        source: The session's name.
+        target: What the images are to show.
+        sights: Those that can be used, labelled `view 3`.
+        views: (m,) their views.
+        lost: Why other views cannot, by their numbers.
+        warnings: What is odd about the session, in sentences.
+    """
+
+    source: str
+    target: Target
+    sights: tuple[Sight, ...]
+    views: tuple[View, ...]
+    lost: Mapping[int, str]
+    warnings: tuple[str, ...]
+
+
+def sighting(
+    session: Session,
+    calibration: Calibration,
+    parent: Parent,
+    *,
+    among: Sequence[View] | None = None,
+    progress: Progress | None = None,
+) -> Sighting:
+    """Finds a session's target in its images.
+
+    Args:
+        session: Of the same camera as the calibration; it names the target.
+        calibration: The camera's.
+        parent: The frame that the target is to be placed in. Where the robot stands between, each
+            view needs its pose.
+        among: Those of its views to look at; all where None.
+        progress: Told after each image.
+
+    Returns:
+        The corners of each view that shows the target and has what else it needs.
+
+    Raises:
+        DataError: No view does, or the session is of another camera.
+    """
+    target = _checked(session, calibration)
+    asked = session.views if among is None else tuple(among)
+    poses, lost = _poses(session, calibration, parent, asked)
+    views = _usable(session, asked, target, lost)
+    seen = detect(session, progress=progress, among=views)
+    lost |= {it.view: it.reason for it in seen.rejections}
+    views = _usable(session, asked, target, lost)
+    check_resolution(session, calibration, seen.resolution)
+    sights = [
+        Sight(_label(it), seen.corners[it.number], poses.get(it.number), it.stop) for it in views
+    ]
+    return Sighting(
+        session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
+    )
+
+
+def pictured(
+    session: Session, calibration: Calibration, *, among: Sequence[View] | None = None
+) -> Sighting:
+    """Reads a session's images as they are: of several markers, to be placed in the base.
+
+    Args:
+        session: As for `sighting`; its target is one of the markers.
+        calibration: The camera's.
+        among: Those of its views to look at; all where None.
+
+    Returns:
+        The images of each view that can be read and has what else it needs.
+
+    Raises:
+        DataError: None can, or the session is of another camera.
+    """
+    target = _checked(session, calibration)
+    asked = session.views if among is None else tuple(among)
+    poses, lost = _poses(session, calibration, "base", asked)
+    sights = []
+    lost |= {it.number: _NO_IMAGE for it in asked if not it.image}
+    for view in _usable(session, asked, target, lost):
+        image = image_of(session, view)
+        if isinstance(image, Rejection):
+            lost[view.number] = image.reason
+            continue
+        check_resolution(session, calibration, (image.shape[1], image.shape[0]))
+        sights.append(Sight(_label(view), image, poses.get(view.number), view.stop))
+    views = _usable(session, asked, target, lost)
+    return Sighting(
+        session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
+    )
+
+
+def for_fits(session: Session) -> tuple[View, ...]:
+    """The views that a fit may use."""
+    return tuple(it for it in session.views if not it.holdout)
+
+
+def held_back(session: Session) -> dict[int, str]:
+    """The views that none may use, by their numbers, with the reason."""
+    return {it.number: HELD_BACK for it in session.views if it.holdout}
+
+
+def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArray | None:
+    """Where the flange was at a view, (4, 4), by the robot's model if need be; None if not said.
+
+    Raises:
+        DataError: The joints are not those of the model.
+    """
+    return _flange(session, calibration, (view,)).base_from_flange.get(view.number)
+
+
+def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
+    """What is odd about the session itself, or beside the calibration."""
+    known, stated = calibration.camera, session.camera
+    told = session.warnings
+    if calibration.arm_is_calibrated and any(it.joints_rad is None for it in session.views):
+        told = (
+            *told,
+            "The calibration is of a calibrated arm, but views come without joint angles: their "
+            "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too.",
+        )
+    if known is None or stated is None:
+        return told
+    off = stated.matrix - known.camera.matrix
+    if np.abs(off).max() <= _OTHER_LENS * known.camera.matrix[0]:
+        return told
+    fx, cx, of_fx, of_cx = (it.matrix[at] for it in (stated, known.camera) for at in (0, 2))
+    return (
+        *told,
+        f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
+        f"calibrated to {of_fx:.0f} and {of_cx:.0f}: is it the same camera? The calibrated lens "
+        "was used.",
+    )
+
+
+def without_label(error: DataError, sight: Sight) -> str:
+    """What is wrong with one image, as the reason that its view is not used."""
+    return error.message.removeprefix(f"{sight.label}: ").rstrip(".")
+
+
+def nothing_fits(shown: Sighting, lost: Mapping[int, str]) -> DataError:
+    """The error that no image shows the target as it should be."""
+    culprits = by_reason(lost)
+    return DataError(
+        f"session {shown.source!r}: no image shows target {shown.target.name} as it should be.",
+        culprits=culprits,
+        next_step=f"First: {culprits[0]}.",
+    )
+
+
+def _checked(session: Session, calibration: Calibration) -> Target:
+    check_mount(session, calibration)
+    if session.target is None:
+        raise DataError(
+            f"session {session.name!r} names no target to look for.",
+            culprits=["session.toml: target"],
+            next_step='Add target = "charuco_9x6_30mm", or what the images show.',
+        )
+    if session.targets:
+        names = ", ".join(session.targets)
+        raise DataError(
+            f"session {session.name!r} has several targets ({names}); one is looked for at a time.",
+            culprits=["session.toml: targets"],
+            next_step="Make a session with the rows of the one that is meant.",
+        )
+    return session.target
+
+
+def _poses(
+    session: Session, calibration: Calibration, parent: Parent, asked: tuple[View, ...]
+) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
+    """The robot's poses by view, and why views without one or without an image are of no use."""
+    lost = {it.number: _NO_IMAGE for it in asked if not (it.image or it.has_corners)}
+    if needs_robot(Eye.of(calibration), parent):
+        reported = _flange(session, calibration, asked)
+        lost = {it.view: it.reason for it in reported.rejections} | lost
+        return reported.base_from_flange, lost
+    there = {it.number: pose for it in asked if (pose := it.base_from_flange()) is not None}
+    return {view: np.asarray(it.as_matrix()) for view, it in there.items()}, lost
+
+
+def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...]) -> Reported:
+    """The robot's side of some views, through the calibrated arm where there is one."""
+    reported = reported_poses(replace(session, views=asked), _robot(session, calibration))
+    arm, poses = calibration.calibrated_robot, dict(reported.base_from_flange)
+    if arm is None or not calibration.arm_is_calibrated:
+        return reported
+    for view in asked:
+        joints = view.joints_rad
+        if joints is not None and len(joints) == arm.joint_count:
+            loads = loads_of([view.numbers])
+            poses[view.number] = calibration.standing(joints[None], loads)[0]
+    return replace(reported, base_from_flange=poses)
+
+
+def _robot(session: Session, calibration: Calibration) -> Robot | None:
+    """The robot that the session's joints are of; the calibration's where it names none."""
+    document = session.robot_document
+    return calibration.robot if document is None else Robot.from_document(document)
+
+
+def _usable(
+    session: Session, asked: Sequence[View], target: Target, lost: Mapping[int, str]
+) -> tuple[View, ...]:
+    """The views that nothing speaks against so far.
+
+    Raises:
+        DataError: There are none.
+    """
+    views = tuple(it for it in asked if it.number not in lost)
+    if views:
+        return views
+    culprits = by_reason(lost) or (f"all views: {HELD_BACK}",)
+    raise DataError(
+        f"session {session.name!r}: no view of {len(asked)} serves to place target {target.name}.",
+        culprits=culprits,
+        next_step=f"First: {culprits[0]}.",
+    )
+
+
+def _label(view: View) -> str:
+    return f"view {view.number}"

@@ -1,0 +1,165 @@
+"""One image of a target on a tool or a fixture: where it puts the target, and what moves that.
+
+base_from_target = base_from_cam * cam_from_target                         eye-to-hand
+base_from_target = base_from_flange * flange_from_cam * cam_from_target    eye-in-hand
+flange_from_target = flange_from_base * base_from_cam * cam_from_target    eye-to-hand
+flange_from_target = flange_from_cam * cam_from_target                     eye-in-hand
+
+The robot counts where it stands between parent and target: in the second and the third. Images of
+one stop share its error there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import Corners, FloatArray, Image
+from visioncal.frames.camera_chain import Eye, checked_pose
+from visioncal.frames.target_in_image import SeenTarget
+
+Parent: TypeAlias = Literal["base", "flange"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One image of a target.
+
+    Attributes:
+        label: What it is called in messages and results.
+        seen: The target's corners, or the (h, w) grey image to find them in.
+        base_from_flange: (4, 4) where the robot stood at the image, as it reported it; None where
+            no robot stands between parent and target.
+        stop: Number of the robot's stop, where stops are numbered; else images with the same pose
+            are of one.
+    """
+
+    label: str
+    seen: Corners | Image
+    base_from_flange: FloatArray | None = None
+    stop: int | None = None
+
+    @property
+    def stop_key(self) -> object:
+        """What tells the robot's stops apart; of an image without a pose, its label."""
+        if self.stop is not None:
+            return self.stop
+        return self.label if self.base_from_flange is None else self.base_from_flange.tobytes()
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where one image puts a target, for one of the poses that it allows.
+
+    Attributes:
+        matrix: (4, 4) `parent_from_target`.
+        pixels: (6, 6) covariance of its right perturbation by the pixels' noise.
+        by_flange: (6, 6) how it moves with the flange at this stop; zero where none is between. Of
+            k images of one stop it is sqrt(k) times as much: their mean then has the variance of
+            the error that they share.
+        by_common: (6, c) how it moves with what all images share: see `common_covariance`.
+    """
+
+    matrix: FloatArray
+    pixels: FloatArray
+    by_flange: FloatArray
+    by_common: FloatArray
+
+
+def common_covariance(eye: Eye, scale_sigma: float) -> FloatArray:
+    """(c, c) of what all images share: the camera's edge, its lens, the target's size, the arm."""
+    arm = eye.arm_basis(np.eye(4)).shape[1]
+    return np.asarray(block_diag(eye.covariance, [[scale_sigma**2]], np.eye(arm)))
+
+
+def needs_robot(eye: Eye, parent: Parent) -> bool:
+    """Whether the robot stands between the parent and what the camera sees."""
+    return (eye.mount == "eye-in-hand") == (parent == "base")
+
+
+def all_places(
+    eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
+) -> list[tuple[Place, ...]]:
+    """Carries what images of one target allow to the parent's frame; see `places`."""
+    stops = [it.stop_key for it in sights]
+    return [
+        places(eye, sight, look, parent, stops.count(stop))
+        for sight, look, stop in zip(sights, looks, stops, strict=True)
+    ]
+
+
+def places(
+    eye: Eye, sight: Sight, view: SeenTarget, parent: Parent, of_stop: int = 1
+) -> tuple[Place, ...]:
+    """Carries the poses that one image allows to the parent's frame.
+
+    Args:
+        eye: The calibrated camera.
+        sight: The image.
+        view: What was seen in it.
+        parent: The frame that the target is to be placed in.
+        of_stop: How many images are of its stop of the robot.
+
+    Raises:
+        DataError: The robot's pose is needed and missing, or it is none.
+    """
+    flange = sight.base_from_flange
+    if not needs_robot(eye, parent):
+        still = np.zeros((len(view.turns), 6, 6))
+        return _carried(eye, view, eye.edge, still, np.eye(4), of_stop)
+    if flange is None:
+        raise DataError(
+            f"{sight.label}: the robot stands between the {parent} and what the camera "
+            f"({eye.mount}) sees, and its pose is missing.",
+            culprits=[sight.label],
+            next_step="Give base_from_flange as the robot reported it when the image was taken.",
+        )
+    checked_pose(flange, f"{sight.label}: base_from_flange")
+    if parent == "base":
+        by_flange = adjoint(invert(eye.edge @ view.cam_from_target))
+        return _carried(eye, view, flange @ eye.edge, by_flange, flange, of_stop)
+    flange_from_cam = invert(flange) @ eye.edge
+    by_flange = -adjoint(invert(flange_from_cam @ view.cam_from_target))
+    return _carried(eye, view, flange_from_cam, by_flange, flange, of_stop)
+
+
+def _carried(
+    eye: Eye,
+    view: SeenTarget,
+    parent_from_cam: FloatArray,
+    by_flange: FloatArray,
+    base_from_flange: FloatArray,
+    of_stop: int,
+) -> tuple[Place, ...]:
+    arm = eye.arm_basis(base_from_flange)
+    by_edge = adjoint(invert(view.cam_from_target))
+    return tuple(
+        Place(
+            parent_from_cam @ pose,
+            view.covariance[at],
+            np.sqrt(of_stop) * by_flange[at],
+            np.concatenate(
+                [by_edge[at], view.by_lens[at], view.by_scale[at][:, None], by_flange[at] @ arm],
+                axis=1,
+            ),
+        )
+        for at, pose in enumerate(view.cam_from_target)
+    )
+
+
+def check_labels(sights: Sequence[Sight]) -> None:
+    """Refuses no image at all, and two by one name.
+
+    Raises:
+        DataError: So it is.
+    """
+    if not sights:
+        raise DataError("no image shows the target: at least one is needed.")
+    labels = [it.label for it in sights]
+    twice = sorted({it for it in labels if labels.count(it) > 1})
+    if twice:
+        raise DataError(f"two images are called {twice[0]!r}.", culprits=twice)

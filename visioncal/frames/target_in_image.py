@@ -1,0 +1,212 @@
+"""A look through a calibrated camera: a target's pose in one image, and what moves it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.stages.pnp import ViewPoses, measure_poses
+from visioncal.core.errors import DataError
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Camera, Corners, FloatArray, Image, IntArray, Target
+from visioncal.estimation.appearance import (
+    SCALE,
+    Appearance,
+    Compressed,
+    compress,
+    shape_basis,
+)
+from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.gating import gate
+from visioncal.estimation.linalg import covariance
+from visioncal.estimation.planar import determines_pose
+from visioncal.frames.camera_chain import Eye
+from visioncal.vision.finders import NotFound, find_target
+from visioncal.vision.finders.imaging import blur_at_corners, why_hard_to_see
+from visioncal.vision.targets import corner_positions, rotations
+
+# Corners scatter more than this by chance in one look of ten thousand.
+_FALSE_ALARM = 1e-4
+# Less than so many times the noise that was to be expected is counted without a word: light and
+# distance do that.
+_WORTH_A_WORD = 2.0
+# Wrong corners spoil the pose that they are judged by: so often it is made anew without them.
+_ROUNDS = 3
+# Edges wider than this hide an image's corners; the widest that detection takes.
+_MAX_BLUR_PX = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTarget:
+    """A target as one image shows it: c poses that it allows, the best by reprojection first.
+
+    Attributes:
+        cam_from_target: (c, 4, 4).
+        covariance: (c, 6, 6) of the right perturbations, by the pixels' noise alone.
+        by_lens: (c, 6, k) how each moves with the camera's intrinsics.
+        by_scale: (c, 6) how each moves with the target's size, as a share of it.
+        scale_sigma: How well the size is known, as a share of it.
+        turns: (c,) which of the target's own symmetries each has applied.
+        warnings: What is odd about the image, in sentences.
+    """
+
+    cam_from_target: FloatArray
+    covariance: FloatArray
+    by_lens: FloatArray
+    by_scale: FloatArray
+    scale_sigma: float
+    turns: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+
+def see(
+    eye: Eye, seen: Corners | Image, target: Target, label: str, sigma_px: float | None = None
+) -> SeenTarget:
+    """Finds the poses of a target in one image.
+
+    Args:
+        eye: The calibrated camera.
+        seen: The target's corners, or the (h, w) grey image to find them in.
+        target: What is seen.
+        label: What the image is called in messages.
+        sigma_px: Noise of a corner's coordinate [px]; where None, what is stated with the corners,
+            or else the calibration's. Corners that scatter significantly more count with what they
+            show, and a warning says so.
+
+    Raises:
+        DataError: The target is not in the image, its corners do not determine a pose, or they do
+            not fit any pose of it.
+    """
+    corners = seen if isinstance(seen, Corners) else _found(eye, seen, target, label)
+    _check(corners, target, label)
+    noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
+    with one_blas_thread():
+        poses, corners, squares = _fitted(eye.camera, corners, target, label, noise_px)
+        looks = [_slopes(eye.camera, poses, at, corners, target) for at in range(len(poses.turns))]
+    noise_px, warnings = _noise(noise_px, squares, 2 * len(corners.ids) - 6, label)
+    # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
+    variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
+    return SeenTarget(
+        np.array([it.cam_from_target[0] for it in looks]),
+        np.array([variance * covariance(it.information[0]) for it in looks]),
+        np.array([it.by_shared[0, :, :lens] for it in looks]),
+        np.array([_by_scale(it.by_shared[0, :, lens:], target) for it in looks]),
+        target.square_sigma_m / target.square_m,
+        poses.turns,
+        warnings,
+    )
+
+
+def check_size(eye: Eye, image: Image, label: str) -> None:
+    """Refuses an image of another size than the camera's.
+
+    Raises:
+        DataError: So it is.
+    """
+    width, height = eye.camera.resolution
+    if image.shape != (height, width):
+        shown = " x ".join(map(str, image.shape[1::-1] + image.shape[2:]))
+        raise DataError(
+            f"{label}: it has {shown} pixels, and the calibrated camera has {width} x {height}, "
+            "grey.",
+            culprits=[label],
+            next_step="Take the image with the same camera, binning and region as calibrated.",
+        )
+
+
+def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
+    check_size(eye, image, label)
+    seen = find_target(image, target)
+    if isinstance(seen, NotFound):
+        cause = why_hard_to_see(image, _MAX_BLUR_PX)
+        raise DataError(
+            f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
+            culprits=[label],
+        )
+    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
+    return Corners(0, seen.ids, seen.px, blur, seen.weights)
+
+
+def _check(corners: Corners, target: Target, label: str) -> None:
+    positions = corner_positions(target)
+    ids = corners.ids
+    if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):
+        raise DataError(
+            f"{label}: corners {ids.min()} to {ids.max()}, and target {target.name} has "
+            f"{len(positions)}.",
+            culprits=[label],
+        )
+    if not determines_pose(positions[ids]):
+        raise DataError(
+            f"{label}: {len(ids)} corners of target {target.name} do not determine its pose: it "
+            "takes four, of which two lie off every line.",
+            culprits=[label],
+        )
+
+
+def _fitted(
+    camera: Camera, corners: Corners, target: Target, label: str, noise_px: float
+) -> tuple[ViewPoses, Corners, float]:
+    """The poses, the corners that fit the best of them, and the sum of their squares [px^2]."""
+    positions = corner_positions(target)
+    for _ in range(_ROUNDS):
+        (poses,) = measure_poses({corners.view: corners}, [target], camera, noise_px)
+        stack = CornerStack.of({corners.view: corners}, positions)
+        residuals = _compressed(camera, stack, target, poses.cam_from_target[:1]).residuals
+        passed = gate(stack, residuals)
+        if passed.reasons:
+            reason = next(iter(passed.reasons.values()))
+            raise DataError(f"{label}: target {target.name}: {reason}.", culprits=[label])
+        if passed.is_open:
+            break
+        kept = passed.mask
+        corners = _chosen(corners, corners.ids[kept], np.flatnonzero(kept))
+    return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
+
+
+def _slopes(
+    camera: Camera, poses: ViewPoses, at: int, corners: Corners, target: Target
+) -> Compressed:
+    """One of the poses with all that moves it, under the numbering that it stands for."""
+    # Turned, corner i lies where corner p[i] was: what was seen as that one is i.
+    ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
+    order = np.argsort(ids)
+    turned = _chosen(corners, ids[order], order)
+    stack = CornerStack.of({turned.view: turned}, corner_positions(target))
+    return _compressed(camera, stack, target, poses.cam_from_target[at : at + 1])
+
+
+def _chosen(corners: Corners, ids: IntArray, rows: IntArray) -> Corners:
+    """Some of the corners, in another order and by other numbers."""
+    weights = None if corners.weights is None else corners.weights[rows]
+    return replace(corners, ids=ids, px=corners.px[rows], weights=weights)
+
+
+def _compressed(
+    camera: Camera, stack: CornerStack, target: Target, starts: FloatArray
+) -> Compressed:
+    basis = shape_basis(target)
+    return compress(stack, basis, Appearance(camera, np.zeros(basis.shape[2])), starts)
+
+
+def _by_scale(by_shape: FloatArray, target: Target) -> FloatArray:
+    """How a pose moves with the target's size: a rig has the size that its table says."""
+    return np.zeros(6) if target.kind == "points" else by_shape[:, SCALE]
+
+
+def _noise(
+    noise_px: float, squares: float, freedom: int, label: str
+) -> tuple[float, tuple[str, ...]]:
+    """The noise to count with: what is known, or what the corners show where that is more."""
+    limit = noise_px**2 * float(chi2_limit(_FALSE_ALARM, freedom))
+    shown = float(np.sqrt(squares / freedom))
+    # Rounding of exact corners is no scatter.
+    if squares <= limit or shown < 1e-6:
+        return noise_px, ()
+    if shown < _WORTH_A_WORD * noise_px:
+        return shown, ()
+    return shown, (
+        f"{label}: the corners scatter by {shown:.2g} px around the target's pose, and "
+        f"{noise_px:.2g} px was to be expected: look whether the image is sharp, and the target "
+        "flat and of the size that is stated.",
+    )

@@ -1,0 +1,272 @@
+"""What there is to export of a calibrated arm, and what a file of others cannot hold of it."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+from visioncal.estimation.workspace import postures
+from visioncal.interchange.exports.content import Selection
+from visioncal.interchange.exports.format import Takes
+from visioncal.interchange.exports.sources import Source
+from visioncal.results import Calibration, Verdict
+from visioncal.robot import (
+    CONVENTIONS,
+    Convention,
+    DHTable,
+    Robot,
+    parallel_axes,
+    table_from_document,
+    table_of,
+    unwritten,
+)
+from visioncal.robot.chain import IDENTITY_FUNCTION
+
+# Postures over which the worst error is looked for.
+_POSTURES = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class ArmContent:
+    """What a format of arms writes.
+
+    Attributes:
+        nominal: The arm as it was stated.
+        robot: The arm as it was calibrated.
+        origin: Where the result comes from, in one line.
+        verdict: Whether it can be trusted.
+        sigma_mm: Predicted standard deviation of a tool's place over the workspace, as
+            calibration.json has it; empty where it has none.
+        convention: In which form joints are tabulated, where that was said.
+        calibration_hash: What marks the arm for its driver, where that was said.
+        sag_mm: How far the flange of an arm whose joints bend stands off at the most under its own
+            weight [mm]; zero for a rigid one.
+        cold_c: Least and greatest temperature of its links [deg C], for one that drifts with it.
+        drift_mm: How far that moved its flange at the most, in one posture of the session [mm].
+    """
+
+    nominal: Robot
+    robot: Robot
+    origin: str
+    verdict: Verdict
+    sigma_mm: Mapping[str, float]
+    convention: Convention | None = None
+    calibration_hash: str | None = None
+    sag_mm: float = 0.0
+    cold_c: tuple[float, float] | None = None
+    drift_mm: float = 0.0
+
+    @property
+    def omitted(self) -> tuple[str, ...]:
+        """What no file holds of the arm, and what that costs."""
+        return tuple(it for it in (self.sagging, self.drifting) if it)
+
+    @property
+    def sagging(self) -> str:
+        """What no file holds of an arm whose joints bend, and what that costs; else empty."""
+        if not self.sag_mm:
+            return ""
+        return (
+            "its joints bend under load, which has no place in it: this is the arm without weight. "
+            f"Under its own it stands off by up to {self.sag_mm:.2g} mm (visioncal correct counts "
+            "that)"
+        )
+
+    @property
+    def drifting(self) -> str:
+        """What no file holds of an arm that drifts with its temperature; else empty."""
+        if self.cold_c is None:
+            return ""
+        low, high = (f"{it:.0f}" for it in self.cold_c)
+        links = f"links at {low} deg C" if low == high else f"links at {low} to {high} deg C"
+        return (
+            "it drifts with its temperature, which has no place in it: this is the arm with "
+            f"{links}. In one posture of the session its flange moved by up to {self.drift_mm:.2g} "
+            "mm as it warmed up (visioncal correct --temperatures counts that)"
+        )
+
+    @property
+    def notes(self) -> list[str]:
+        """Lines for a comment: where it comes from, its worth, and what it goes with."""
+        worth = f"verdict {self.verdict.status}"
+        if self.sigma_mm:
+            median, high = self.sigma_mm["median"], self.sigma_mm["p95"]
+            worth += f"; sigma over the workspace {median:.2g} mm, at 95 % of it under {high:.2g}"
+        return [
+            self.origin,
+            worth,
+            f"{self.robot.name}, calibrated: base_from_flange, the pose of {self.robot.tip} in the "
+            "base; the calibration's transforms go with this arm, not with the nominal one",
+            *self.omitted,
+        ]
+
+    @property
+    def nominal_table(self) -> DHTable:
+        """The nominal arm as a table, whose choices a table of the calibrated one keeps."""
+        if "convention" in self.nominal.document:
+            return table_from_document(self.nominal.document)
+        return table_of(self.nominal, "standard")
+
+    @property
+    def table(self) -> DHTable:
+        """The calibrated arm as a table; where nothing was said, in a form that has no leaps."""
+        nominal, form = self.nominal_table, self.convention
+        if form is None:
+            form = "hayati" if parallel_axes(self.nominal).any() else nominal.convention
+        return table_of(self.robot, form, like=nominal)
+
+    @property
+    def left_out(self) -> str:
+        """What a URDF or a table of others leaves out, and what that costs; empty for nothing."""
+        missing = unwritten(self.robot)
+        if not missing:
+            return ""
+        return (
+            f"gear ratio and eccentricity ({'; '.join(missing)}) have no place in it. A reader "
+            f"without them is off by up to {omission_mm(self.robot):.2g} mm"
+        )
+
+
+@dataclass(frozen=True)
+class ArmFormat:
+    """A form in which others read an arm.
+
+    Attributes:
+        name: As the command line has it.
+        words: What it is and who reads it, with its units, in one line.
+        write: Builds the document.
+        takes: What it can be told beside.
+        warn: Words what the user should know before the document serves; empty for nothing.
+    """
+
+    name: str
+    words: str
+    write: Callable[[ArmContent], str]
+    takes: frozenset[Takes] = frozenset()
+    warn: Callable[[ArmContent], tuple[str, ...]] = field(default=lambda _: ())
+
+
+def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmContent:
+    """Picks the arm that is to be exported.
+
+    Args:
+        source: A calibration.
+        selection: What is asked for.
+        form: The format that is to hold it.
+
+    Raises:
+        DataError: The source has no calibrated arm, or something was said for which the format
+            has no use.
+    """
+    check_said(selection, form)
+    nominal = source.robot if isinstance(source, Calibration) else None
+    calibrated = isinstance(source, Calibration) and source.arm_is_calibrated
+    if not isinstance(source, Calibration) or nominal is None or not calibrated:
+        raise _without_arm(source, form)
+    found: Mapping[str, Any] = source.stages["kinematics"]
+    return ArmContent(
+        nominal,
+        Robot.from_document(found["robot"]),
+        f"calibrated by visioncal from {source.session_name!r}, {source.created}",
+        source.verdict,
+        found.get("workspace_sigma_mm", {}),
+        None if selection.convention is None else _convention(selection.convention),
+        selection.calibration_hash,
+        _sag_mm(source),
+        *_drift(source),
+    )
+
+
+def _sag_mm(calibration: Calibration) -> float:
+    """How far the flange stands off under its own weight at worst, over the workspace [mm]."""
+    arm = calibration.calibrated_robot
+    if arm is None or "elastic" not in calibration.stages:
+        return 0.0
+    q = postures(arm)
+    away = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
+    return 1e3 * float(np.linalg.norm(away, axis=1).max())
+
+
+def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]:
+    """Temperatures of the links to which the arm belongs, and how far it drifted from that [mm]."""
+    if "thermal" not in calibration.stages:
+        return None, 0.0
+    model = calibration.drift
+    course = calibration.stages["thermal"]["course"]
+    cold_c = float(model.reference_c.min()), float(model.reference_c.max())
+    return cold_c, max(float(it["drift_mm"]) for it in course)
+
+
+def omission_mm(robot: Robot) -> float:
+    """How far the flange is off at worst without gear ratios and eccentricity [mm].
+
+    Over random postures within the joints' limits, at most a turn from zero.
+    """
+    none = np.array(IDENTITY_FUNCTION) - robot.chain.functions
+    none[:, 0] = 0.0
+    q = postures(robot, _POSTURES)
+    away: FloatArray = robot.base_from_flange(q) - robot.corrected(functions=none).base_from_flange(
+        q
+    )
+    return 1e3 * float(np.linalg.norm(away[:, :3, 3], axis=1).max())
+
+
+def check_said(selection: Selection, form: ArmFormat) -> None:
+    """Refuses what belongs to a transform, or to another format of arms.
+
+    Raises:
+        DataError: Something of the kind was said.
+    """
+    given = {
+        "--edge": selection.edge is not None,
+        "--inverse": selection.inverse,
+        "--parent": selection.parent is not None,
+        "--child": selection.child is not None,
+        "--number": selection.number is not None,
+        "--mass-kg and --cog-mm": selection.load is not None,
+        "--convention": selection.convention is not None and "convention" not in form.takes,
+        "--hash": selection.calibration_hash is not None and "hash" not in form.takes,
+        "--onto": selection.onto is not None,
+    }
+    said = [option for option, there in given.items() if there]
+    if said:
+        raise DataError(
+            f"{form.name} writes the calibrated arm and has no place for {', '.join(said)}.",
+            culprits=said,
+            next_step="Leave it out.",
+        )
+
+
+def _convention(name: str) -> Convention:
+    if name in CONVENTIONS:
+        return name
+    raise DataError(
+        f"There is no convention {name!r}; the names are {', '.join(CONVENTIONS)}.",
+        culprits=["--convention"],
+    )
+
+
+def _without_arm(source: Source, form: ArmFormat) -> DataError:
+    """Says why there is no calibrated arm, and how to get one."""
+    if not isinstance(source, Calibration):
+        why, step = "a file of frames has none", "Name the calibration instead"
+    elif "kinematics" in source.stages:
+        why = "this calibration kept the nominal one: no level of the arm's errors explained more"
+        step = (
+            "The nominal arm is what its own file says. For more than that, add stops all over the "
+            "workspace and calibrate again"
+        )
+    else:
+        why = "this calibration has none"
+        step = (
+            "Record q1_rad ... in views.csv, name [robot] model in session.toml, and run "
+            "visioncal calibrate SESSION"
+        )
+    return DataError(
+        f"{form.name} writes the calibrated arm, and {why}.",
+        culprits=[form.name],
+        next_step=f"{step}.",
+    )

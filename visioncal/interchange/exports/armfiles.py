@@ -1,0 +1,138 @@
+"""A calibrated arm as a file: URDF, joint table, the kinematics of UR's driver, and a chain."""
+
+import json
+
+import numpy as np
+
+from visioncal.core.transforms import log
+from visioncal.interchange.exports.arm import ArmContent, ArmFormat
+from visioncal.robot import (
+    DHTable,
+    corrected_tip,
+    corrected_urdf,
+    small_urdf,
+    table_toml,
+    ur_flange,
+    ur_kinematics_yaml,
+)
+
+# Such a way along an axis is no part of an arm: it leads to the common normal of two axes that are
+# nearly parallel [m].
+_FAR_M = 10.0
+# A flange is in its place within this, which no tool is mounted to [mm, deg].
+_EXACT = 1e-4
+# What stands in a file for an arm whose hash is not known: no controller has it.
+_NO_HASH = "calib_visioncal"
+
+
+def _notes(content: ArmContent) -> list[str]:
+    return [*content.notes, *([content.left_out] if content.left_out else [])]
+
+
+def _write_urdf(content: ArmContent) -> str:
+    if "urdf" in content.nominal.document:
+        return corrected_urdf(content.nominal, content.robot, _notes(content))
+    return small_urdf(content.robot, _notes(content))
+
+
+def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
+    said = _left_out(content)
+    if "urdf" not in content.nominal.document:
+        return said
+    tip = corrected_tip(content.nominal, content.robot)
+    if tip != content.robot.tip:
+        said += (
+            f"no fixed joint places {content.robot.tip}, so that the calibrated one is a link of "
+            f"its own in the file: {tip}. Poses are of that.",
+        )
+    return said
+
+
+def _write_table(content: ArmContent) -> str:
+    notes = content.notes
+    if content.left_out:
+        notes.append(
+            "gear_ratio, sine_rad and cosine_rad are visioncal's own keys, for a table of others "
+            f"has none: {content.left_out}"
+        )
+    return table_toml(content.table, "visioncal", notes)
+
+
+def _warn_table(content: ArmContent) -> tuple[str, ...]:
+    return (*_left_out(content), *_far(content.table))
+
+
+def _far(table: DHTable) -> tuple[str, ...]:
+    far = int(np.argmax(np.abs(table.d_m)))
+    if abs(table.d_m[far]) < _FAR_M:
+        return ()
+    return (
+        f"d_m of {table.joint_names[far]} is {table.d_m[far]:.0f} m: its axis and a neighbour are "
+        f"nearly parallel, and the {table.convention} convention goes to their common normal. "
+        "--convention hayati does not.",
+    )
+
+
+def _write_ur(content: ArmContent) -> str:
+    return ur_kinematics_yaml(
+        content.robot,
+        calibration_hash=content.calibration_hash or _NO_HASH,
+        like=content.nominal_table,
+        notes=_notes(content),
+    )
+
+
+def _warn_ur(content: ArmContent) -> tuple[str, ...]:
+    said = _left_out(content)
+    away = log(ur_flange(content.robot, content.nominal_table))
+    turned, moved = np.rad2deg(np.linalg.norm(away[:3])), 1e3 * np.linalg.norm(away[3:])
+    if max(turned, moved) > _EXACT:
+        said += (
+            f"the flange lies {moved:.2g} mm and {turned:.2g} deg from wrist_3, which has no field "
+            "for that: a comment in the file has its pose. What sits on the flange goes behind it.",
+        )
+    if content.calibration_hash is None:
+        said += (
+            f"its hash is {_NO_HASH!r}, which no controller has: the driver will report that the "
+            "calibration does not match, and go on. Give the one that ur_calibration extracts with "
+            "--hash.",
+        )
+    return said
+
+
+def _write_chain(content: ArmContent) -> str:
+    document = {**content.robot.document, "source": "; ".join(content.notes)}
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def _left_out(content: ArmContent) -> tuple[str, ...]:
+    return (f"{content.left_out}.",) if content.left_out else ()
+
+
+ROBOT_URDF = ArmFormat(
+    "robot-urdf",
+    "the calibrated arm as a URDF: the session's own with other origins, or a small one [m, rad]",
+    _write_urdf,
+    warn=_warn_urdf,
+)
+ROBOT_DH = ArmFormat(
+    "robot-dh",
+    "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati [m, rad]",
+    _write_table,
+    takes=frozenset({"convention"}),
+    warn=_warn_table,
+)
+UR_KINEMATICS = ArmFormat(
+    "ur-kinematics",
+    "the calibrated UR as ur_description's kinematics_params_file (YAML), --hash its hash [m, rad]",
+    _write_ur,
+    takes=frozenset({"hash"}),
+    warn=_warn_ur,
+)
+ROBOT_JSON = ArmFormat(
+    "robot-json",
+    "the calibrated arm with all that was found: 4x4 placements, axes, joints' functions [m, rad]",
+    _write_chain,
+)
+
+ARMS = (ROBOT_URDF, ROBOT_DH, UR_KINEMATICS, ROBOT_JSON)

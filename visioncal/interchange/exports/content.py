@@ -1,0 +1,112 @@
+"""What is asked for of a result, and what a format then writes."""
+
+from dataclasses import dataclass
+
+from visioncal.core.types import FloatArray, Mount
+from visioncal.results import CameraResult, Edge, Verdict
+
+
+@dataclass(frozen=True)
+class Load:
+    """What a tool weighs, which no calibration tells.
+
+    Attributes:
+        mass_kg: Its mass.
+        centre_mm: Where its centre of mass is in the flange's frame.
+    """
+
+    mass_kg: float
+    centre_mm: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What to export; what is None is left to the format.
+
+    Attributes:
+        edge: A transform by name; None for the camera's, or in a format of tools or fixtures for
+            the only one of its kind.
+        inverse: Whether its inverse is wanted.
+        parent: What to call the frame in which the pose is given.
+        child: What to call the frame whose pose it is; the camera, in a format of lenses.
+        number: Which of the controller's tools or bases it becomes.
+        load: What the tool weighs.
+        convention: In which form the joints of an arm are tabulated.
+        calibration_hash: The `hash` of a UR's own kinematics.
+        onto: The document of the reader's own that is to be written onto.
+        camera: Which camera of a whole cell is meant, in a format of lenses.
+        robot: Which robot of a whole cell: its part of it is exported as of one camera and robot.
+        target: Which target of a whole cell; likewise.
+    """
+
+    edge: str | None = None
+    inverse: bool = False
+    parent: str | None = None
+    child: str | None = None
+    number: int | None = None
+    load: Load | None = None
+    convention: str | None = None
+    calibration_hash: str | None = None
+    onto: str | None = None
+    camera: str | None = None
+    robot: str | None = None
+    target: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a format writes.
+
+    Attributes:
+        name: Which transform of the result it is.
+        edge: `parent_from_child`: its translation and rotation are the child's pose in the parent.
+        parent: Name of the parent's frame, as its readers know it.
+        child: Name of the child's frame likewise.
+        frames: Our own names of parent and child.
+        mount: How the camera is mounted; None for a frame that belongs to no calibration.
+        lens: The camera, where there is one.
+        origin: Where the result comes from, in one line.
+        verdict: Whether it can be trusted.
+        rotation_of: Our name of the frame whose rotation was taken over unmeasured; None where
+            the rotation was measured.
+        number: Which of the controller's tools or bases it becomes, where that was said.
+        load: What the tool weighs, where that was said.
+        onto: The document that is to be written onto, where there is one.
+    """
+
+    name: str
+    edge: Edge
+    parent: str
+    child: str
+    frames: tuple[str, str]
+    mount: Mount | None
+    lens: CameraResult | None
+    origin: str
+    verdict: Verdict
+    rotation_of: str | None = None
+    number: int | None = None
+    load: Load | None = None
+    onto: str | None = None
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(4, 4) `parent_from_child` [m]."""
+        return self.edge.matrix
+
+    @property
+    def worth(self) -> str:
+        """The verdict and the sigma of the transform, in one line."""
+        position = f"verdict {self.verdict.status}; sigma {self.edge.sigma_mm:.2g} mm"
+        if self.rotation_of is None:
+            return f"{position} and {self.edge.sigma_deg:.2g} deg"
+        return f"{position}; rotation taken from the {self.rotation_of}, not measured"
+
+    @property
+    def direction(self) -> str:
+        """What the transform does, in one line."""
+        return f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t"
+
+    @property
+    def notes(self) -> list[str]:
+        """Lines for a comment: where it comes from, its worth, and what it does."""
+        return [self.origin, self.worth, self.direction]

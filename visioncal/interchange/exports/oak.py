@@ -1,0 +1,32 @@
+"""The calibration of a Luxonis OAK camera, as its own library reads it and the device keeps it."""
+
+from visioncal.interchange.exports.content import Content
+from visioncal.interchange.exports.format import ExportFormat
+from visioncal.interchange.exports.lens import camera_of
+from visioncal.live.drivers.oak_calibration import calibration_json
+
+
+def _write(content: Content) -> str:
+    """Writes the JSON of depthai's CalibrationHandler; the child's name is the camera's socket."""
+    return calibration_json(camera_of(content), content.child, content.onto)
+
+
+def _warn(content: Content) -> str:
+    if content.onto is not None:
+        return ""
+    return (
+        "this calibration holds one camera and nothing of its board. Before a device is given it, "
+        "write it onto the device's own: --onto FILE, as CalibrationHandler.eepromToJsonFile saves "
+        "it."
+    )
+
+
+OAK = ExportFormat(
+    "oak",
+    "the lens as the calibration JSON of an OAK [px]; --child names the socket",
+    _write,
+    "lens",
+    {"cam": "CAM_A"},
+    frozenset({"onto"}),
+    warn=_warn,
+)

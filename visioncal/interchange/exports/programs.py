@@ -1,0 +1,122 @@
+"""Tools and fixtures for FANUC: an ASCII program (.LS) that sets UTOOL or UFRAME when it runs.
+
+A program cannot hold a frame as a constant. It keeps it as a position, and takes that through a
+position register (FANUC operator's manual, "frame instructions": UTOOL[i]=PR[j], UFRAME[i]=PR[j]).
+The listing's layout is what a controller prints of such a program (CrossArm,
+docs/fanuc_ls_format.md and tests/fixtures/probes/maketp: loaded, run and printed by ROBOGUIDE).
+"""
+
+from functools import partial
+from typing import Literal
+
+from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.core.errors import DataError
+from visioncal.interchange.exports.content import Content
+from visioncal.interchange.exports.format import ExportFormat
+from visioncal.interchange.exports.writing import fixed
+
+# The last position register of a controller as it is delivered.
+REGISTER = 100
+# A nanometre and 2e-8 rad. A controller prints three decimals, but loads more.
+_DECIMALS = 6
+_REMARK_SIZE = 32
+_NEWLINE = "\r\n"
+
+_ATTRIBUTES = (
+    "OWNER\t\t= MNEDITOR;",
+    'COMMENT\t\t= "visioncal";',
+    "PROG_SIZE\t= 0;",
+    "FILE_NAME\t= ;",
+    "VERSION\t\t= 0;",
+    "LINE_COUNT\t= {count};",
+    "MEMORY_SIZE\t= 0;",
+    "PROTECT\t\t= READ_WRITE;",
+    "TCD:  STACK_SIZE\t= 0,",
+    "      TASK_PRIORITY\t= 50,",
+    "      TIME_SLICE\t= 0,",
+    "      BUSY_LAMP_OFF\t= 0,",
+    "      ABORT_REQUEST\t= 0,",
+    "      PAUSE_REQUEST\t= 0;",
+    "DEFAULT_GROUP\t= 1,*,*,*,*;",
+    "CONTROL_CODE\t= 00000000 00000000;",
+)
+
+
+def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
+    """Writes the program; what it sets and what it overwrites stand in its remarks.
+
+    Raises:
+        DataError: It is not said which tool or frame it sets.
+    """
+    if content.number is None:
+        raise DataError(
+            f"fanuc-{what.lower()} sets {what}[n] of the controller, and n is not said.",
+            next_step="Name it with --number: what stands there is overwritten.",
+        )
+    instructions = [
+        *_remarks(content),
+        f"!PR[{REGISTER}] is overwritten",
+        # A controller pads the first of them; the second it does not.
+        f"PR[{REGISTER}]=P[1]   ",
+        f"{what}[{content.number}]=PR[{REGISTER}]",
+    ]
+    lines = [
+        f"/PROG  {program_name(what, content.number)}",
+        "/ATTR",
+        *(it.format(count=len(instructions)) for it in _ATTRIBUTES),
+        "/MN",
+        *(f"{number:>4}:  {it} ;" for number, it in enumerate(instructions, 1)),
+        "/POS",
+        *_position(content),
+        "/END",
+    ]
+    return _NEWLINE.join(lines) + _NEWLINE
+
+
+def program_name(what: Literal["UTOOL", "UFRAME"], number: int) -> str:
+    """Names the program, which is its file's name, too: 8 characters are safe everywhere."""
+    return f"SET_{what[:2]}{number}"
+
+
+def _remarks(content: Content) -> list[str]:
+    edge, measured = content.edge, content.rotation_of is None
+    parts = [
+        f"visioncal {content.name}",
+        f"verdict {content.verdict.status}",
+        f"sigma {edge.sigma_mm:.2g} mm" + (f" and {edge.sigma_deg:.2g} deg" if measured else ""),
+        *([] if measured else ["rotation not measured"]),
+    ]
+    return [f"!{it[: _REMARK_SIZE - 1]}" for it in parts]
+
+
+def _position(content: Content) -> list[str]:
+    pose = [fixed(it, _DECIMALS) for it in write_pose(content.matrix, POSE_FORMS["fanuc"])]
+    x, y, z, w, p, r = (f"{it:>13}" for it in pose)
+    return [
+        "P[1]{",
+        "   GP1:",
+        "\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',",
+        f"\tX ={x}  mm,\tY ={y}  mm,\tZ ={z}  mm,",
+        f"\tW ={w} deg,\tP ={p} deg,\tR ={r} deg",
+        "};",
+    ]
+
+
+PROGRAMS = (
+    ExportFormat(
+        "fanuc-utool",
+        "a tool for FANUC: a program that sets UTOOL[n], --number n [mm, deg]",
+        partial(_write, "UTOOL"),
+        "tool",
+        takes=frozenset({"number"}),
+        counterpart="fanuc-uframe",
+    ),
+    ExportFormat(
+        "fanuc-uframe",
+        "a fixture for FANUC: a program that sets UFRAME[n], --number n [mm, deg]",
+        partial(_write, "UFRAME"),
+        "fixture",
+        takes=frozenset({"number"}),
+        counterpart="fanuc-utool",
+    ),
+)

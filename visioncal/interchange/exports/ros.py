@@ -1,0 +1,75 @@
+"""A transform for ROS as YAML: the fields of a message, and a calibration of easy_handeye2."""
+
+from collections.abc import Sequence
+
+from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.interchange.exports.content import Content
+from visioncal.interchange.exports.format import ExportFormat
+from visioncal.interchange.exports.frames import ROS_FRAMES, ros_notes
+from visioncal.interchange.exports.writing import comments, numbers, yaml_text
+
+
+def _message(content: Content) -> dict[str, dict[str, float]]:
+    """Builds the fields of geometry_msgs/msg/Transform: metres, and a quaternion x, y, z, w."""
+    x, y, z, qx, qy, qz, qw = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
+    return {
+        "translation": {"x": x, "y": y, "z": z},
+        "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
+    }
+
+
+def _write_transform(content: Content) -> str:
+    """Writes the fields of geometry_msgs/msg/TransformStamped (ROS 2, common_interfaces)."""
+    document = {
+        "header": {"frame_id": content.parent},
+        "child_frame_id": content.child,
+        "transform": _message(content),
+    }
+    return comments("#", ros_notes(content)) + yaml_text(document)
+
+
+def _write_easy_handeye2(content: Content) -> str:
+    """Writes what easy_handeye2 keeps in its calibrations' folder.
+
+    The fields are those of its message HandeyeCalibration (easy_handeye2_msgs, msg/), as
+    `save_calibration` of its handeye_calibration.py writes them and its publisher reads them: the
+    pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed camera.
+    """
+    in_hand = content.mount == "eye-in-hand"
+    document = {
+        "parameters": {
+            "name": "visioncal",
+            "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
+            "robot_base_frame": ROS_FRAMES["base"] if in_hand else content.parent,
+            "robot_effector_frame": content.parent if in_hand else ROS_FRAMES["flange"],
+            "tracking_base_frame": content.child,
+            "tracking_marker_frame": "target",
+            "freehand_robot_movement": True,
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transform": _message(content),
+    }
+    use = "its publisher finds it as ~/.ros2/easy_handeye2/calibrations/visioncal.calib"
+    return comments("#", [*ros_notes(content), use]) + yaml_text(document)
+
+
+def _write_transforms(contents: Sequence[Content]) -> str:
+    """Writes a document of YAML for each transform."""
+    return "---\n".join(map(_write_transform, contents))
+
+
+ROS = ExportFormat(
+    "ros",
+    "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
+    _write_transform,
+    frames=ROS_FRAMES,
+    write_all=_write_transforms,
+)
+EASY_HANDEYE2 = ExportFormat(
+    "easy-handeye2",
+    "a .calib of easy_handeye2 [m, quaternion x, y, z, w]",
+    _write_easy_handeye2,
+    holds="hand-eye",
+    frames=ROS_FRAMES,
+)

@@ -1,0 +1,43 @@
+"""The forms in which sessions are stored, ours and others': one file a format, one entry each.
+
+Somebody else's recording becomes a session in three steps: `read_foreign` gives its numbers as they
+are written, `assemble` the session that they mean, and `write_session` stores it. Between the first
+and the second, `guess_foreign` can look whether they mean something else. `convert` does them all.
+
+A new format is a file with a `ForeignFormat` and its entry in `registry.FOREIGN_FORMATS`. Another
+usual name of a field needs no format: it is added to the keys in `poses`, `fields` (times),
+`columns` (images) or `intrinsics`, and a recording with it to the samples of the tests.
+"""
+
+from visioncal.interchange.formats.assemble import assemble
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.import_options import PoseWishes, Wishes
+from visioncal.interchange.formats.registry import (
+    FOREIGN_FORMATS,
+    OWN_FORMATS,
+    convert,
+    read_foreign,
+    write_session,
+)
+from visioncal.interchange.formats.rereading import (
+    guess_foreign,
+    load_in_doubt,
+    reread,
+    reread_session,
+)
+
+__all__ = [
+    "FOREIGN_FORMATS",
+    "OWN_FORMATS",
+    "Foreign",
+    "PoseWishes",
+    "Wishes",
+    "assemble",
+    "convert",
+    "guess_foreign",
+    "load_in_doubt",
+    "read_foreign",
+    "reread",
+    "reread_session",
+    "write_session",
+]

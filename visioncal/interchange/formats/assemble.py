@@ -1,0 +1,354 @@
+"""A session out of what someone else recorded."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.documents import is_number
+from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
+from visioncal.core.types import Mount
+from visioncal.interchange.formats.boards import described_target, target_name
+from visioncal.interchange.formats.foreign import Foreign, Sweep, rows_of
+from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
+from visioncal.session import MemoryImages, Session, Stream
+from visioncal.session import columns as known
+from visioncal.vision.finders.imaging import decode_image, looks_like_image
+
+
+@dataclass(frozen=True, eq=False)
+class FileImages:
+    """Images that lie anywhere, by the paths that the session gives them."""
+
+    files: Mapping[str, Path]
+
+    def read(self, path: str) -> bytes:
+        """Reads the bytes of one image file."""
+        if path not in self.files:
+            raise DataError(f"The session has no image {path}.", culprits=[path])
+        return _image_bytes(self.files[path])
+
+    def absence(self, path: str) -> str:
+        """Says why there is no such image; empty where there is one."""
+        return absence(self.files[path]) if path in self.files else "is missing"
+
+    def exists(self, path: str) -> bool:
+        """Tells whether there is such an image."""
+        return not self.absence(path)
+
+
+def wished(foreign: Foreign, wishes: Wishes) -> Foreign:
+    """Adds to a recording what the user says of it besides how its poses are written.
+
+    Raises:
+        DataError: A name that the user gives is not known, or a file that he names is wrong.
+    """
+    if wishes.mount is not None:
+        foreign = replace(foreign, mount=wishes.mount)
+    if wishes.target is not None:
+        foreign = replace(foreign, target=described_target(wishes.target))
+    if wishes.tip is not None and wishes.robot_model is None:
+        raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
+    if wishes.robot_model is not None:
+        tip = {} if wishes.tip is None else {"tip": wishes.tip}
+        foreign = replace(foreign, arm={"model": wishes.robot_model} | tip)
+    return _with_lens(foreign, wishes)
+
+
+def _with_lens(foreign: Foreign, wishes: Wishes) -> Foreign:
+    lens, notes = dict(foreign.lens or {}), foreign.notes
+    if wishes.intrinsics == "estimate":
+        lens = {it: lens[it] for it in ("name", "model", "resolution") if it in lens}
+    elif wishes.intrinsics is not None:
+        lens, more = read_intrinsics(Path(wishes.intrinsics))
+        notes = (*notes, *more)
+    if wishes.resolution is not None:
+        lens["resolution"] = list(wishes.resolution)
+    return replace(foreign, lens=lens or None, notes=notes)
+
+
+def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
+    """Builds the session of a recording, as its numbers are read and its mount is stated.
+
+    Args:
+        foreign: The recording; `replace` it to try another reading, mount or order of rows.
+        mount: Taken where the recording states none.
+
+    Returns:
+        The session; what was assumed stands among its warnings.
+
+    Raises:
+        DataError: No mount is known, no row says what the camera saw, or a number is wrong.
+    """
+    mount = foreign.mount or mount
+    if mount is None:
+        raise DataError(
+            f"{foreign.name}: how the camera is mounted is not known.",
+            culprits=["mount"],
+            next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
+        )
+    foreign = spoken(foreign if foreign.sweep is None else _swept(foreign, foreign.sweep))
+    rows = _written(foreign)
+    document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
+    files = {path: file for row in rows for path, file in row.image.items()}
+    notes = list(foreign.notes)
+    if files:
+        _check_images(foreign.name, list(files.values()), notes)
+        document["camera"] = _camera(foreign, list(files.values()))
+    target = foreign.target if files else None
+    if target is not None:
+        document["target"] = target_name(target) or "target.toml"
+    robot = _robot(foreign, document)
+    columns = list(dict.fromkeys(name for row in rows for name in row.cells))
+    cells = [[row.cells.get(name, "") for name in columns] for row in rows]
+    session = Session.assemble(
+        document,
+        columns,
+        cells,
+        FileImages(files) if files else MemoryImages({}),
+        target_document=target,
+        robot_document=robot,
+    )
+    if foreign.sweep is not None:
+        session = session.with_streams({"robot": _stream(foreign.sweep)})
+    elif foreign.joints_rad is None and not foreign.robot.there.all():
+        absent = [foreign.robot.places[it] for it in np.flatnonzero(~foreign.robot.there)]
+        notes.append(
+            f"{len(absent)} of {len(rows)} rows have no pose of the robot: {some_of(absent)}."
+        )
+    return replace(session, warnings=(*notes, *session.warnings))
+
+
+def _swept(foreign: Foreign, sweep: Sweep) -> Foreign:
+    """All that the camera saw, without the robot's poses: those stay in a stream of their own."""
+    return replace(
+        foreign,
+        robot=PoseNumbers.nowhere(sweep.camera.places),
+        camera=sweep.camera,
+        stamps_s=sweep.camera_s,
+        views=(),
+        columns={},
+    )
+
+
+def _stream(sweep: Sweep) -> Stream:
+    rows = pose_cells(sweep.robot, known.POSE)
+    numbers = np.array([[float(row[name]) for name in known.POSE] for row in rows])
+    values = np.hstack([sweep.robot_s[:, None], numbers])
+    values.setflags(write=False)
+    return Stream(("stamp_s", *known.POSE), values)
+
+
+def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
+    missing = [it for it in files if not it.is_file()]
+    if not missing:
+        return
+    words = f"{len(missing)} of {len(files)} images are missing: {some_of([*map(str, missing)], 3)}"
+    if len(missing) == len(files):
+        raise DataError(
+            f"{name}: {words}.",
+            culprits=[str(missing[0])],
+            next_step="Name the folder that holds them with --images.",
+        )
+    notes.append(f"{words}. --images names the folder that holds them.")
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One row of views.csv, and the file of its image by the path in the session."""
+
+    cells: dict[str, str]
+    image: dict[str, Path]
+
+
+def spoken(foreign: Foreign) -> Foreign:
+    """Leaves out the rows that say nothing, and what of the others is not used.
+
+    Raises:
+        DataError: No row says what a camera saw, or images show a target that is not known.
+    """
+    notes: list[str] = []
+    foreign = _with_one_witness(foreign, notes)
+    points = foreign.columns.get("point", ())
+    saw = np.zeros(len(foreign.robot), dtype=bool)
+    for cells in (foreign.images, points):
+        saw |= np.array([bool(it) for it in cells] or [False])
+    if foreign.camera is not None:
+        saw |= foreign.camera.there
+    silent = [foreign.robot.places[it] for it in np.flatnonzero(~saw)]
+    if len(silent) == len(saw):
+        raise DataError(
+            f"{foreign.name} has {len(saw)} poses of the robot, but neither images nor poses of "
+            "the target: nothing says what a camera saw.",
+            culprits=[foreign.robot.places[0]],
+            next_step="Name the images with --images, or the target's poses with --camera-columns "
+            "or --camera-file. Touches of a point need a column `point`.",
+        )
+    if silent:
+        notes.append(
+            f"{len(silent)} of {len(saw)} rows are left out, as they have neither an image nor a "
+            f"pose of the target: {some_of(silent)}."
+        )
+    return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
+
+
+def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
+    """Chooses between images and stored poses of the target where there are both."""
+    if not foreign.images:
+        return foreign
+    if foreign.target is not None:
+        if foreign.camera is not None:
+            notes.append(
+                "The stored poses of the target are left aside: the images tell them better."
+            )
+        return replace(foreign, camera=None)
+    if foreign.camera is None:
+        raise DataError(
+            f"{foreign.name} has images, but what target they show is not known.",
+            culprits=["target"],
+            next_step="Say --target with a name in targets/, a .toml, or a description such as "
+            "checkerboard_9x6_23.6mm.",
+        )
+    notes.append("The images are left aside: no --target says what they show.")
+    return replace(foreign, images=())
+
+
+def _written(foreign: Foreign) -> list[_Row]:
+    images = _image_paths(foreign)
+    robot = pose_cells(foreign.robot, known.POSE)
+    camera: list[dict[str, str]] = [{}] * len(foreign.robot)
+    if foreign.camera is not None:
+        camera = pose_cells(foreign.camera, known.MEASURED_CAM_POSE)
+    extra = _extra_columns(foreign)
+    rows = []
+    for at in range(len(foreign.robot)):
+        image = images[at]
+        cells = {"view": str(foreign.views[at] if foreign.views else at)}
+        if foreign.images:
+            cells["image"] = "" if image is None else image[0]
+        cells |= _scalars(foreign, at) | robot[at] | camera[at]
+        cells |= {name: column[at] for name, column in extra.items()}
+        rows.append(_Row(cells, dict([image]) if image is not None else {}))
+    return rows
+
+
+def _scalars(foreign: Foreign, at: int) -> dict[str, str]:
+    cells = {}
+    if foreign.stamps_s is not None and np.isfinite(foreign.stamps_s[at]):
+        cells["stamp_s"] = repr(float(foreign.stamps_s[at]))
+    if foreign.joints_rad is not None:
+        angles = foreign.joints_rad[at].tolist()
+        names = [f"q{number}_rad" for number in range(1, len(angles) + 1)]
+        cells |= {it: "" if np.isnan(a) else repr(a) for it, a in zip(names, angles, strict=True)}
+    return cells
+
+
+def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str]]:
+    """Writes poses so that reading them gives the same numbers; nothing for a row without one."""
+    poses = numbers.poses()
+    values = np.hstack([numbers.positions, numbers.rotations])
+    there = numbers.there
+    # Where they are written as our own are, nothing is computed.
+    if numbers.reading != Reading() and there.any():
+        values = np.full((len(numbers), 7), np.nan)
+        transforms = RigidTransform.from_matrix(poses[there])
+        values[there] = np.hstack([transforms.translation, transforms.rotation.as_quat()])
+    return [
+        dict(zip(names, map(repr, row), strict=True)) if is_pose else {}
+        for row, is_pose in zip(values.tolist(), there, strict=True)
+    ]
+
+
+def _extra_columns(foreign: Foreign) -> dict[str, tuple[str, ...]]:
+    """Names the other columns so that none is taken for one of ours that it is not."""
+    written = {"view", "image", "stamp_s", *known.POSE, *known.MEASURED_CAM_POSE}
+    written |= set(known.joint_columns(tuple(foreign.columns)))
+    columns: dict[str, tuple[str, ...]] = {}
+    for name, cells in foreign.columns.items():
+        own = name if _is_meant(name, cells) else f"source_{name}"
+        while own in written or own in columns:
+            own = f"source_{own}"
+        columns[own] = cells
+    return columns
+
+
+def _is_meant(name: str, cells: Sequence[str]) -> bool:
+    """Tells whether a column with a name that sessions know holds what they mean by it."""
+    filled = {it for it in cells if it}
+    if name == "role":
+        return filled <= {"fit", "holdout"}
+    if name == "stop":
+        return all(it.isascii() and it.isdecimal() and len(it) < 10 for it in filled)
+    if name in known.SELECTORS:
+        return len(filled) < 2
+    finite = (is_number(it) and np.isfinite(float(it)) for it in filled)
+    return not known.is_number(name) or all(finite)
+
+
+def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
+    """Names the images in the session; where a name is taken it gets a number before it."""
+    if not foreign.images:
+        return [None] * len(foreign.robot)
+    paths: dict[Path, str] = {}
+    taken: set[str] = set()
+    for at, file in enumerate(foreign.images):
+        if file is None or file in paths:
+            continue
+        names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
+        # Not every file system tells capitals from small letters.
+        paths[file] = next(it for it in names if it.casefold() not in taken)
+        taken.add(paths[file].casefold())
+    return [None if it is None else (f"images/{paths[it]}", it) for it in foreign.images]
+
+
+def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
+    lens = {it: value for it, value in (foreign.lens or {}).items() if value is not None}
+    if "resolution" not in lens:
+        size = next((it for file in files if (it := _image_size(file)) is not None), None)
+        if size is not None:
+            lens["resolution"] = list(size)
+        elif "matrix" in lens:
+            raise DataError(
+                f"{foreign.name}: the intrinsics do not say for which size of image they hold, and "
+                "no image can be read.",
+                culprits=["resolution"],
+                next_step="Say --resolution WIDTH,HEIGHT.",
+            )
+    return lens
+
+
+def _image_size(file: Path) -> tuple[int, int] | None:
+    image = decode_image(_image_bytes(file)) if file.is_file() else ""
+    return None if isinstance(image, str) else (image.shape[1], image.shape[0])
+
+
+def _image_bytes(file: Path) -> bytes:
+    data = read_bytes(file, MOST_IMAGE_BYTES)
+    # A camera that failed leaves empty files; what else is no image is not to be handed on.
+    if data and not looks_like_image(data):
+        raise DataError(
+            f"{file} is no image (png, jpg, tif, bmp).",
+            culprits=[str(file)],
+            next_step="Name each row's image with --image-column, or the folder with --images.",
+        )
+    return data
+
+
+def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
+    """Names the robot's model in the document, reads it, and checks that it is one."""
+    if foreign.arm is None:
+        return None
+    arm = {it: str(value) for it, value in foreign.arm.items()}
+    robot = read_robot_document(arm["model"], tip=arm.get("tip"))
+    Robot.from_document(robot)
+    suffix = Path(arm["model"]).suffix.lower()
+    document["robot"] = arm | ({"model": f"robot{suffix}"} if suffix in ROBOT_SUFFIXES else {})
+    return robot

@@ -1,0 +1,264 @@
+"""Tables, JSON and .npz with named columns or keys, a row a view."""
+
+import re
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.core.conventions import PoseNumbers
+from visioncal.core.documents import (
+    read_json,
+    read_npy,
+    read_npz,
+    read_opencv,
+    read_table,
+    read_yaml,
+)
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.interchange.formats.fields import (
+    Fields,
+    fields_of_arrays,
+    fields_of_records,
+    fields_of_table,
+    flattened,
+    stamp_name,
+    unnamed_columns,
+)
+from visioncal.interchange.formats.finding import images_beside, images_named, is_image_name, listed
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.pairing import with_camera_file
+from visioncal.interchange.formats.pendants import pendant_fields
+from visioncal.interchange.formats.poses import (
+    CAMERA_KEYS,
+    JOINT_KEYS,
+    ROBOT_KEYS,
+    joints_from,
+    known_names,
+    pose_names,
+    poses_from,
+)
+from visioncal.interchange.formats.streams import in_seconds
+from visioncal.session.columns import joint_columns
+
+DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
+ENDINGS = (".csv", ".tsv", ".txt", ".npz", ".npy", *DOCUMENTS)
+_IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
+
+
+def read_fields(path: Path) -> Fields:
+    """Reads a table, JSON, YAML, .npz or .npy as rows of named values.
+
+    Raises:
+        DataError: It cannot be read, or holds no rows.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return fields_of_arrays(read_npz(path), path)
+    if suffix == ".npy":
+        return fields_of_arrays({"value": read_npy(path)}, path)
+    if suffix in DOCUMENTS:
+        return _fields_of_document(read_document(path), path)
+    lines = pendant_fields(path)
+    if lines is not None:
+        return lines
+    table = read_table(path)
+    if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
+        raise DataError(
+            f"{path} is one 4 x 4 matrix; a file a view in a folder, or a row a view, is needed.",
+            culprits=[str(path)],
+            next_step="Convert the folder.",
+        )
+    return fields_of_table(table)
+
+
+def read_document(path: Path) -> object:
+    """Reads JSON, YAML or OpenCV's XML.
+
+    Raises:
+        DataError: It cannot be read.
+    """
+    if path.suffix.lower() == ".json":
+        return read_json(path)
+    return read_opencv(path) if path.suffix.lower() == ".xml" else read_yaml(path)
+
+
+def _fields_of_document(document: object, path: Path) -> Fields:
+    """Takes a list of records, the longest such list inside a mapping, or a mapping of lists.
+
+    In a mapping, names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
+    """
+    if isinstance(document, Mapping):
+        numbered = _numbered(document)
+        if len(numbered) > 1:
+            places = [f"{path.name}, {it}" for it in numbered]
+            rows = [flattened(it) for it in numbered.values()]
+            return fields_of_records(rows, places, path.stem, path.parent, tuple(numbered))
+        lists = [it for it in document.values() if isinstance(it, list) and it]
+        tables = [it for it in lists if isinstance(it[0], Mapping)]
+        if tables:
+            document = max(tables, key=len)
+        elif document and all(isinstance(it, Mapping) for it in document.values()):
+            document = list(document.values())
+        elif lists:
+            count = max(len(it) for it in lists)
+            columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
+            document = [{k: v[at] for k, v in columns.items()} for at in range(count)]
+    if not isinstance(document, list) or not document:
+        raise DataError(f"{path} holds no rows; a list with one entry a pose is needed.")
+    places = [f"{path.name}, entry {at}" for at in range(len(document))]
+    records = [flattened(it) for it in document]
+    return fields_of_records(records, places, path.stem, path.parent)
+
+
+def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
+    """Groups matrices by the numbers that their names end with."""
+    rows: dict[int, dict[str, object]] = defaultdict(dict)
+    for name, value in document.items():
+        match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", name)
+        # Columns of numbers may have names such as q1; a matrix is a list of lists.
+        nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)
+        if match and (nested or isinstance(value, np.ndarray)):
+            rows[int(match[2])][match[1] or "matrix"] = value
+    return dict(sorted(rows.items()))
+
+
+def _read_file(path: Path, wishes: Wishes) -> Foreign:
+    """Reads one file with a row a view, or the only one in a folder of images."""
+    file = _pose_file(path)
+    if file is None:
+        raise DataError(
+            f"{path}: one file of poses ({', '.join(ENDINGS)}) is needed.", culprits=[str(path)]
+        )
+    fields = read_fields(file)
+    if wishes.camera_file is None:
+        return foreign_from(fields, wishes, images=path if path.is_dir() else None)
+    return with_camera_file(fields, read_fields(wishes.camera_file), wishes)
+
+
+def _pose_file(path: Path) -> Path | None:
+    if path.is_file():
+        return path if path.suffix.lower() in ENDINGS else None
+    files = [it for it in listed(path) if it.suffix.lower() in ENDINGS]
+    # Beside a file of intrinsics or notes, the name tells.
+    named = [it for it in files if re.search("pose|robot", it.stem.lower())]
+    return next((it[0] for it in (files, named) if len(it) == 1), None)
+
+
+def foreign_from(fields: Fields, wishes: Wishes, *, images: Path | None = None) -> Foreign:
+    """Takes rows of named values for a recording, as their names or the user say.
+
+    Args:
+        fields: The rows.
+        wishes: What the user says of them.
+        images: A folder that holds the images, where the source is one.
+
+    Raises:
+        DataError: There are no poses and no joints in it.
+    """
+    unnamed = unnamed_columns(fields)
+    given = (*wishes.robot.names, *wishes.camera.names, *wishes.joints)
+    used = {fields.find(it) for it in given}
+    robot_names = pose_names(fields, wishes.robot.names, unnamed["robot"], ROBOT_KEYS, used)
+    used.update(robot_names)
+    camera_names = pose_names(fields, wishes.camera.names, unnamed["camera"], CAMERA_KEYS, used)
+    used.update(camera_names)
+    joint_names = wishes.joints or _joint_names(fields, used)
+    used.update(joint_names)
+    if not robot_names and not joint_names:
+        raise DataError(
+            f"{fields.name}: which of its fields are the robot's poses is not known; it has "
+            f"{fields.listing()}.",
+            culprits=[fields.name],
+            next_step="Name them with --robot-columns, or the joint angles with --joint-columns.",
+        )
+    notes: tuple[str, ...] = ()
+    robot, camera = PoseNumbers.nowhere(fields.places), None
+    if robot_names:
+        robot, notes = poses_from(fields, robot_names, wishes.robot, "robot")
+    if camera_names:
+        camera, more = poses_from(fields, camera_names, wishes.camera, "camera")
+        notes = (*notes, *more)
+    stamps = stamp_name(fields, used)
+    if stamps and stamps in unnamed["time"]:
+        notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
+    used |= {stamps, "view"} if view_numbers(fields) else {stamps}
+    paths, image_name, more = _images(fields, wishes, images, used)
+    return Foreign(
+        name=fields.name,
+        robot=robot,
+        camera=camera,
+        images=paths,
+        joints_rad=joints_from(fields, joint_names, degrees=wishes.joints_deg)
+        if joint_names
+        else None,
+        stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
+        views=fields.views or view_numbers(fields),
+        columns={it: cells for it, cells in fields.texts.items() if it not in used | {image_name}},
+        notes=(*notes, *more),
+    )
+
+
+def view_numbers(fields: Fields) -> tuple[int, ...]:
+    """The numbers in a column `view`, where they are whole and each is there once."""
+    cells = fields.texts.get("view", ())
+    whole = all(it.isascii() and it.isdecimal() and len(it) < 10 for it in cells)
+    return tuple(int(it) for it in cells) if whole and len(set(cells)) == len(cells) else ()
+
+
+def _joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
+    ours = joint_columns(tuple(fields.numbers))
+    return ours or known_names(fields, [(it,) for it in JOINT_KEYS], taken)
+
+
+def _images(
+    fields: Fields, wishes: Wishes, folder: Path | None, taken: Collection[str]
+) -> tuple[tuple[Path | None, ...], str, tuple[str, ...]]:
+    """Pairs the rows with images: (paths, the field that names them, what was assumed)."""
+    beside = wishes.images or folder
+    name = fields.find(wishes.image) if wishes.image else _image_name(fields, beside, taken)
+    if name in fields.texts:
+        return images_named(fields.texts[name], fields.folder, wishes.images), name, ()
+    if beside is None:
+        return (), "", ()
+    views, numbered = fields.views or tuple(range(len(fields))), bool(fields.views)
+    paths, notes = images_beside(beside, wishes.images, views, fields.places, numbered=numbered)
+    return paths, "", notes
+
+
+def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> str:
+    """Finds the field that names images, by its name or its cells; empty where none does.
+
+    Raises:
+        DataError: Several do, and none has a usual name.
+    """
+    free = {name: cells for name, cells in fields.texts.items() if name not in taken}
+    usual = (it for it in _IMAGE_NAMES if any(map(is_image_name, free.get(it, ()))))
+    if name := next(usual, ""):
+        return name
+    files = [] if folder is None else listed(folder)
+    there = {name for it in files if is_image_name(it.name) for name in (it.name, it.stem)}
+    naming = [
+        name
+        for name, cells in free.items()
+        if any(cells) and all(not it or is_image_name(it) or it in there for it in cells)
+    ]
+    if len(naming) > 1:
+        raise DataError(
+            f"{fields.name}: {some_of(naming)} name images; one column of them is needed.",
+            culprits=naming,
+            next_step="Say which with --image-column.",
+        )
+    return next(iter(naming), "")
+
+
+TABLE = ForeignFormat(
+    "table",
+    "a table, JSON, YAML or .npz with a row a view, alone or in the folder of its images",
+    lambda path: _pose_file(path) is not None,
+    _read_file,
+)

@@ -1,0 +1,269 @@
+"""Rows with named values, before it is known what they mean: tables, JSON, arrays."""
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from visioncal.core.documents import TextTable, is_number
+from visioncal.core.documents.arrays import Array
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.types import FloatArray
+
+_TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
+# Columns of a table without a header, by their number: times, then poses of the robot and the
+# camera, each a position with a quaternion or a matrix by rows.
+_UNNAMED = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
+_UNNAMED |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
+_LISTED = 40
+# A pose and its covariance have fewer numbers; lists of corners and images have more.
+_MOST_NUMBERS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Named values of n rows.
+
+    Attributes:
+        name: What the recording is called.
+        folder: What the names of images are relative to.
+        places: (n,) where each row stands, for messages.
+        numbers: (n, ...) arrays by name; NaN where a row has none.
+        texts: (n,) texts by name, of every column of a table and of single numbers.
+        views: (n,) the rows' numbers, where their files' names have them.
+        ragged: What is wrong with fields whose rows differ in shape.
+        form: A name among `POSE_FORMS` where the rows themselves say in which form the robot's
+            poses are.
+    """
+
+    name: str
+    folder: Path
+    places: tuple[str, ...]
+    numbers: Mapping[str, FloatArray]
+    texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    views: tuple[int, ...] = ()
+    ragged: Mapping[str, str] = field(default_factory=dict)
+    form: str = ""
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def rows(self, chosen: Sequence[int]) -> Self:
+        """The same of some rows alone."""
+        return replace(
+            self,
+            places=tuple(self.places[it] for it in chosen),
+            numbers={name: it[list(chosen)] for name, it in self.numbers.items()},
+            texts={name: tuple(it[at] for at in chosen) for name, it in self.texts.items()},
+            views=tuple(self.views[it] for it in chosen) if self.views else (),
+        )
+
+    def find(self, name: str) -> str:
+        """Finds the full name of a field, which may be given without what stands before its point.
+
+        Raises:
+            DataError: There is no such field; the message lists those that there are.
+        """
+        known = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
+        if name in known:
+            return name
+        ends = [it for it in known if it.endswith(f".{name}")]
+        if len(ends) == 1:
+            return ends[0]
+        if ends:
+            raise DataError(
+                f"{self.name}: {name!r} may be {some_of(ends)}; the full name is needed.",
+                culprits=ends,
+            )
+        raise DataError(
+            f"{self.name} has no column or key {name!r}; it has {self.listing()}.",
+            culprits=[name],
+            next_step=did_you_mean(name, known),
+        )
+
+    def column(self, name: str) -> FloatArray:
+        """Takes a field's numbers, (n, k).
+
+        Raises:
+            DataError: There is no such field, or it holds text.
+        """
+        full = self.find(name)
+        if full in self.ragged:
+            raise DataError(self.ragged[full], culprits=[full])
+        if full not in self.numbers:
+            told = zip(self.places, self.texts[full], strict=True)
+            odd = ((place, it) for place, it in told if it and not is_number(it))
+            # JSON has numbers in quotes as well.
+            place, text = next(odd, (self.places[0], self.texts[full][0]))
+            raise DataError(
+                f"{place}: {full} holds {text[:40]!r}; a number is needed.",
+                culprits=[place],
+                next_step="Correct the cell, or leave the whole pose of that row empty.",
+            )
+        return self.numbers[full].reshape(len(self), -1)
+
+    def listing(self) -> str:
+        """Words the fields with the numbers that each has a row."""
+        names = list(dict.fromkeys([*self.numbers, *self.texts]))
+        words = [
+            f"{it} ({int(np.prod(self.numbers[it].shape[1:]))})"
+            if it in self.numbers and self.numbers[it].ndim > 1
+            else it
+            for it in names
+        ]
+        return some_of(words, _LISTED)
+
+
+def fields_of_table(table: TextTable) -> Fields:
+    """Takes the columns of a table; those in which every filled cell is a number become numbers."""
+    columns = list(zip(*table.rows, strict=True))
+    texts = dict(zip(table.columns, columns, strict=True))
+    numbers = {
+        name: np.array([float(it) if it else np.nan for it in cells])
+        for name, cells in texts.items()
+        if any(cells) and all(not it or is_number(it) for it in cells)
+    }
+    places = tuple(table.place(it) for it in range(len(table.rows)))
+    return Fields(table.path.stem, table.path.parent, places, numbers, texts)
+
+
+def fields_of_records(
+    records: Sequence[Mapping[str, object]],
+    places: Sequence[str],
+    name: str,
+    folder: Path,
+    views: tuple[int, ...] = (),
+) -> Fields:
+    """Takes the values of n records, as `flattened` gives them; one that rows lack is NaN there."""
+    numbers: dict[str, FloatArray] = {}
+    texts: dict[str, tuple[str, ...]] = {}
+    ragged: dict[str, str] = {}
+    for key in dict.fromkeys(name for it in records for name in it):
+        values = [it.get(key) for it in records]
+        if any(isinstance(it, str) for it in values):
+            texts[key] = tuple("" if it is None else str(it) for it in values)
+            continue
+        if bad := [at for at, it in enumerate(values) if isinstance(it, list)]:
+            ragged[key] = (
+                f"{places[bad[0]]}: {key} is no regular list or matrix of numbers: its lists "
+                "differ in length, or hold something else."
+            )
+            continue
+        arrays = [it if isinstance(it, np.ndarray) else None for it in values]
+        shapes = Counter(it.shape for it in arrays if it is not None)
+        if not shapes:
+            continue
+        shape = shapes.most_common(1)[0][0]
+        odd = [at for at, it in enumerate(arrays) if it is not None and it.shape != shape]
+        if odd:
+            ragged[key] = (
+                f"{places[odd[0]]}: {key} has the shape {shapes.most_common()[-1][0]}; most rows "
+                f"have {shape}."
+            )
+            continue
+        rows = [np.full(shape, np.nan) if it is None else it for it in arrays]
+        numbers[key] = np.array(rows).reshape(len(rows), *shape)
+        if not shape:
+            texts[key] = _cells(numbers[key])
+    return Fields(name, folder, tuple(places), numbers, texts, views, ragged)
+
+
+def flattened(record: object, prefix: str = "") -> dict[str, object]:
+    """Joins the names of nested mappings by points; parsing has bounded their depth.
+
+    Returns:
+        Texts, arrays of few numbers, and lists that are no arrays; what is larger or null is left
+        out.
+    """
+    if isinstance(record, Mapping):
+        flat: dict[str, object] = {}
+        for name, value in record.items():
+            flat |= flattened(value, f"{prefix}{name}.")
+        return flat
+    name = prefix.rstrip(".") or "value"
+    if isinstance(record, str | bool):
+        return {name: str(record)}
+    try:
+        array = np.array(record, dtype=float)
+    except (ValueError, TypeError, OverflowError):
+        return {name: record}
+    return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
+
+
+def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
+    """Takes arrays whose first axis counts the rows; others are left out.
+
+    Raises:
+        DataError: There is no array with rows.
+    """
+    lengths = Counter(len(it) for it in arrays.values() if it.ndim > 1)
+    lengths = lengths or Counter(len(it) for it in arrays.values() if it.ndim == 1)
+    if not lengths:
+        shapes = ", ".join(f"{name} {it.shape}" for name, it in arrays.items()) or "nothing"
+        raise DataError(
+            f"{path} holds {shapes}; arrays with one row a pose are needed.", culprits=[str(path)]
+        )
+    rows = lengths.most_common(1)[0][0]
+    fitting = {
+        name: it
+        for name, it in arrays.items()
+        if it.ndim and len(it) == rows and it.size <= _MOST_NUMBERS * max(rows, 1)
+    }
+    numbers = {name: it.astype(float) for name, it in fitting.items() if it.dtype.kind in "fiub"}
+    texts = {name: _cells(it) for name, it in numbers.items() if it.ndim == 1}
+    texts |= {
+        name: tuple(it.decode("latin-1") if isinstance(it, bytes) else str(it) for it in array)
+        for name, array in fitting.items()
+        if array.dtype.kind in "US" and array.ndim == 1
+    }
+    places = tuple(f"{path.name}, row {at}" for at in range(rows))
+    return Fields(path.stem, path.parent, places, numbers, texts)
+
+
+def _cells(numbers: FloatArray) -> tuple[str, ...]:
+    """Writes (n,) numbers as the cells of a table, whole ones as counts are written."""
+    return tuple(
+        "" if np.isnan(it) else str(int(it)) if it % 1 == 0 else repr(it) for it in numbers.tolist()
+    )
+
+
+def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
+    """Tells what the columns of a table without a header are, by how many there are.
+
+    Returns:
+        The columns of `time`, `robot` and `camera`; empty where it has a header or another number.
+    """
+    names = [str(at) for at in range(1, len(fields.texts) + 1)]
+    if not names or list(fields.texts) != names:
+        return {"time": (), "robot": (), "camera": ()}
+    time, robot, camera = _UNNAMED.get(len(names), (0, 0, 0))
+    return {
+        "time": tuple(names[:time]),
+        "robot": tuple(names[time : time + robot]),
+        "camera": tuple(names[time + robot :]) if camera else (),
+    }
+
+
+def stamp_name(fields: Fields, taken: Collection[str]) -> str:
+    """Finds the field of the times, one number a row and none of those `taken`; else empty."""
+    named = (
+        name
+        for name, numbers in fields.numbers.items()
+        if name.lower() in _TIME_NAMES and name not in taken and numbers.size == len(fields)
+    )
+    return next(iter(_unnamed_times(fields, taken)), next(named, ""))
+
+
+def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
+    """The times in a table without a header, where the poses stand behind them."""
+    unnamed = unnamed_columns(fields)
+    if not set(unnamed["robot"]) <= set(taken):
+        return ()
+    # Numbers of rows are no times.
+    return tuple(
+        it for it in unnamed["time"] if (np.diff(np.sort(fields.column(it)[:, 0])) != 1).any()
+    )

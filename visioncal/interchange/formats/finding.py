@@ -1,0 +1,201 @@
+"""Finding files: in natural order, by the number in their names, and images by their rows."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import is_inside, natural
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+# Enough to tell what a text file is about.
+_HEAD_BYTES = 16_384
+
+
+def number_in(name: str) -> int | None:
+    """Takes the last number in a name without its ending; None where there is none."""
+    digits = re.findall(r"[0-9]+", Path(name).stem)
+    return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
+
+
+def listed(folder: Path) -> tuple[Path, ...]:
+    """Lists the files of a folder in natural order; none where it cannot be listed.
+
+    Links that lead out of it are left out.
+    """
+    try:
+        files = [it for it in folder.iterdir() if it.is_file()]
+    except OSError:
+        return ()
+    own = (it for it in files if not it.is_symlink() or is_inside(it, folder))
+    return tuple(sorted(own, key=natural))
+
+
+def images_in(folder: Path) -> tuple[Path, ...]:
+    """Lists the images of a folder in natural order.
+
+    Raises:
+        DataError: There are none.
+    """
+    found = tuple(it for it in listed(folder) if is_image_name(it.name))
+    if not found:
+        raise DataError(
+            f"{folder} has no images (png, jpg, tif).",
+            culprits=[str(folder)],
+            next_step="Name the folder of the images with --images.",
+        )
+    return found
+
+
+def head(path: Path) -> str:
+    """Reads the beginning of a text file; empty where it is none."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(_HEAD_BYTES)
+    except (OSError, ValueError):
+        return ""
+    return "" if b"\0" in data else data.decode("utf-8", "ignore")
+
+
+def images_named(
+    names: Sequence[str | None], base: Path, folder: Path | None
+) -> tuple[Path | None, ...]:
+    """Finds the images that rows name.
+
+    Args:
+        names: (n,) what each row says; None or empty in a row without an image.
+        base: What the names are relative to.
+        folder: Where the images lie now; they are matched by name, else by the number in it.
+
+    Returns:
+        (n,) paths; one that does not exist is where the source says that it should be.
+
+    Raises:
+        DataError: A name leaves the folder, or is of no image.
+    """
+    if folder is None:
+        found = [_beside(base, name) if name else None for name in names]
+    else:
+        found = _found(names, folder)
+    for name, path in zip(names, found, strict=True):
+        if path is not None and not is_image_name(path.name):
+            raise DataError(
+                f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif or bmp is needed.",
+                culprits=[str(name)[:80]],
+                next_step="Correct it, or name the column of the images with --image-column.",
+            )
+    return tuple(found)
+
+
+def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
+    there = images_in(folder)
+    by_name = {it.stem: it for it in there} | {it.name: it for it in there}
+    by_number = _unique_numbers(there)
+    wanted = [number_in(it) for it in names if it]
+    numbers_tell = len(set(wanted)) == len(wanted) and None not in wanted
+    found: list[Path | None] = []
+    for name in names:
+        if not name:
+            found.append(None)
+            continue
+        plain = name.replace("\\", "/").rsplit("/", 1)[-1]
+        number = number_in(plain)
+        match = by_name.get(plain)
+        if match is None and numbers_tell and number is not None:
+            match = by_number.get(number)
+        found.append(match or below(folder, plain))
+    return found
+
+
+def is_image_name(name: str) -> bool:
+    """Tells whether a name ends as those of images do."""
+    return name.lower().endswith(IMAGE_ENDINGS)
+
+
+def _beside(base: Path, name: str) -> Path:
+    """Finds a named image where the name says, else in the folder `images` beside the source."""
+    path = below(base, name)
+    inner = base / "images" / path.name
+    return inner if not path.exists() and is_inside(inner, base) and inner.exists() else path
+
+
+def _images_of(
+    folder: Path, views: Sequence[int], labels: Sequence[str], *, numbered: bool
+) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
+    """Pairs rows with the images of a folder, by number or in order.
+
+    Args:
+        folder: The folder.
+        views: (n,) the rows' numbers.
+        labels: (n,) the rows' places, for messages.
+        numbered: Whether these numbers stand in the source's names; else rows and images are paired
+            in natural order, and must be as many.
+
+    Returns:
+        (n,) paths, None in a row whose number no image has; and a note where order decides.
+
+    Raises:
+        DataError: Their numbers differ, with what is over.
+    """
+    there = images_in(folder)
+    by_number = _unique_numbers(there)
+    if numbered and len(by_number) == len(there) and by_number.keys() & set(views):
+        return tuple(by_number.get(it) for it in views), ()
+    if len(there) != len(views):
+        first, last = there[0].name, there[-1].name
+        raise DataError(
+            f"{folder} has {len(there)} images ({first} ... {last}), but there are {len(views)} "
+            f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
+            culprits=[str(folder)],
+            next_step="Remove what is over, or name each row's image with --image-column.",
+        )
+    return there, (
+        f"Rows and images are paired in order, {labels[0]} with {there[0].name}, {labels[-1]} with "
+        f"{there[-1].name}; --image-column names a column that tells each row's image.",
+    )
+
+
+def images_beside(
+    folder: Path,
+    chosen: Path | None,
+    views: Sequence[int],
+    labels: Sequence[str],
+    *,
+    numbered: bool,
+) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
+    """Pairs rows by number or in order with the images of `chosen`, else with any in the folder.
+
+    Returns:
+        (n,) paths, None in a row whose number no image has; and a note where order decides.
+
+    Raises:
+        DataError: `chosen` has no images, or they are not as many as the rows.
+    """
+    beside = any(is_image_name(it.name) for it in listed(folder))
+    if chosen is None and not beside:
+        return (), ()
+    return _images_of(chosen or folder, views, labels, numbered=numbered)
+
+
+def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
+    numbers = [(number_in(it.name), it) for it in paths]
+    counts = Counter(number for number, _ in numbers)
+    return {number: path for number, path in numbers if number is not None and counts[number] == 1}
+
+
+def below(base: Path, name: str) -> Path:
+    """Finds the file that a document names, relative to the document's folder.
+
+    Raises:
+        DataError: The path leaves the folder, itself or by a link, or can be none.
+    """
+    path = base / name.replace("\\", "/")
+    if not is_inside(path, base):
+        raise DataError(
+            f"{base}: the path {name[:80]!r} is too long or leaves the folder; a file inside it is "
+            "needed.",
+            culprits=[name[:80]],
+            next_step="Name the folder of the images with --images.",
+        )
+    return path

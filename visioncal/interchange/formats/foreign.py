@@ -1,0 +1,80 @@
+"""What someone else recorded, before anything is believed of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from visioncal.core.conventions import PoseNumbers
+from visioncal.core.types import FloatArray, IntArray, Mount
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Two streams of one motion, each with a clock of its own.
+
+    Attributes:
+        robot_s: (n,) times [s], ascending.
+        robot: (n,) `base_from_flange`.
+        camera_s: (k,) times [s], ascending.
+        camera: (k,) `cam_from_target`.
+    """
+
+    robot_s: FloatArray
+    robot: PoseNumbers
+    camera_s: FloatArray
+    camera: PoseNumbers
+
+
+@dataclass(frozen=True, eq=False)
+class Foreign:
+    """A recording in somebody else's form: n rows, each what was seen from one pose.
+
+    Attributes:
+        name: Its name.
+        robot: `base_from_flange` of each row.
+        camera: `cam_from_target` of each row; None where images stand for it.
+        images: (n,) the image of each row; None in a row without one, empty where there are none.
+        joints_rad: (n, j) joint angles [rad], NaN in a row without; None where they were not
+            recorded.
+        stamps_s: (n,) times [s]; None where they were not recorded.
+        mount: How the camera is mounted, where the source says so.
+        target: The content of a target's `.toml`, where the source describes one.
+        lens: The fields of `[camera]` in session.toml, where the source has intrinsics.
+        arm: The fields of `[robot]` in session.toml, where the user names one.
+        views: (n,) the rows' numbers in the source; 0, 1, ... where empty.
+        sweep: Two streams with clocks of their own, of which the rows are a sample; None where the
+            source has one clock.
+        columns: Further columns of views.csv with their (n,) cells.
+        notes: What was assumed or left aside, in sentences for the user.
+    """
+
+    name: str
+    robot: PoseNumbers
+    camera: PoseNumbers | None = None
+    images: tuple[Path | None, ...] = ()
+    joints_rad: FloatArray | None = None
+    stamps_s: FloatArray | None = None
+    mount: Mount | None = None
+    target: Mapping[str, Any] | None = None
+    lens: Mapping[str, Any] | None = None
+    arm: Mapping[str, Any] | None = None
+    views: tuple[int, ...] = ()
+    sweep: Sweep | None = None
+    columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
+    """Takes some rows of a recording, in the order that is given."""
+    count = len(foreign.robot)
+    return replace(
+        foreign,
+        robot=foreign.robot.rows(rows),
+        camera=None if foreign.camera is None else foreign.camera.rows(rows),
+        images=tuple(foreign.images[it] for it in rows) if foreign.images else (),
+        joints_rad=None if foreign.joints_rad is None else foreign.joints_rad[rows],
+        stamps_s=None if foreign.stamps_s is None else foreign.stamps_s[rows],
+        views=tuple((foreign.views or tuple(range(count)))[it] for it in rows),
+        columns={name: tuple(cells[it] for it in rows) for name, cells in foreign.columns.items()},
+    )

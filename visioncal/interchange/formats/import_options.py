@@ -1,0 +1,96 @@
+"""What the user says of somebody else's recording, beyond what the recording says itself."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.types import Mount
+
+
+@dataclass(frozen=True)
+class PoseWishes:
+    """Where poses stand and how they are written; what is None or empty is left to the source.
+
+    Attributes:
+        names: Columns of a table, keys of JSON or arrays of an .npz: position first.
+        form: A name among `POSE_FORMS` or `ROTATION_FORMS`.
+        unit: A name among `UNITS_M`.
+        inverse: Whether the inverse of the pose is written.
+    """
+
+    names: tuple[str, ...] = ()
+    form: str | None = None
+    unit: str | None = None
+    inverse: bool | None = None
+
+    def applied_to(self, poses: PoseNumbers) -> PoseNumbers:
+        """Reads poses as the user says; what the user does not say stays."""
+        return poses.read_as(self.reading(poses.reading))
+
+    def reading(self, declared: Reading) -> Reading:
+        """Changes a declared reading into what the user says.
+
+        Raises:
+            DataError: There is no such form or unit.
+        """
+        reading = declared
+        if self.form is not None:
+            maker = POSE_FORMS.get(self.form)
+            rotation = self.form if maker is None else maker.rotation
+            _check("form of poses", rotation, [*POSE_FORMS, *ROTATION_FORMS])
+            reading = replace(
+                reading, rotation=rotation, unit=maker.unit if maker else reading.unit
+            )
+        if self.unit is not None:
+            _check("unit of length", self.unit, list(UNITS_M))
+            reading = replace(reading, unit=self.unit)
+        if self.inverse is not None:
+            reading = replace(reading, inverse=self.inverse)
+        return reading
+
+
+def _check(what: str, name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise DataError(
+            f"There is no {what} named {name!r}; the names are {some_of(known, 20)}.",
+            culprits=[name],
+            next_step=did_you_mean(name, known),
+        )
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """Everything that the user says of a recording.
+
+    Attributes:
+        robot: Of the robot's poses, `base_from_flange`.
+        camera: Of the measured poses of the target, `cam_from_target`.
+        joints: Columns or keys of the joint angles.
+        joints_deg: Whether these are in degrees.
+        image: The column or key that names each row's image.
+        camera_file: A second file, which holds the camera's poses.
+        mount: How the camera is mounted.
+        target: A shipped name, the path of a `.toml`, or a description in one word.
+        intrinsics: The path of a file with intrinsics, or `estimate`.
+        images: A folder with the images.
+        resolution: (width, height) [px].
+        robot_model: A built-in robot's name, or the path of a .urdf or a DH .toml.
+        tip: The frame that the poses are of.
+    """
+
+    robot: PoseWishes = PoseWishes()
+    camera: PoseWishes = PoseWishes()
+    joints: tuple[str, ...] = ()
+    joints_deg: bool = False
+    image: str | None = None
+    camera_file: Path | None = None
+    mount: Mount | None = None
+    target: str | None = None
+    intrinsics: str | None = None
+    images: Path | None = None
+    resolution: tuple[int, int] | None = None
+    robot_model: str | None = None
+    tip: str | None = None

@@ -1,0 +1,191 @@
+"""ROS-Industrial: industrial_calibration, and robot_cal_tools before it."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.documents import as_numbers, mapping, number, read_yaml
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.finding import below, head, images_named, listed, number_in
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.intrinsics import intrinsics_from
+
+# Others keep the pose itself there.
+_NAMED_POSE = re.compile(r"\bpose: *[\"']?[^\n\"'\[{,]+\.ya?ml\b", re.IGNORECASE)
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def _hand_eye_file(path: Path) -> Path | None:
+    files = listed(path) if path.is_dir() else (path,)
+    for file in files:
+        if file.suffix.lower() in (".yaml", ".yml"):
+            words = head(file)
+            if "data:" in words and "image:" in words and _NAMED_POSE.search(words):
+                return file
+    return None
+
+
+def _kinematic_file(path: Path) -> Path | None:
+    files = listed(path) if path.is_dir() else (path,)
+    return next((it for it in files if "target_joints:" in head(it)), None)
+
+
+def _read_hand_eye(path: Path, wishes: Wishes) -> Foreign:
+    """Reads cal_data.yaml with a pose file and an image a row.
+
+    The poses are of the robot's flange in its base; `static_camera` tells the mount.
+    """
+    file = _required(_hand_eye_file(path), path, "a cal_data.yaml with pose and image rows")
+    document = mapping(read_yaml(file), str(file))
+    rows = document.get("data")
+    if not isinstance(rows, list) or not rows:
+        raise DataError(f"{file}: data holds no rows of pose and image.", culprits=[str(file)])
+    names, poses, places = [], [], []
+    for at, row in enumerate(rows):
+        entry = mapping(row, f"{file}: data, row {at}")
+        name = entry.get("pose")
+        if not isinstance(name, str):
+            raise DataError(f"{file}: data, row {at} names no pose.", culprits=[str(file)])
+        stored = below(file.parent, name)
+        poses.append(pose_numbers_of(read_yaml(stored), str(stored)))
+        places.append(name)
+        names.append(str(entry["image"]) if entry.get("image") else None)
+    numbers = np.array(poses)
+    static = document.get("static_camera")
+    if not isinstance(static, bool | None):
+        raise DataError(
+            f"{file}: static_camera is {static!r}; true or false is needed.", culprits=[str(file)]
+        )
+    notes: list[str] = []
+    # What the user says stands in place of what the source does.
+    lens = None if wishes.intrinsics else _lens(document, str(file), notes)
+    target = None if wishes.target else _target(document, notes)
+    numbered = [number_in(it) for it in places]
+    views = tuple(it for it in numbered if it is not None)
+    return Foreign(
+        name=file.parent.name,
+        robot=wishes.robot.applied_to(
+            PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), tuple(places))
+        ),
+        images=images_named(names, file.parent, wishes.images),
+        mount=None if static is None else "eye-to-hand" if static else "eye-in-hand",
+        target=target,
+        lens=lens,
+        views=views if len(set(views)) == len(places) else (),
+        notes=tuple(notes),
+    )
+
+
+def pose_numbers_of(value: object, where: str) -> list[float]:
+    """Reads x, y, z, qx, qy, qz, qw [m]."""
+    content = mapping(value, where)
+    return [number(content.get(it), f"{where}: {it}") for it in _POSE]
+
+
+def _lens(document: Mapping[str, Any], where: str, notes: list[str]) -> dict[str, Any] | None:
+    if "intrinsics" not in document:
+        return None
+    notes.append(
+        "The intrinsics of the source have no distortion; it is taken for zero. "
+        "--intrinsics estimate leaves them out."
+    )
+    return intrinsics_from(document, where)[0]
+
+
+def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | None:
+    finder = document.get("target_finder")
+    if not isinstance(finder, Mapping):
+        return None
+    kind = str(finder.get("type", ""))
+    if "Charuco" not in kind:
+        notes.append(f"The target finder {kind[:60]!r} has no twin here; name the target.")
+        return None
+    where = "target_finder"
+    return {
+        "kind": "charuco",
+        "columns": _integer(finder.get("cols"), f"{where}: cols"),
+        "rows": _integer(finder.get("rows"), f"{where}: rows"),
+        "square_m": number(finder.get("chessboard_dim"), f"{where}: chessboard_dim"),
+        "marker_m": number(finder.get("aruco_marker_dim"), f"{where}: aruco_marker_dim"),
+        "dictionary": _dictionary(finder.get("dictionary"), f"{where}: dictionary"),
+        "legacy": False,
+    }
+
+
+def _dictionary(value: object, where: str) -> str:
+    """Names OpenCV's dictionary of a number."""
+    if isinstance(value, str):
+        return value
+    wanted = _integer(value, where)
+    names = [it for it in dir(cv2.aruco) if it.startswith("DICT_")]
+    found = [it for it in names if getattr(cv2.aruco, it) == wanted]
+    if not found:
+        raise DataError(f"{where} is {wanted}, which OpenCV does not have.", culprits=[where])
+    return found[0]
+
+
+def _integer(value: object, where: str) -> int:
+    found = number(value, where)
+    if found % 1:
+        raise DataError(f"{where} is {found}; a whole number is needed.", culprits=[where])
+    return int(found)
+
+
+def _read_kinematics(path: Path, wishes: Wishes) -> Foreign:
+    """Reads kinematic measurements: cam_from_target with the joints of either chain."""
+    file = _required(_kinematic_file(path), path, "a file with camera_joints and target_joints")
+    document = mapping(read_yaml(file), str(file))
+    poses = []
+    joints: dict[str, list[FloatArray]] = {"camera_joints": [], "target_joints": []}
+    for name, row in document.items():
+        entry = mapping(row, f"{file}: {name}")
+        poses.append(pose_numbers_of(entry.get("pose"), f"{file}: {name}: pose"))
+        for chain, values in joints.items():
+            values.append(as_numbers(entry.get(chain, []), f"{file}: {name}: {chain}").reshape(-1))
+    moving = [it for it, values in joints.items() if any(len(row) for row in values)]
+    counts = {len(row) for it in moving for row in joints[it]}
+    if len(moving) != 1 or len(counts) != 1:
+        raise DataError(
+            f"{file}: {' and '.join(moving) or 'no chain'} with {sorted(counts)} joints; one chain "
+            "with the same joints in every row is needed.",
+            culprits=[str(file)],
+        )
+    numbers = np.array(poses)
+    places = tuple(f"{file.name}: {it}" for it in document)
+    camera = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
+    return Foreign(
+        name=file.stem,
+        robot=PoseNumbers.nowhere(places),
+        camera=wishes.camera.applied_to(camera),
+        joints_rad=np.array(joints[moving[0]]),
+        mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",
+        columns={"source_row": tuple(str(it) for it in document)},
+    )
+
+
+def _required(path: Path | None, source: Path, needed: str) -> Path:
+    if path is None:
+        raise DataError(f"{source} has not {needed}.", culprits=[str(source)])
+    return path
+
+
+HAND_EYE = ForeignFormat(
+    "industrial-calibration",
+    "ROS-Industrial's cal_data.yaml with poses and images",
+    lambda path: _hand_eye_file(path) is not None,
+    _read_hand_eye,
+)
+KINEMATICS = ForeignFormat(
+    "industrial-kinematics",
+    "ROS-Industrial's kinematic measurements",
+    lambda path: _kinematic_file(path) is not None,
+    _read_kinematics,
+)

@@ -1,0 +1,234 @@
+"""Intrinsics as others store them, turned into the fields of `[camera]` in session.toml."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.documents import (
+    Element,
+    as_numbers,
+    is_number,
+    mapping,
+    number,
+    read_npz,
+    read_opencv,
+    read_xml,
+)
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
+
+_MATRIX_KEYS: tuple[str, ...] = (
+    "camera_matrix",
+    "cameraMatrix",
+    "camera_intrinsics",
+    "intrinsic_matrix",
+    "IntrinsicMatrix",
+    "K",
+    "k",
+    "mtx",
+    "M1",
+    "intrinsic",
+)
+_DISTORTION_KEYS: tuple[str, ...] = (
+    "distortion_coefficients",
+    "dist_coeffs",
+    "distCoeffs",
+    "distortion",
+    "dist",
+    "D",
+    "d",
+    "D1",
+)
+_SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
+# Pixels are square to a millionth of their size, or the model is another.
+_MOST_SKEW = 1e-6
+_FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
+_BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
+
+
+def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Reads the intrinsics of a camera.
+
+    Known are ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
+    ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, and .npz or JSON with a matrix under one of
+    the usual names.
+
+    Returns:
+        model, matrix, distortion, and resolution where the file has it; and what was assumed.
+
+    Raises:
+        DataError: It is none of these, or a lens model that is not known here.
+    """
+    if path.suffix.lower() == ".npz":
+        return intrinsics_from(read_npz(path), str(path))
+    if path.suffix.lower() == ".xml":
+        root = read_xml(path)
+        if root.child("camera") is not None:
+            return _visp(root, str(path)), ()
+    return intrinsics_from(read_opencv(path), str(path))
+
+
+def intrinsics_from(
+    content: Mapping[str, Any], where: str
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Takes the intrinsics out of a document, as `read_intrinsics` does out of a file.
+
+    Raises:
+        DataError: There are none in it.
+    """
+    if "cam0" in content:
+        return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0"), ()
+    inner = content.get("intrinsics")
+    if isinstance(inner, Mapping):
+        return intrinsics_from(inner, f"{where}: intrinsics")
+    if {"fx", "fy", "cx", "cy"} <= content.keys():
+        values = [number(content[it], f"{where}: {it}") for it in ("fx", "fy", "cx", "cy")]
+        return _lens("brown", values, [], content, where), ()
+    key = next((it for it in _MATRIX_KEYS if it in content), None)
+    if key is None:
+        raise DataError(
+            f"{where} has no camera matrix; it has {', '.join(map(str, list(content)[:20]))}.",
+            culprits=[where],
+            next_step=f"The usual names are {', '.join(_MATRIX_KEYS[:5])}, or fx, fy, cx, cy.",
+        )
+    k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
+    coefficients: object = next((content[it] for it in _DISTORTION_KEYS if it in content), [])
+    flat = _array(coefficients, f"{where}: distortion").reshape(-1)
+    notes: tuple[str, ...] = ()
+    if len(flat) == 4 and "distortion_model" not in content:
+        notes = (
+            f"{where}: four distortion coefficients without a model are taken for k1, k2, p1, p2; "
+            "OpenCV's fisheye model has four as well.",
+        )
+    model = _model(str(content.get("distortion_model", "plumb_bob")), where)
+    lens = _lens(model, [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], list(flat), content, where)
+    return lens, notes
+
+
+def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
+    """Takes nine numbers as fx, 0, cx; 0, fy, cy; 0, 0, 1: by rows or, as 0, 0, 1 shows, columns.
+
+    Open3D and MATLAB write columns.
+    """
+    k = numbers.reshape(3, 3) if numbers.size == 9 else np.zeros((3, 3))
+    last = [0.0, 0.0, 1.0]
+    k = k.T if not np.array_equal(k[2], last) and np.array_equal(k[:, 2], last) else k
+    if not np.array_equal(k[2], last) or k[1, 0] or abs(k[0, 1]) > _MOST_SKEW * abs(k[0, 0]):
+        raise DataError(
+            f"{where} is {np.array2string(numbers.reshape(-1)[:9], precision=6)}; the nine numbers "
+            "fx, 0, cx, 0, fy, cy, 0, 0, 1 are needed.",
+            culprits=[where],
+            next_step="Leave it out with --intrinsics estimate.",
+        )
+    return k
+
+
+def _array(value: object, where: str) -> FloatArray:
+    """Numbers, or the data of a ROS matrix."""
+    if isinstance(value, Mapping):
+        return as_numbers(value.get("data"), f"{where}: data")
+    return as_numbers(value, where)
+
+
+def _model(name: str, where: str) -> str:
+    if name.lower() in _FISHEYE:
+        return "fisheye"
+    if name.lower() in _BROWN:
+        return "brown"
+    raise DataError(
+        f"{where}: the lens model {name[:40]!r} is not known; {', '.join(_BROWN + _FISHEYE)} are.",
+        culprits=[where],
+        next_step="Leave it out with --intrinsics estimate.",
+    )
+
+
+def _kalibr(content: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Kalibr's camchain (Kalibr wiki, "Yaml formats"): pinhole with radtan or equidistant."""
+    if content.get("camera_model", "pinhole") != "pinhole":
+        raise DataError(
+            f"{where}: the camera model {str(content['camera_model'])[:40]!r} is not known; "
+            "pinhole is needed.",
+            culprits=[where],
+        )
+    values = as_numbers(content.get("intrinsics"), f"{where}: intrinsics").reshape(-1)
+    if len(values) != 4:
+        raise DataError(
+            f"{where}: intrinsics has {len(values)} numbers; fu, fv, pu, pv are needed.",
+            culprits=[where],
+        )
+    flat = as_numbers(content.get("distortion_coeffs", []), f"{where}: distortion_coeffs")
+    model = _model(str(content.get("distortion_model", "none")), where)
+    return _lens(model, list(values), list(flat.reshape(-1)), content, where)
+
+
+def _visp(root: Element, where: str) -> dict[str, Any]:
+    """ViSP's camera XML (ViSP, vpCameraParameters).
+
+    Its k_ud carries undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
+    """
+    camera = root.child("camera") or root
+    models = [it for it in camera.children if it.tag == "model"]
+    kinds = [(it.child("type") or it).text for it in models]
+    chosen = [it for it, kind in zip(models, kinds, strict=True) if kind.endswith("WithDistortion")]
+    if not models:
+        raise DataError(f"{where}: the camera has no <model>.", culprits=[where])
+    model = (chosen or models)[0]
+
+    def read(element: Element, tag: str, default: float | None = None) -> float:
+        child = element.child(tag)
+        if child is None and default is not None:
+            return default
+        place, text = f"{where}: <{tag}>", child.text if child else ""
+        return number(float(text) if is_number(text) else text, place)
+
+    values = [read(model, it) for it in ("px", "py", "u0", "v0")]
+    size = {"width": read(camera, "image_width", 0.0), "height": read(camera, "image_height", 0.0)}
+    return _lens("brown", values, [read(model, "kud", 0.0)], size if size["width"] else {}, where)
+
+
+def _lens(
+    model: str,
+    matrix: list[float],
+    coefficients: list[float],
+    content: Mapping[str, Any],
+    where: str,
+) -> dict[str, Any]:
+    if not (matrix[0] > 0 and matrix[1] > 0):
+        raise DataError(
+            f"{where}: the focal lengths are {matrix[0]:g} and {matrix[1]:g} px; both must be "
+            "above 0.",
+            culprits=[where],
+        )
+    count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
+    beyond = [it for it in coefficients[count:] if it]
+    values = np.array([*matrix, *coefficients])
+    if not np.isfinite(values).all() or beyond:
+        what = f"{len(coefficients)} coefficients" if beyond else "a number that is not finite"
+        raise DataError(
+            f"{where}: {what}; up to {count} of the {model} model are known here.",
+            culprits=[where],
+        )
+    padded = (coefficients + [0.0] * count)[:count]
+    lens: dict[str, Any] = {
+        "model": model,
+        "matrix": [float(it) for it in matrix],
+        "distortion": [float(it) for it in padded],
+    }
+    size = _size(content, where)
+    return lens | ({"resolution": list(size)} if size else {})
+
+
+def _size(content: Mapping[str, Any], where: str) -> tuple[int, int] | None:
+    for names in _SIZE_KEYS:
+        if set(names) <= content.keys():
+            sides = [number(content[it], f"{where}: {it}") for it in names]
+            break
+    else:
+        if "resolution" not in content:
+            return None
+        sides = list(as_numbers(content["resolution"], f"{where}: resolution").reshape(-1))
+    if len(sides) != 2 or not all(it % 1 == 0 and 0 < it < 1e6 for it in sides):
+        raise DataError(f"{where}: the size of the image is {sides}.", culprits=[where])
+    return int(sides[0]), int(sides[1])

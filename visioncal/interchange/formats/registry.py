@@ -1,0 +1,188 @@
+"""The formats that are known, and the way from one to another."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeAlias
+
+from visioncal.calibration.guess import Candidate
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, did_you_mean
+from visioncal.interchange.formats.assemble import assemble, wished
+from visioncal.interchange.formats.columns import TABLE
+from visioncal.interchange.formats.finding import listed
+from visioncal.interchange.formats.folder import FOLDER
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.format import ForeignFormat, OwnFormat
+from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
+from visioncal.interchange.formats.poses import check_radians
+from visioncal.interchange.formats.recording import RECORDING
+from visioncal.interchange.formats.rereading import load_in_doubt, reread, reread_session
+from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
+from visioncal.interchange.formats.views import VIEWS
+from visioncal.interchange.formats.visp import VISP
+from visioncal.interchange.formats.zivid import ZIVID
+from visioncal.session import Session
+from visioncal.session.single import check_one_of_each
+
+OWN_FORMATS: tuple[OwnFormat, ...] = (FOLDER, RECORDING)
+
+# The first that recognises a path reads it: those that look for less come last.
+FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
+    HAND_EYE,
+    KINEMATICS,
+    VISP,
+    ZIVID,
+    EASY_HANDEYE,
+    MOVEIT,
+    VIEWS,
+    TABLE,
+)
+
+_NO_WISHES = Wishes()
+
+# Tries other readings of the poses, and settles which is right.
+Choose: TypeAlias = Callable[[Session | Foreign], Candidate]
+
+
+def convert(
+    source: Path,
+    dest: Path,
+    *,
+    wishes: Wishes = _NO_WISHES,
+    form: str | None = None,
+    force: bool = False,
+    choose: Choose | None = None,
+) -> Session:
+    """Writes a session, or somebody else's recording, as a session's folder or as a recording.
+
+    A session goes from one form of ours to another without loss.
+
+    Args:
+        source: The session, in any of `OWN_FORMATS`, or a recording in any of `FOREIGN_FORMATS`.
+        dest: Where to; its suffix says in which form, and none of theirs means a folder.
+        wishes: What is to be known of somebody else's recording beyond what it says.
+        form: The name of its format, where it is not to be recognised.
+        force: Whether a file that is there may be replaced; a folder never is.
+        choose: Called, where it is in doubt how the poses are meant, with what was read; what it
+            answers is what is written.
+
+    Returns:
+        The session.
+
+    Raises:
+        DataError: `source` is neither, `wishes` are not for it, `dest` is taken, cannot be written
+            or, read again, is another session.
+    """
+    _check_dest(source, dest, force=force)
+    own = next((it for it in OWN_FORMATS if form is None and it.recognises(source)), None)
+    if own is None:
+        foreign = read_foreign(source, wishes, form)
+        if choose is None:
+            check_radians(foreign.robot, wishes.robot, "robot")
+            if foreign.camera is not None:
+                check_radians(foreign.camera, wishes.camera, "camera")
+        session = assemble(foreign if choose is None else reread(foreign, choose(foreign)))
+    elif wishes != _NO_WISHES:
+        raise DataError(
+            f"{source} is a session already; what describes poses and cameras is for somebody "
+            "else's recording.",
+            culprits=[str(source)],
+            next_step="Edit its session.toml, or convert its views.csv.",
+        )
+    elif choose is None:
+        session = own.read(source)
+    else:
+        session = load_in_doubt(source)
+        check_one_of_each(session)
+        session = reread_session(session, choose(session))
+    write_session(session, dest)
+    return session
+
+
+def read_foreign(source: Path, wishes: Wishes, form: str | None = None) -> Foreign:
+    """Reads somebody else's recording, as the user says that it is to be read.
+
+    Args:
+        source: A file or folder in any of `FOREIGN_FORMATS`.
+        wishes: What the user says of it.
+        form: The name of its format; None to recognise it.
+
+    Raises:
+        DataError: It is of no known format, or something in it is wrong.
+    """
+    # Two files are two tables, whatever the first of them looks like.
+    form = form or (TABLE.name if wishes.camera_file is not None else None)
+    return wished(_foreign_format(source, form).read(source, wishes), wishes)
+
+
+def write_session(session: Session, dest: Path) -> None:
+    """Writes a session in the form that the suffix of `dest` tells, and reads it again.
+
+    Raises:
+        DataError: There is nothing in the session, `dest` cannot be written, or does not hold it.
+    """
+    if not session.views and not session.streams:
+        raise DataError(
+            " ".join([f"Session {session.name!r} has no view and no stream.", *session.warnings]),
+            culprits=[session.name],
+            next_step="Nothing was written; record it again.",
+        )
+    form = _format_for(dest)
+    form.write(session, dest)
+    if form.read(dest).digest() != session.digest():
+        raise DataError(
+            f"{dest} does not hold the session {session.name}: their digests differ.",
+            culprits=[str(dest)],
+            next_step="Remove it, and report this with the session.",
+        )
+
+
+def _check_source(source: Path) -> None:
+    if not source.exists():
+        raise DataError(
+            f"{source} does not exist.",
+            culprits=[str(source)],
+            next_step="Check the path and its spelling.",
+        )
+    if not (source.is_file() or source.is_dir()):
+        raise DataError(
+            f"{source} is no regular file; a file or a folder is needed.",
+            culprits=[str(source)],
+            next_step="Save what it gives as a file first.",
+        )
+
+
+def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
+    is_folder = not _format_for(dest).suffix
+    # An empty folder is free for a session's folder, which looks for itself.
+    if not (is_folder and dest.is_dir()):
+        same = source.exists() and dest.exists() and dest.samefile(source)
+        check_free(dest, force=force, replaceable=not is_folder and not same)
+
+
+def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
+    _check_source(source)
+    names = [it.name for it in FOREIGN_FORMATS]
+    if form is not None and form not in names:
+        raise DataError(
+            f"There is no format named {form!r}; the names are {', '.join(names)}.",
+            culprits=[form],
+            next_step=did_you_mean(form, names),
+        )
+    for known in FOREIGN_FORMATS:
+        if known.name == form or (form is None and known.recognises(source)):
+            return known
+    words = "; ".join([it.words for it in OWN_FORMATS] + [it.words for it in FOREIGN_FORMATS])
+    inside = ", ".join(it.name for it in listed(source)[:8]) if source.is_dir() else ""
+    raise DataError(
+        f"{source} is no session and in no format that is known: {words}."
+        + (f" It holds {inside}." if inside else ""),
+        culprits=[str(source)],
+        next_step="Write the poses into a CSV with a header, a row a view.",
+    )
+
+
+def _format_for(dest: Path) -> OwnFormat:
+    by_suffix = {it.suffix: it for it in OWN_FORMATS}
+    return by_suffix.get(dest.suffix.lower(), FOLDER)

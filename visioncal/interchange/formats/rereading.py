@@ -1,0 +1,213 @@
+"""Other readings of a recording's poses: which is right, and the recording read that way."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visioncal.calibration.guess import Candidate, Guess, guess_reading
+from visioncal.calibration.guess.hypothesis import Hypothesis
+from visioncal.calibration.pipeline.guess_inputs import (
+    chain_poses,
+    numbers_in,
+    seen_poses,
+    told_or_chained,
+)
+from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_toml
+from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress
+from visioncal.interchange.formats.assemble import assemble, pose_cells, spoken
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.session import Session, Stream
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
+from visioncal.vision.targets import LARGEST_M
+
+# Distances between consecutive rows of one log go up and down together.
+_FEWEST_STEPS, _SAME_LOG = 4, 0.9
+# No printed square is larger.
+_LARGEST_MM = 1e3 * LARGEST_M
+_LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
+
+
+def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Guess:
+    """Tries every plausible reading of somebody else's poses, and both mounts where none is known.
+
+    Raises:
+        DataError: There is nothing to read, the target is in no view, or nothing tells the mount.
+        DegenerateError: Too few views have both poses.
+        ConvergenceError: The intrinsics do not come to rest.
+    """
+    foreign = spoken(foreign)
+    # The mount has no part in what is taken from the session here.
+    session = assemble(foreign, mount=MOUNTS[0])
+    chain = chain_poses(session)
+    camera = foreign.camera
+    if camera is None:
+        camera = seen_poses(session, progress=progress)
+    return guess_reading(
+        told_or_chained(foreign.robot, chain),
+        camera,
+        foreign.mount,
+        chain=chain,
+        is_measured=foreign.camera is None,
+    )
+
+
+def reread(foreign: Foreign, candidate: Candidate) -> Foreign:
+    """Reads a recording as a candidate has it: poses, pairing, mount and the size of the board.
+
+    Raises:
+        DataError: It reads the robot's poses otherwise, and there are joint angles in their place.
+    """
+    foreign, notes, taken = spoken(foreign), _note(candidate), candidate.hypothesis
+    if foreign.mount is None:
+        notes = (*notes, f"The mount is taken for {taken.mount}.")
+    robot, camera, joints = foreign.robot, foreign.camera, foreign.joints_rad
+    _check_applies(candidate, robot)
+    if joints is not None:
+        chain = chain_poses(assemble(foreign, mount=taken.mount))
+        if _go_together(chain, robot):
+            order = taken.rows(len(joints))
+            joints = np.where((order >= 0)[:, None], joints[order], np.nan)
+    target, sweep = foreign.target, foreign.sweep
+    if sweep is not None:
+        corrected = taken.robot.corrected(sweep.robot), taken.camera.corrected(sweep.camera)
+        sweep = replace(sweep, robot=corrected[0], camera=corrected[1])
+    return replace(
+        foreign,
+        sweep=sweep,
+        robot=taken.robot_numbers(robot) if robot.there.any() else robot,
+        camera=None if camera is None else taken.camera_numbers(camera),
+        joints_rad=joints,
+        mount=taken.mount,
+        target=None if target is None else _scaled(target, candidate.board_scale),
+        notes=(*foreign.notes, *notes),
+    )
+
+
+def load_in_doubt(path: Path) -> Session:
+    """Loads a session that is to be read anew: a board larger than any is taken for millimetres.
+
+    Raises:
+        DataError: It is no session.
+    """
+    file = path / "session.toml"
+    name = read_toml(file, file.name).get("target") if file.is_file() else None
+    if not isinstance(name, str) or not name.endswith(".toml"):
+        return Session.load(path)
+    stated = read_toml(path / name, name)
+    sides = [stated[it] for it in ("square_m", "size_m") if isinstance(stated.get(it), int | float)]
+    if not sides or not LARGEST_M < sides[0] < _LARGEST_MM:
+        return Session.load(path)
+    session = Session.load(path, target_document=_scaled(stated, 1e-3))
+    note = f"{name} can only be in millimetres: a side of {sides[0]:g} is read as {sides[0]:g} mm."
+    return replace(session, warnings=(note, *session.warnings))
+
+
+def reread_session(session: Session, candidate: Candidate) -> Session:
+    """Reads a session's poses as a candidate has it; everything else stays as it is.
+
+    Raises:
+        DataError: The session that comes out is wrong; or as `reread`.
+    """
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    robot, camera = numbers_in(session, POSE), numbers_in(session, MEASURED_CAM_POSE)
+    taken = candidate.hypothesis
+    _check_applies(candidate, robot)
+    if _go_together(chain_poses(session), robot):
+        _reorder(cells, taken.rows(len(cells)), joint_columns(session.columns))
+    if robot.there.any():
+        _replace(cells, pose_cells(taken.robot_numbers(robot), POSE), POSE)
+    if camera.there.any():
+        corrected = pose_cells(taken.camera_numbers(camera), MEASURED_CAM_POSE)
+        _replace(cells, corrected, MEASURED_CAM_POSE)
+    document = {**session.document, "mount": taken.mount}
+    target = session.target_document
+    if target is not None and candidate.board_scale != 1.0 and not session.targets:
+        target = _scaled(target, candidate.board_scale)
+        document["target"] = "target.toml"
+    reread = Session.assemble(
+        document,
+        session.columns,
+        [[row[name] for name in session.columns] for row in cells],
+        session.images,
+        target_document=target,
+        robot_document=session.robot_document,
+        corners=session.corner_table,
+    ).with_streams({name: _reread_stream(it, taken) for name, it in session.streams.items()})
+    said = dict.fromkeys((*_note(candidate), *session.warnings, *reread.warnings))
+    return replace(reread, warnings=tuple(said))
+
+
+def _reread_stream(stream: Stream, taken: Hypothesis) -> Stream:
+    """Reads the poses of a stream as they are read in views."""
+    if any(name not in stream for name in POSE):
+        return stream
+    numbers = np.stack([stream[name] for name in POSE], axis=1)
+    places = tuple(f"sample {row + 1}" for row in range(len(stream)))
+    poses = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
+    values = stream.values.copy()
+    columns = [stream.columns.index(name) for name in POSE]
+    rows = pose_cells(taken.robot.corrected(poses), POSE)
+    values[:, columns] = [[float(row.get(name, "nan")) for name in POSE] for row in rows]
+    values.setflags(write=False)
+    return replace(stream, values=values)
+
+
+def _note(candidate: Candidate) -> tuple[str, ...]:
+    if not candidate.changes:
+        return ()
+    return (f"The poses are read otherwise than declared: {candidate.words}.",)
+
+
+def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
+    """Joint angles can change rows with their views, and nothing else."""
+    if not robot.there.any() and candidate.hypothesis.robot != candidate.declared.robot:
+        raise DataError(
+            f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
+            "alone, of which that cannot be said.",
+            culprits=[candidate.words],
+            next_step="Check the robot's model, its tip, and the camera's poses.",
+        )
+
+
+def _go_together(chain: FloatArray | None, robot: PoseNumbers) -> bool:
+    """Whether each row's joint angles are of its pose: they then change rows with it.
+
+    Without a model of the robot nobody can tell, and one log is the likelier.
+    """
+    if chain is None or not robot.there.any():
+        return True
+    # Other units or frames move all rows alike: what differs from row to row tells.
+    steps = [
+        np.linalg.norm(np.diff(it, axis=0), axis=1) for it in (chain[:, :3, 3], robot.positions)
+    ]
+    both = np.isfinite(steps).all(axis=0)
+    if both.sum() < _FEWEST_STEPS:
+        return True
+    return bool(np.corrcoef(steps[0][both], steps[1][both])[0, 1] > _SAME_LOG)
+
+
+def _reorder(rows: Sequence[dict[str, str]], order: IntArray, names: Sequence[str]) -> None:
+    before = [{name: row[name] for name in names} for row in rows]
+    for row, at in zip(rows, order, strict=True):
+        row.update(before[at] if at >= 0 else dict.fromkeys(names, ""))
+
+
+def _replace(
+    rows: Sequence[dict[str, str]], cells: Sequence[Mapping[str, str]], names: Sequence[str]
+) -> None:
+    for row, own in zip(rows, cells, strict=True):
+        row.update({name: own.get(name, "") for name in names})
+
+
+def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
+    if factor == 1.0:
+        return target
+    return {
+        it: factor * value if it in _LENGTHS and isinstance(value, int | float) else value
+        for it, value in target.items()
+    }

@@ -1,0 +1,133 @@
+"""Two streams of poses with clocks of their own: their times, and moments that both have seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.calibration.stages.motion import slow_and_new
+from visioncal.calibration.stages.offset import LEAST_CORRELATION
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.clock_correlation import WIDEST_OFFSET_S, Frames, Match, turning_matches
+from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
+
+# Less in common tells no offset; more is a recording of work, not of a calibration.
+_SHORTEST_S, _LONGEST_S = 2.0, 3600.0
+# Epochs of our days count 1e9 seconds: (larger than, seconds).
+_EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+
+
+@dataclass(frozen=True, eq=False)
+class Paired:
+    """Slow moments that two streams have in common: a fair sample of them.
+
+    Attributes:
+        rows: (m,) the camera's samples that were chosen.
+        base_from_flange: (m, 4, 4) the robot's poses at those moments [m].
+        match: How the clocks go together, to a fraction of a frame.
+    """
+
+    rows: IntArray
+    base_from_flange: FloatArray
+    match: Match
+
+
+def seconds(stamps: FloatArray, places: Sequence[str]) -> FloatArray:
+    """Reads stamps as seconds; those of an epoch may be in milli-, micro- or nanoseconds.
+
+    Raises:
+        DataError: A stamp is missing, or they do not increase.
+    """
+    if not np.isfinite(stamps).all():
+        place = places[int(np.argmin(np.isfinite(stamps)))]
+        raise DataError(f"{place}: the time is missing.", culprits=[place])
+    falls = np.diff(stamps) <= 0
+    if falls.any():
+        place = places[int(np.argmax(falls)) + 1]
+        raise DataError(
+            f"{place}: the time does not increase from the row before.",
+            culprits=[place],
+            next_step="Sort the rows by time and remove doubled ones.",
+        )
+    return in_seconds(stamps)
+
+
+def in_seconds(stamps: FloatArray) -> FloatArray:
+    """Reads stamps as seconds; an epoch in milli-, micro- or nanoseconds tells by its size."""
+    known = np.abs(stamps[np.isfinite(stamps)])
+    largest = float(known.max()) if len(known) else 0.0
+    return stamps * next((it for limit, it in _EPOCHS if largest > limit), 1.0)
+
+
+def pair_streams(
+    robot_s: FloatArray, robot: FloatArray, camera_s: FloatArray, camera: FloatArray
+) -> Paired:
+    """Finds about how the clocks go together, and moments at which the robot is slow.
+
+    Args:
+        robot_s: (n,) times [s], increasing.
+        robot: (n, 4, 4) `base_from_flange`, or the inverse [m].
+        camera_s: (k,) times [s], increasing.
+        camera: (k, 4, 4) `cam_from_target`, or the inverse [m].
+
+    Raises:
+        DataError: The streams have too little time in common, or their motions do not agree.
+    """
+    _check_common(robot_s, camera_s)
+    flange = Trajectory(robot_s, robot)
+    match = _match(flange, Frames("eye-in-hand", camera_s, camera))
+    at_s = camera_s - match.offset_s
+    rows = np.flatnonzero(flange.covers(at_s))
+    if len(rows) < 3:
+        raise DataError(
+            f"The robot's poses cover {len(rows)} samples of the camera's; 3 or more are "
+            f"needed. They are {flange.step_s:.2f} s apart; where the gap is {LONGEST_GAP_S} s or "
+            "more, nothing is interpolated.",
+            culprits=["robot", "camera"],
+            next_step="Log the robot's pose ten times a second or more.",
+        )
+    poses = flange.at(at_s[rows])
+    chosen = slow_and_new(poses, flange.speeds(at_s[rows]))
+    return Paired(rows[chosen], poses[chosen], match)
+
+
+def _check_common(robot_s: FloatArray, camera_s: FloatArray) -> None:
+    common_s = min(robot_s[-1], camera_s[-1]) - max(robot_s[0], camera_s[0])
+    if common_s < _SHORTEST_S:
+        raise DataError(
+            f"The streams have {max(common_s, 0.0):.1f} s in common (robot {robot_s[0]:.2f} to "
+            f"{robot_s[-1]:.2f}, camera {camera_s[0]:.2f} to {camera_s[-1]:.2f}); "
+            f"{_SHORTEST_S:g} s or more are needed.",
+            culprits=["robot", "camera"],
+            next_step="Stamp both with the same clock, to within a few seconds.",
+        )
+    if common_s > _LONGEST_S:
+        raise DataError(
+            f"The streams have {common_s:.0f} s in common; up to {_LONGEST_S:.0f} are read.",
+            culprits=["robot", "camera"],
+            next_step="Cut the recording into parts.",
+        )
+
+
+def _match(flange: Trajectory, frames: Frames) -> Match:
+    best = next(iter(turning_matches(flange, frames)), Match(0.0, np.inf, 0.0))
+    if flange.step_s >= LONGEST_GAP_S:
+        # Nothing can be compared; whoever looks for covered samples says so.
+        return best
+    if best.correlation < LEAST_CORRELATION:
+        raise DataError(
+            f"The turning of robot and camera agrees with a correlation of {best.correlation:.2f} "
+            f"at best, {best.offset_s:+.2f} s apart; {LEAST_CORRELATION} is needed.",
+            culprits=["robot", "camera"],
+            next_step="Check that both streams are of the same motion.",
+        )
+    if best.at_end:
+        raise DataError(
+            f"The turning of robot and camera agrees best {best.offset_s:+.2f} s apart, "
+            f"where the search ends: offsets within {WIDEST_OFFSET_S:g} s and a quarter of the "
+            "time in common are tried.",
+            culprits=["robot", "camera"],
+            next_step="Stamp both with clocks that differ by less, or record for longer.",
+        )
+    return best

@@ -1,0 +1,212 @@
+"""Files of touches and of CAD points: tables in any form that `convert` reads."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.core.conventions import POSE_FORMS, UNITS_M
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.types import FloatArray
+from visioncal.frames.drawing_points import NominalPoints
+from visioncal.frames.touches import TouchRows, touches_of
+from visioncal.interchange.formats.columns import foreign_from, read_fields, view_numbers
+from visioncal.interchange.formats.fields import Fields, unnamed_columns
+from visioncal.interchange.formats.import_options import PoseWishes, Wishes
+from visioncal.interchange.formats.poses import ROBOT_KEYS, check_radians, pose_names
+from visioncal.session import Session
+from visioncal.session.columns import joint_columns
+
+_NAMES = ("point", "name", "label", "id")
+
+
+def read_touches(
+    path: Path, wishes: Wishes, robot: str | None = None, *, positions: bool = False
+) -> TouchRows:
+    """Reads touches.
+
+    Args:
+        path: A table with the columns of views.csv, `kind` and `point`; of these, only the pose or
+            the joints have to be there. Or a session, whose rows have them.
+        wishes: How poses and joints are written, where the columns do not say.
+        robot: Which robot of a whole cell is meant, where a session or a column `robot` has more.
+        positions: Whether positions will do where the table has no rotations: x_m, y_m, z_m, or
+            x, y, z with the unit given.
+
+    Raises:
+        DataError: It cannot be read, or a row is no pose.
+    """
+    if path.is_dir() or path.suffix.lower() == ".rrd":
+        return touches_of(Session.load(path), robot)
+    fields = _of_robot(read_fields(path), robot)
+    unnamed = unnamed_columns(fields)["robot"]
+    named = pose_names(fields, wishes.robot.names, unnamed, ROBOT_KEYS, ())
+    if positions and (not named or (wishes.robot.names and len(named) == 3)):
+        return _rows_of(fields, path, _positions_alone(fields, wishes.robot), None)
+    joints = wishes.joints or joint_columns(tuple(fields.numbers))
+    if not named and not joints and _has_axes(fields):
+        raise DataError(
+            f"{path.name} has positions without rotations, and a tip beside the flange needs both.",
+            culprits=[path.name],
+            next_step="Add the rotations, or name all columns with --robot-columns; or, for a "
+            "fixture, say --tool none where the positions are of the tip itself.",
+        )
+    foreign = foreign_from(fields, wishes)
+    check_radians(foreign.robot, wishes.robot, "robot", guesses=False)
+    return _rows_of(fields, path, foreign.robot.poses(), foreign.joints_rad)
+
+
+def _of_robot(fields: Fields, robot: str | None) -> Fields:
+    """The rows of one robot, where a column tells whose each is."""
+    named = fields.texts.get("robot", ())
+    known = list(dict.fromkeys(named))
+    if len(known) < 2:
+        return fields
+    if robot is None:
+        raise DataError(
+            f"{fields.name} has touches of several robots ({some_of(known)}), and which is meant "
+            "is not said.",
+            culprits=["--robot"],
+            next_step=f"Name one: --robot {known[0]}.",
+        )
+    if robot not in known:
+        raise DataError(
+            f"{fields.name} has no touches of robot {robot!r}: its robots are {some_of(known)}.",
+            culprits=["--robot"],
+            next_step=did_you_mean(robot, known),
+        )
+    return fields.rows([at for at, it in enumerate(named) if it == robot])
+
+
+def _rows_of(
+    fields: Fields, path: Path, poses: FloatArray, joints_rad: FloatArray | None
+) -> TouchRows:
+    count = len(fields)
+    numbers = fields.views or view_numbers(fields) or tuple(range(count))
+    texts = {name.lower(): cells for name, cells in fields.texts.items()}
+    nothing = ("",) * count
+    return TouchRows(
+        path.name,
+        tuple(map(str, numbers)),
+        fields.places,
+        poses,
+        joints_rad,
+        texts.get("kind", nothing),
+        texts.get("point", nothing),
+    )
+
+
+def _positions_alone(fields: Fields, wishes: PoseWishes) -> FloatArray:
+    """Poses (n, 4, 4) without rotations."""
+    form = POSE_FORMS.get(wishes.form or "")
+    unit = wishes.unit or (form.unit if form else None)
+    poses = np.full((len(fields), 4, 4), np.nan)
+    poses[:, :3, 3] = _coordinates(fields, *_axes(fields, unit, "--robot-unit", wishes.names))
+    return poses
+
+
+def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
+    """Reads a table of CAD coordinates.
+
+    Args:
+        path: A table with a column `point` (or name) and x_m, y_m, z_m, or the same in another unit
+            of `UNITS_M`, or x, y, z with the unit given. A column sigma_m (sigma_mm ...) may say
+            how well each is known.
+        unit: What x, y, z are in.
+
+    Raises:
+        DataError: Columns are missing, a name stands there twice, or a cell is no number.
+    """
+    fields = read_fields(path)
+    names = _names(fields)
+    twice = [it for it in dict.fromkeys(names) if names.count(it) > 1]
+    if twice:
+        raise DataError(
+            f"{path.name}: point {some_of(twice)} stands there more than once.", culprits=twice
+        )
+    columns, length_m = _axes(fields, unit, "--cad-unit")
+    positions = _coordinates(fields, columns, length_m)
+    bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+    if len(bad):
+        raise DataError(
+            f"{fields.places[bad[0]]}: a coordinate is missing.",
+            culprits=[fields.places[it] for it in bad],
+        )
+    return NominalPoints(path.name, names, positions, _sigmas(fields, length_m))
+
+
+def _names(fields: Fields) -> tuple[str, ...]:
+    column = next((it for it in _NAMES if it in fields.texts), None)
+    if column is None:
+        raise DataError(
+            f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point; "
+            f"there are {fields.listing()}.",
+            culprits=[fields.name],
+        )
+    names = tuple(it.strip() for it in fields.texts[column])
+    if not all(names):
+        place = fields.places[names.index("")]
+        raise DataError(f"{place}: the point has no name.", culprits=[place])
+    return names
+
+
+def _sigmas(fields: Fields, length_m: float) -> FloatArray:
+    """How well each point is known (n,) [m]; zero where the table does not say."""
+    units = {f"sigma_{name}": length for name, length in UNITS_M.items()} | {"sigma": length_m}
+    column = next((it for it in units if it in fields.numbers), None)
+    if column is None:
+        return np.zeros(len(fields))
+    sigmas = units[column] * np.nan_to_num(fields.column(column)[:, 0])
+    if (sigmas < 0).any():
+        place = fields.places[int(np.argmin(sigmas))]
+        raise DataError(f"{place}: {column} is negative.", culprits=[place])
+    return np.asarray(sigmas)
+
+
+def _axes(
+    fields: Fields, unit: str | None, option: str, named: Sequence[str] = ()
+) -> tuple[tuple[str, ...], float]:
+    """Finds the columns of x, y, z, and the length of their unit [m].
+
+    Args:
+        fields: The rows.
+        unit: What they are in, where their names do not say.
+        option: By which the user says that.
+        named: The columns, where the user names them.
+    """
+    if unit is not None and unit not in UNITS_M:
+        raise DataError(
+            f"There is no unit of length named {unit!r}; the names are {some_of(list(UNITS_M))}.",
+            culprits=[unit],
+        )
+    known = {it.lower(): it for it in (*fields.texts, *fields.numbers)}
+    for name, length in UNITS_M.items():
+        wanted = named or [f"{axis}_{name}" for axis in "xyz"]
+        if all(it.lower() in known and it.endswith(f"_{name}") for it in wanted):
+            return tuple(known[it.lower()] for it in wanted), length
+    plain = tuple(named) or tuple(known.get(axis, "") for axis in "xyz")
+    if not all(plain):
+        raise DataError(
+            f"{fields.name}: columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed; there are "
+            f"{fields.listing()}.",
+            culprits=[fields.name],
+        )
+    if unit is None:
+        raise DataError(
+            f"{fields.name}: {', '.join(plain)} are in no unit that is named.",
+            culprits=[fields.name],
+            next_step=f"Name the columns x_mm, y_mm, z_mm, or say {option} mm.",
+        )
+    return plain, UNITS_M[unit]
+
+
+def _has_axes(fields: Fields) -> bool:
+    known = {it.lower() for it in fields.numbers}
+    suffixes = ("", *(f"_{it}" for it in UNITS_M))
+    return any(all(f"{axis}{it}" in known for axis in "xyz") for it in suffixes)
+
+
+def _coordinates(fields: Fields, columns: Sequence[str], length_m: float) -> FloatArray:
+    """Takes three columns in a unit of some length: (n, 3) [m]; NaN where a cell is empty."""
+    return length_m * np.column_stack([fields.column(it)[:, 0] for it in columns])

@@ -1,0 +1,105 @@
+"""Folders with a file a view, or several kinds of file a view."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from visioncal.core.documents import is_number, read_npy, read_npz, read_table
+from visioncal.core.errors import DataError
+from visioncal.core.files import is_inside
+from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
+from visioncal.interchange.formats.fields import fields_of_records, flattened
+from visioncal.interchange.formats.finding import listed, number_in
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.import_options import Wishes
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Files of one kind in a folder, one a view: `pose_000.txt`, `pose_001.txt`, ..."""
+
+    name: str
+    files: Mapping[int, Path]
+
+
+def _families(folder: Path) -> tuple[_Family, ...]:
+    """Groups a folder's data files by their names without the number, the largest group first."""
+    groups: dict[str, dict[int, Path]] = defaultdict(dict)
+    for file in listed(folder):
+        number = number_in(file.name)
+        if file.suffix.lower() in ENDINGS and number is not None:
+            digits = file.stem.rstrip("0123456789")
+            groups[f"{digits.rstrip('_-. ')}{file.suffix.lower()}"].setdefault(number, file)
+    families = [_Family(name.rsplit(".", 1)[0], files) for name, files in groups.items()]
+    return tuple(
+        sorted((it for it in families if len(it.files) > 1), key=lambda it: -len(it.files))
+    )
+
+
+def _view_folder(path: Path) -> Path | None:
+    """The folder with a file a view: the one named, or `poses` in it."""
+    if not path.is_dir():
+        return None
+    inner = path / "poses"
+    folders = (path, inner) if is_inside(inner, path) else (path,)
+    return next((it for it in folders if _families(it)), None)
+
+
+def _read_views(path: Path, wishes: Wishes) -> Foreign:
+    """Reads a folder with a file a view, or several kinds of file a view."""
+    folder = _view_folder(path)
+    if folder is None:
+        raise DataError(f"{path} has no files like pose_01.json.", culprits=[str(path)])
+    families = _families(folder)
+    views = sorted({number for it in families for number in it.files})
+    records: list[dict[str, object]] = [{} for _ in views]
+    for family in families:
+        prefix = f"{family.name}." if len(families) > 1 else ""
+        for at, view in enumerate(views):
+            if view in family.files:
+                for key, value in _record(family.files[view]).items():
+                    own = family.name if key == "matrix" else f"{prefix}{key}"
+                    records[at][own or "matrix"] = value
+    places = [
+        " and ".join(it.files[view].name for it in families if view in it.files) for view in views
+    ]
+    name = (path if folder == path else folder.parent).resolve().name
+    fields = fields_of_records(records, places, name, folder, tuple(views))
+    return foreign_from(fields, wishes)
+
+
+def _record(path: Path) -> dict[str, object]:
+    """Reads one view's file; numbers without a name are its matrix or pose."""
+    suffix = path.suffix.lower()
+    document: object
+    if suffix == ".npz":
+        document = read_npz(path)
+    elif suffix == ".npy":
+        document = read_npy(path)
+    elif suffix in DOCUMENTS:
+        document = read_document(path)
+    else:
+        document = _table_record(path)
+    return flattened(document if isinstance(document, Mapping) else {"matrix": document})
+
+
+def _table_record(path: Path) -> object:
+    table = read_table(path)
+    if table.has_header and len(table.rows) == 1:
+        return dict(zip(table.columns, (_cell(it) for it in table.rows[0]), strict=True))
+    rows = [[_cell(it) for it in row] for row in table.rows]
+    return rows[0] if len(rows) == 1 else rows
+
+
+def _cell(text: str) -> object:
+    return float(text) if is_number(text) else text
+
+
+VIEWS = ForeignFormat(
+    "views",
+    "a folder with one or more files a view (pose_01.json, .txt, .npz)",
+    lambda path: _view_folder(path) is not None,
+    _read_views,
+)

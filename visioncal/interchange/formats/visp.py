@@ -1,0 +1,111 @@
+"""ViSP's hand-eye data: a YAML a pose, an image a pose, and a camera XML."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.documents import as_numbers, mapping, read_yaml
+from visioncal.core.documents.bounds import read_plain_text
+from visioncal.core.errors import DataError
+from visioncal.core.types import MOUNTS, Mount
+from visioncal.interchange.formats.finding import images_beside, listed, number_in
+from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.format import ForeignFormat
+from visioncal.interchange.formats.import_options import Wishes
+from visioncal.interchange.formats.intrinsics import read_intrinsics
+
+# `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame.
+_POSE_NAME = re.compile(r".*pose_[a-z]Pe_[0-9]+\.ya?ml", re.IGNORECASE)
+
+
+def _pose_files(path: Path) -> tuple[Path, ...]:
+    if not path.is_dir():
+        return ()
+    return tuple(it for it in listed(path) if _POSE_NAME.fullmatch(it.name))
+
+
+def _read(path: Path, wishes: Wishes) -> Foreign:
+    """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
+    files = _pose_files(path)
+    if not files:
+        raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])
+    rows = [_pose(it) for it in files]
+    numbers = np.array(rows)
+    views = tuple(number_in(it.name) or 0 for it in files)
+    places = tuple(it.name for it in files)
+    notes: list[str] = []
+    images, paired = images_beside(path, wishes.images, views, places, numbered=True)
+    robot = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
+    return Foreign(
+        name=path.resolve().name,
+        robot=wishes.robot.applied_to(robot),
+        images=images,
+        mount=_mount(path, notes),
+        target=None if wishes.target else _target(path, notes),
+        lens=_lens(path, notes),
+        views=views,
+        notes=(*notes, *paired),
+    )
+
+
+def _pose(path: Path) -> list[float]:
+    content = mapping(read_yaml(path), str(path))
+    flat = as_numbers(content.get("data"), f"{path}: data").reshape(-1)
+    if len(flat) != 6 or not np.isfinite(flat).all():
+        raise DataError(
+            f"{path}: data holds {len(flat)} numbers; tx, ty, tz and theta-u are needed.",
+            culprits=[str(path)],
+        )
+    return [float(it) for it in flat]
+
+
+def _mount(path: Path, notes: list[str]) -> Mount | None:
+    name = path.resolve().name
+    found = next((it for it in MOUNTS if it in name), None)
+    if found is not None:
+        notes.append(f"The mount is taken from the folder's name: {found}.")
+    return found
+
+
+def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
+    cameras = [it for it in listed(path) if it.suffix.lower() == ".xml"]
+    if not cameras:
+        return None
+    lens, more = read_intrinsics(cameras[0])
+    notes.extend(more)
+    return lens
+
+
+def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
+    """Reads the target from the note that lies with the images, where it says enough."""
+    for file in listed(path):
+        if not file.name.endswith("-data.txt"):
+            continue
+        text = read_plain_text(file)
+        size = re.search(r"size:\s*([0-9]{1,6}(?:\.[0-9]{1,9})?)\s*m\b", text)
+        board = re.search(r"([0-9]{1,3})\s*x\s*([0-9]{1,3})", text)
+        family = re.search(r"(16h5|25h9|36h10|36h11)", text)
+        if size and board and "chess" in text.lower():
+            return {
+                "kind": "checkerboard",
+                "columns": int(board[1]),
+                "rows": int(board[2]),
+                "square_m": float(size[1]),
+            }
+        if size and family:
+            notes.append(
+                f"{file.name} names no id of the tag: give "
+                f"--target marker_DICT_APRILTAG_{family[1]}_ID_{1e3 * float(size[1]):g}mm."
+            )
+    return None
+
+
+VISP = ForeignFormat(
+    "visp",
+    "ViSP's poses (*_pose_rPe_1.yaml) with images and a camera XML",
+    lambda path: bool(_pose_files(path)),
+    _read,
+)

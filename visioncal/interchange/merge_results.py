@@ -1,0 +1,103 @@
+"""What has joined the result of an earlier calibration: written with it anew, or kept beside."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from visioncal.calibration.pipeline import Run
+from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.frames.frame_from_images import rests_on_camera
+from visioncal.interchange.outputs import CALIBRATION, Written, write_alignment, write_outputs
+from visioncal.interchange.result_files import FRAMES, load_stored
+from visioncal.results import Calibration, Frame, FrameFile
+
+
+def rewrite(folder: Path, calibration: Calibration) -> Written:
+    """Replaces the files of an output folder by those of the same session's extended result.
+
+    Session and evidence come from the recording in the folder; its images stay as they are, byte by
+    byte. Where there is no recording, or none that belongs to the result, it is left alone and the
+    report says what is missing.
+
+    Args:
+        folder: What `visioncal calibrate` has written.
+        calibration: The result in it with what has joined it, such as frames.
+
+    Returns:
+        The files that were written: without the recording where that was left alone.
+
+    Raises:
+        DataError: The folder has no result, one of another session, or cannot be written; the files
+            in it stay as they were.
+    """
+    stored = load_stored(folder)
+    if stored.calibration.session_sha256 != calibration.session_sha256:
+        raise DataError(
+            f"{folder} holds the result of another session, {stored.calibration.session_name!r}, "
+            f"than the one that is to be written, {calibration.session_name!r}.",
+            culprits=[str(folder)],
+            next_step="Name the output folder that the result was loaded from.",
+        )
+    if calibration.cell is not None:
+        cell = replace(calibration.cell, placed=calibration.frames)
+        return write_alignment(folder, stored.session, cell)
+    run = Run(calibration, stored.evidence)
+    return write_outputs(folder, stored.session, run, stored.note)
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """Frames of a result that is about to be replaced by one that does not have them.
+
+    Attributes:
+        file: Where they are kept.
+        frames: By the transforms that place them.
+        before: What the file holds already.
+    """
+
+    file: Path
+    frames: Mapping[str, Frame]
+    before: Mapping[str, Frame]
+
+    def keep(self) -> None:
+        """Writes them, beside what the file holds under other names."""
+        FrameFile({**self.before, **self.frames}).save(self.file)
+
+    @property
+    def words(self) -> str:
+        """What became of them, and which of them to place anew, for the user."""
+        seen = [name for name, frame in self.frames.items() if rests_on_camera(frame)]
+        told = (
+            f"{some_of(list(self.frames))} had joined the result that this one replaces: kept in "
+            f"{self.file}."
+        )
+        replaced = sorted(self.before.keys() & self.frames.keys())
+        if replaced:
+            told += f" It had another {some_of(replaced)} of an earlier time."
+        if seen:
+            told += (
+                f" By images of the camera as it was calibrated before: {some_of(seen)}. Place "
+                "these again."
+            )
+        return told
+
+
+def leftover(folder: Path) -> Leftover | None:
+    """Finds the frames that a new result in a folder would lose; None where there are none.
+
+    Args:
+        folder: Where a result is to be written. One that cannot be read is no error: it has
+            nothing to lose.
+
+    Raises:
+        DataError: There is a file of frames beside them that cannot be read, nor be replaced.
+    """
+    try:
+        frames = Calibration.load(folder / CALIBRATION).frames
+    except DataError:
+        return None
+    if not frames:
+        return None
+    file = folder / FRAMES
+    return Leftover(file, frames, FrameFile.load(file).frames if file.exists() else {})

@@ -1,0 +1,309 @@
+"""What `calibrate`, `align`, `verify`, `plan` and `dynamics` write into a folder."""
+
+import json
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from visioncal.calibration.pipeline import Run as Calibrated
+from visioncal.calibration.verification import Check, Outcome
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_atomically
+from visioncal.core.output_generations import write_generation
+from visioncal.dynamics import FILE as DYNAMICS
+from visioncal.dynamics import Run
+from visioncal.dynamics.planned import MotionPlan
+from visioncal.dynamics.written import MOTION_FILES, motion_files
+from visioncal.live.planning.plan import Plan
+from visioncal.live.planning.written import program_of, stops_table
+from visioncal.results import Alignment, Calibration
+from visioncal.session import Session
+
+CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
+VERIFY = "verify.json"
+ALIGNMENT = "alignment.json"
+STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
+
+_Writer: TypeAlias = Callable[[Path], None]
+
+
+@dataclass(frozen=True)
+class Undrawn:
+    """A file that there is not, because drawing it failed: a bug, which takes no result away.
+
+    Attributes:
+        file: The file; one of an earlier result was taken away.
+        cause: The error and its place in the code.
+    """
+
+    file: Path
+    cause: str
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written into a folder.
+
+    Attributes:
+        files: The files, the result first.
+        undrawn: What is missing beside it.
+    """
+
+    files: tuple[Path, ...]
+    undrawn: tuple[Undrawn, ...] = ()
+
+
+def write_outputs(
+    folder: Path, session: Session | None, run: Calibrated, note: str = ""
+) -> Written:
+    """Writes the three files into a folder, all at once whenever it is killed.
+
+    Several threads may do so at once; their figures are drawn one at a time.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        session: What was calibrated; None where it was not kept, which leaves the recording out.
+        run: The result and its evidence.
+        note: What the reader should know of the report itself.
+
+    Returns:
+        The files that were written: the result even where drawing the report or recording failed.
+
+    Raises:
+        DataError: The folder cannot be written; the files in it stay as they were.
+    """
+
+    def report(path: Path) -> None:
+        # Plots and the recording's codec take half a second to import, which help need not wait
+        # for.
+        from visioncal.present.report import write_report
+
+        write_report(path, run.calibration, session, run.evidence, note)
+
+    drawings: dict[str, _Writer] = {REPORT: report}
+    if session is not None:
+
+        def record(path: Path) -> None:
+            from visioncal.present.recording import write_recording
+            from visioncal.present.viewer import blueprint
+
+            layout = blueprint(session, run.calibration)
+            write_recording(path, session, run.calibration, run.evidence, layout)
+
+        drawings[RECORDING] = record
+    return _write(folder, {CALIBRATION: run.calibration.save}, drawings, (ALIGNMENT,))
+
+
+def write_check(folder: Path, check: Check, triggers: Sequence[Outcome], document: str) -> Written:
+    """Writes a check's page and JSON into a folder, all at once.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        check: The check.
+        triggers: What became of the policy's triggers.
+        document: The content of verify.json.
+
+    Returns:
+        The files that were written: the JSON even where drawing the page failed.
+
+    Raises:
+        DataError: The folder cannot be written; the files in it stay as they were.
+    """
+
+    def page(path: Path) -> None:
+        from visioncal.present.report.check import write_check as write_page
+        from visioncal.present.report.check_page import page_of
+
+        write_page(path, page_of(check, triggers))
+
+    return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
+
+
+def refuse_calibration(folder: Path) -> None:
+    """Refuses a folder whose report is a calibration's.
+
+    Raises:
+        DataError: It is one.
+    """
+    if (folder / CALIBRATION).exists():
+        raise DataError(
+            f"{folder} holds a calibration, whose {REPORT} the check's would replace.",
+            culprits=[str(folder)],
+            next_step="Name another folder with -o.",
+        )
+
+
+def write_alignment(folder: Path, session: Session | None, found: Alignment) -> Written:
+    """Writes the alignment of a cell, its report and its recording into a folder, all at once.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        session: What was aligned; None where it was not kept, which leaves the recording out.
+        found: The result.
+
+    Returns:
+        The files that were written: the result even where drawing the others failed.
+
+    Raises:
+        DataError: The folder cannot be written; the files in it stay as they were.
+    """
+
+    def report(path: Path) -> None:
+        from visioncal.present.report.cells import write_cell_report
+
+        write_cell_report(path, found)
+
+    drawings: dict[str, _Writer] = {REPORT: report}
+    if session is not None:
+
+        def record(path: Path) -> None:
+            from visioncal.present.recording import write_cell_recording
+            from visioncal.present.viewer.cells import cell_blueprint
+
+            write_cell_recording(path, session, found, cell_blueprint(session, found))
+
+        drawings[RECORDING] = record
+    results = {CALIBRATION: Calibration.whole(found).save, ALIGNMENT: found.save}
+    return _write(folder, results, drawings)
+
+
+def write_plan(folder: Path, plan: Plan, document: Mapping[str, Any]) -> Written:
+    """Writes a plan's table, program, preview and JSON into a folder, all at once.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        plan: The plan.
+        document: The content of plan.json.
+
+    Returns:
+        The files that were written: all but the preview even where drawing that failed. Robots that
+        are not programmed like a UR get no program, and one that an earlier plan left is taken
+        away.
+
+    Raises:
+        DataError: The folder cannot be written; the files in it stay as they were.
+    """
+
+    def draw(path: Path) -> None:
+        from visioncal.live.planning.preview import preview_of
+        from visioncal.present.recording.preview import write_preview
+        from visioncal.present.viewer.planned import plan_blueprint
+
+        preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
+        write_preview(path, preview, plan_blueprint(preview))
+
+    texts = {PLAN: _json(document), STOPS: stops_table(plan)}
+    if program := program_of(plan):
+        texts[PROGRAM] = program
+    results = {name: _text(text) for name, text in texts.items()}
+    return _write(folder, results, {PREVIEW: draw}, (PROGRAM,))
+
+
+def write_motions(
+    folder: Path, plan: MotionPlan, rate_hz: float, document: Mapping[str, Any]
+) -> Written:
+    """Writes planned motions as tables, programs, preview and JSON, all at once.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        plan: The motions.
+        rate_hz: Samples a second in the tables.
+        document: The content of plan.json.
+
+    Returns:
+        The files that were written: all but the preview even where drawing that failed. Robots that
+        are not programmed like a UR get no programs; what an earlier plan left and this one has not
+        is taken away.
+
+    Raises:
+        DataError: The folder cannot be written; the files in it stay as they were.
+    """
+
+    def draw(path: Path) -> None:
+        from visioncal.live.planning.motion_preview import motion_preview
+        from visioncal.present.recording.motions import write_motion_preview
+        from visioncal.present.viewer.motions import motion_blueprint
+
+        preview = motion_preview(plan)
+        write_motion_preview(path, preview, motion_blueprint(preview))
+
+    texts = {PLAN: _json(document), **motion_files(plan, rate_hz)}
+    results = {name: _text(text) for name, text in texts.items()}
+    return _write(folder, results, {PREVIEW: draw}, MOTION_FILES)
+
+
+def write_dynamics(folder: Path, run: Run) -> Written:
+    """Writes identified dynamics, their report and recording into a folder, all at once.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        run: The result with its evidence.
+
+    Returns:
+        The files that were written: the result even where drawing the others failed.
+
+    Raises:
+        DataError: The folder cannot be written; the files in it stay as they were.
+    """
+
+    def report(path: Path) -> None:
+        from visioncal.present.report.dynamics import write_dynamics_report
+
+        write_dynamics_report(path, run)
+
+    def record(path: Path) -> None:
+        from visioncal.present.recording.dynamics import write_dynamics_recording
+        from visioncal.present.viewer.dynamics import dynamics_blueprint
+
+        write_dynamics_recording(path, run, dynamics_blueprint(run))
+
+    return _write(folder, {DYNAMICS: run.identified.save}, {REPORT: report, RECORDING: record})
+
+
+def _write(
+    folder: Path,
+    results: Mapping[str, _Writer],
+    drawings: Mapping[str, _Writer],
+    others: Sequence[str] = (),
+) -> Written:
+    """Writes results, and what is drawn of them as far as that succeeds, as one generation.
+
+    Args:
+        folder: Where to.
+        results: What writes each file without which there is nothing; the one that counts first.
+        drawings: What draws the others.
+        others: Files that an earlier generation may have, and this one has not.
+    """
+    undrawn: list[Undrawn] = []
+
+    def write(aside: Path) -> None:
+        for name, save in results.items():
+            save(aside / name)
+        for name, draw in drawings.items():
+            try:
+                draw(aside / name)
+            except Exception as error:
+                # A disk without room is no bug, and ends as a result that cannot be written does.
+                if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
+                    raise
+                undrawn.append(Undrawn(folder / name, _cause(error)))
+
+    # The result last: it is what the others are beside.
+    mine = [*results, *drawings]
+    names = [*(it for it in others if it not in mine), *reversed(mine)]
+    return Written(write_generation(folder, names, write), tuple(undrawn))
+
+
+def _cause(error: Exception) -> str:
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"
+
+
+def _json(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def _text(content: str) -> _Writer:
+    return lambda path: write_atomically(path, content)

@@ -1,0 +1,200 @@
+"""Finds again what an earlier calibration has written."""
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import absence, read_bytes
+from visioncal.dynamics import FILE as DYNAMICS
+from visioncal.dynamics import Identified
+from visioncal.interchange.outputs import CALIBRATION, RECORDING
+from visioncal.results import Alignment, Calibration, FrameFile, to_document
+from visioncal.results.evidence import ViewEvidence
+from visioncal.session import Session
+from visioncal.session.choosing import ANY, ARM, PARTS, Choice, Part
+
+# What tells the folder of a session.
+_SESSION = "session.toml"
+# Frames of a robot without a calibration, in a folder.
+FRAMES = "frames.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A result, with all that was kept of the way to it.
+
+    Attributes:
+        calibration: The result.
+        session: What it was computed from; None where it was not kept.
+        evidence: What was seen and computed of each view; empty likewise.
+        note: Why something is missing, in words for the user; empty where nothing is.
+    """
+
+    calibration: Calibration
+    session: Session | None
+    evidence: tuple[ViewEvidence, ...]
+    note: str = ""
+
+
+def load_calibration(
+    path: Path, choice: Choice = ANY, needs: Collection[Part] = PARTS
+) -> Calibration:
+    """Loads the result of one camera and one robot, or takes it out of that of a whole cell.
+
+    Args:
+        path: An output folder, its calibration.json, or a recording with a result.
+        choice: Which camera, robot and target of a whole cell are meant.
+        needs: What of the three has to be clear.
+
+    Raises:
+        DataError: There is none, it cannot be read, or it is not clear what is meant.
+    """
+    return load_result(path).chosen(choice, needs)
+
+
+def load_result(path: Path) -> Calibration:
+    """Loads a result, of one camera and one robot or of a whole cell.
+
+    Args:
+        path: As for `load_calibration`; or the alignment.json of a whole cell.
+
+    Raises:
+        DataError: There is none, or it cannot be read.
+    """
+    if path.suffix.lower() != ".rrd":
+        _refuse_session(path)
+        try:
+            return Calibration.load(path)
+        except DataError as error:
+            if _holds_frames(path):
+                raise _frames_alone(path) from error
+            raise
+    # The codec takes half a second to import, which a calibration.json need not wait for.
+    from visioncal.present.recording import read_alignment, read_calibration
+
+    calibration = read_calibration(path)
+    if calibration is not None:
+        return calibration
+    cell = read_alignment(path)
+    if cell is None:
+        raise _uncalibrated(path, "the recording of a session")
+    return Calibration.whole(cell)
+
+
+def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile:
+    """Loads a result, or frames that belong to none.
+
+    Args:
+        path: As for `load_calibration`, or a file of frames, which its content tells, or a folder
+            with one and no calibration.json.
+        robot: Which robot of a whole cell is meant.
+
+    Raises:
+        DataError: There is neither, or it cannot be read.
+    """
+    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / FRAMES).is_file()
+    file = path / FRAMES if alone else path
+    if _holds_frames(file):
+        return FrameFile.load(file)
+    return load_calibration(path, Choice(robot=robot), ARM)
+
+
+def load_exportable(path: Path) -> Calibration | FrameFile | Alignment | Identified:
+    """Loads what `load_placed` does, the alignment of a whole cell, or an arm's dynamics.
+
+    Args:
+        path: As there, or an alignment.json or a dynamics.json, which its content tells, a folder
+            with one and no calibration.json, or the recording of a cell.
+
+    Raises:
+        DataError: There is none of them, or it cannot be read.
+    """
+    alone = path.is_dir() and not (path / CALIBRATION).exists()
+    file = path / DYNAMICS if alone and (path / DYNAMICS).is_file() else path
+    if "base" in _content(file) and "transforms" not in _content(file):
+        return Identified.load(file)
+    frames = path / FRAMES if alone else path
+    if _holds_frames(frames):
+        return FrameFile.load(frames)
+    found = load_result(path)
+    return found if found.cell is None else found.cell
+
+
+def _holds_frames(path: Path) -> bool:
+    """Tells a file of frames by its content: every calibration has transforms."""
+    document = _content(path)
+    return "frames" in document and "transforms" not in document
+
+
+def _content(path: Path) -> dict[str, object]:
+    """The content of a JSON file; empty of what is none."""
+    if path.suffix.lower() == ".rrd" or absence(path):
+        return {}
+    try:
+        document = json.loads(read_bytes(path))
+    except (ValueError, RecursionError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _frames_alone(path: Path) -> DataError:
+    return DataError(
+        f"{path} holds frames of tools and fixtures, and no calibration.",
+        culprits=[str(path)],
+        next_step="Name the calibration's folder or its calibration.json.",
+    )
+
+
+def _refuse_session(path: Path) -> None:
+    """Refuses a session where its result is needed."""
+    folder = path.parent if path.name == _SESSION else path
+    calibrated = path == folder and (folder / CALIBRATION).exists()
+    if not calibrated and (folder / _SESSION).is_file():
+        raise _uncalibrated(folder, "a session")
+
+
+def _uncalibrated(path: Path, what: str) -> DataError:
+    return DataError(
+        f"{path} is {what} without a result.",
+        culprits=[str(path)],
+        next_step=f"Run visioncal calibrate {path} -o FOLDER first, and name that FOLDER.",
+    )
+
+
+def load_stored(path: Path) -> Stored:
+    """Loads a result with its session and evidence, from the recording or the one beside it.
+
+    Args:
+        path: An output folder, its calibration.json, or a recording with a result.
+
+    Raises:
+        DataError: There is no result, or it cannot be read. A recording that is missing beside a
+            calibration.json, is damaged or belongs to another result is no error but noted.
+    """
+    calibration = load_result(path)
+    if path.suffix.lower() == ".rrd":
+        return _with_recording(calibration, path)
+    recording = (path if path.is_dir() else path.parent) / RECORDING
+    if not recording.is_file():
+        return _alone(calibration, f"There is no {RECORDING} beside this result.")
+    try:
+        recorded = load_result(recording)
+        if to_document(recorded) != to_document(calibration):
+            return _alone(calibration, f"The {RECORDING} beside this result holds another one.")
+        return _with_recording(calibration, recording)
+    except DataError as error:
+        return _alone(calibration, error.message)
+
+
+def _with_recording(calibration: Calibration, recording: Path) -> Stored:
+    from visioncal.present.recording import read_evidence, read_session
+
+    return Stored(calibration, read_session(recording), read_evidence(recording))
+
+
+def _alone(calibration: Calibration, why: str) -> Stored:
+    return Stored(
+        calibration, None, (), f"{why} Pictures, coverage and joint angles are left out here."
+    )

@@ -1,0 +1,190 @@
+"""One view after the other: settled, taken, checked, put on the disk, and told."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from visioncal.calibration.stages.detect import look_for
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import figure
+from visioncal.core.types import Corners, Target
+from visioncal.live.capture.coach import Coach
+from visioncal.live.capture.facts import state_of
+from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.predict import Prediction
+from visioncal.live.capture.take import Missed, Taken, settle, take
+from visioncal.live.planning.accuracy import Accuracy
+from visioncal.vision.finders.imaging import decode_image
+
+
+@dataclass(frozen=True)
+class Times:
+    """How long a view took: on the way, until all stood still, and for everything else [s]."""
+
+    moved_s: float
+    settled_s: float
+    worked_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What became of a view, for whoever watches.
+
+    Attributes:
+        view: Its number.
+        place: Which of the stops it is, from 1 on; of `count`, 0 where that is open.
+        count: How many there are.
+        found: What was taken, or why nothing was.
+        covered: What is covered so far, in words.
+        accuracy: What is predicted so far; None while nothing is.
+        advice: What comes next, in words.
+        times: How long it took.
+    """
+
+    view: int
+    place: int
+    count: int
+    found: Taken | Missed
+    covered: str
+    accuracy: Accuracy | None
+    advice: str
+    times: Times
+
+
+class Watcher(Protocol):
+    """Whoever watches a recording; what it does must be quick."""
+
+    def stepped(self, step: Step) -> None:
+        """Is told of a view that is on the disk, or of a stop that gave none."""
+
+
+@dataclass(eq=False)
+class Capture:
+    """A recording at work.
+
+    Attributes:
+        cell: The devices.
+        target: What is to be seen.
+        journal: Where the views go.
+        options: How they are taken.
+        agreement: Whether joints and pose belong together.
+        coach: What is covered.
+        prediction: How accurate the result will be.
+        watchers: Who is told.
+        steps: What became of each stop so far.
+    """
+
+    cell: LiveCell
+    target: Target
+    journal: Journal
+    options: CaptureOptions
+    agreement: Agreement
+    coach: Coach
+    prediction: Prediction | None
+    watchers: Sequence[Watcher] = ()
+    steps: list[Step] = field(default_factory=list)
+
+    def catch_up(self) -> None:
+        """Takes into account what is on the disk already."""
+        for view in self.journal.views:
+            image = decode_image(self.journal.image(view))
+            found = None if isinstance(image, str) else look_for(image, self.target, view.number)
+            if found is not None and isinstance(found[0], Corners):
+                self.coach.add(found[0])
+            state = state_of(view)
+            if state is not None:
+                self.agreement.why_not(state)
+
+    def view(
+        self,
+        number: int,
+        place: int,
+        count: int,
+        moved_s: float,
+        advise: Callable[[], str],
+    ) -> Step:
+        """Takes a view where the arm stands.
+
+        Args:
+            number: The view's number.
+            place: Which of the stops it is, from 1 on.
+            count: How many there are; 0 where that is open.
+            moved_s: How long the arm was on its way here [s].
+            advise: Says what comes next, once the view is there.
+
+        Raises:
+            DriverError: A device fails, or the arm is stopped.
+            DataError: The view cannot be written, or nothing was seen at too many stops in a row.
+        """
+        clock = self.cell.clock
+        begun = clock.now()
+        settled = settle(self.cell, self.options)
+        rested = clock.now()
+        found: Taken | Missed
+        if isinstance(settled, Missed):
+            found = settled
+        else:
+            found = take(self.cell, settled, self.target, number, self.options)
+        found = self._kept(number, found)
+        accuracy = self._accuracy()
+        times = Times(moved_s, rested - begun, clock.now() - rested)
+        advice = advise()
+        step = Step(number, place, count, found, self.coach.words(), accuracy, advice, times)
+        self.steps.append(step)
+        for watcher in self.watchers:
+            watcher.stepped(step)
+        self._check_lost()
+        return step
+
+    def onward(self, view: int | None) -> str:
+        """Names the view that is next, and what is predicted with it; empty where none is."""
+        if view is None:
+            return ""
+        if self.prediction is None:
+            return f"view {view}"
+        then = self.prediction.after([*(it.number for it in self.journal.views), view])
+        if then is None or then.is_open:
+            return f"view {view}"
+        return f"view {view}, for {figure(then.mm)} mm"
+
+    def _kept(self, number: int, found: Taken | Missed) -> Taken | Missed:
+        """Puts a view on the disk, if it can be believed."""
+        if isinstance(found, Missed):
+            return found
+        disagreement = self.agreement.why_not(found.state)
+        if disagreement:
+            return Missed(disagreement)
+        self.journal.append(number, found)
+        self.coach.add(found.corners)
+        return found
+
+    def _accuracy(self) -> Accuracy | None:
+        if self.prediction is None:
+            return None
+        return self.prediction.after([it.number for it in self.journal.views])
+
+    def _check_lost(self) -> None:
+        if not self.options.lost:
+            return
+        last = self.steps[-self.options.lost :]
+        reasons = [it.found.reason for it in last if isinstance(it.found, Missed)]
+        if len(reasons) < self.options.lost:
+            return
+        raise DataError(
+            f"no view at {len(last)} stops in a row ({', '.join(f'{it.view}' for it in last)}): "
+            f"{reasons[-1]}.",
+            culprits=[f"view {it.view}" for it in last],
+            next_step="Look at the board: does it lie where the plan has it, in the light and "
+            f"unhidden? Is it a {self.target.name}, and the lens in focus? Then go on with "
+            "--resume.",
+        )
+
+
+def missed(steps: Sequence[Step]) -> Iterator[tuple[int, str]]:
+    """The stops that gave no view, with the reasons."""
+    for step in steps:
+        if isinstance(step.found, Missed):
+            yield step.view, step.found.reason

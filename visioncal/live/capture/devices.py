@@ -1,0 +1,123 @@
+"""Devices by the words in which a user names them: `ur:192.168.0.10`, `oak`, `folder:images`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TypeAlias, TypeVar
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
+from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceWishes
+
+
+@dataclass(frozen=True)
+class ArmWish:
+    """What is asked of an arm that is opened.
+
+    Attributes:
+        address: What follows the kind: a host.
+        watch_only: Whether it is only looked at, and need not be ready to be driven.
+        ask: Asks a question and gives the line that was typed.
+        form: In which form poses are typed; None to have it told by their looks.
+    """
+
+    address: str
+    watch_only: bool
+    ask: Callable[[str], str]
+    form: str | None = None
+
+
+ArmOpener: TypeAlias = Callable[[ArmWish], Arm]
+CameraOpener: TypeAlias = Callable[[str, DeviceWishes], CameraDevice]
+_Opener = TypeVar("_Opener")
+
+
+def open_arm(words: str, wish: ArmWish, openers: Mapping[str, ArmOpener] | None = None) -> Arm:
+    """Opens an arm.
+
+    Args:
+        words: `KIND` or `KIND:ADDRESS`.
+        wish: What is asked of it; its address is replaced by that of the words.
+        openers: The kinds; `ARMS` where None.
+
+    Raises:
+        DataError: There is no such kind.
+        DriverError: It cannot be opened.
+    """
+    kind, _, address = words.partition(":")
+    opener = _opener(kind, ARMS if openers is None else openers, "--arm")
+    return opener(ArmWish(address, wish.watch_only, wish.ask, wish.form))
+
+
+def open_camera(
+    words: str, wishes: DeviceWishes, openers: Mapping[str, CameraOpener] | None = None
+) -> CameraDevice:
+    """Opens a camera; the arguments are like those of `open_arm`.
+
+    Raises:
+        DataError: There is no such kind.
+        DriverError: It cannot be opened.
+    """
+    kind, _, address = words.partition(":")
+    return _opener(kind, CAMERAS if openers is None else openers, "--camera")(address, wishes)
+
+
+def is_folder(words: str) -> bool:
+    """Tells whether a camera is a folder of pictures, each of another place."""
+    return words.partition(":")[0] == "folder"
+
+
+def _opener(kind: str, openers: Mapping[str, _Opener], option: str) -> _Opener:
+    if kind not in openers:
+        raise DataError(
+            f"{option}: {kind[:80]!r} is no kind of device; {', '.join(openers)} are.",
+            culprits=[option],
+            next_step=did_you_mean(kind, openers),
+        )
+    return openers[kind]
+
+
+def _needs(address: str, words: str) -> str:
+    if not address:
+        raise DataError(f"{words.split(':')[0]} needs to be told where: {words}.")
+    return address
+
+
+# The drivers and their client libraries are imported when a device is asked for.
+
+
+def _ur(wish: ArmWish) -> Arm:
+    from visioncal.live.drivers.ur import UrArm
+
+    return UrArm(_needs(wish.address, "ur:HOST, as ur:192.168.0.10"), watch_only=wish.watch_only)
+
+
+def _manual(wish: ArmWish) -> Arm:
+    from visioncal.live.drivers.manual import ManualArm
+
+    return ManualArm(wish.ask, wish.form)
+
+
+def _oak(address: str, wishes: DeviceWishes) -> CameraDevice:
+    from visioncal.live.drivers.oak import OakCamera
+
+    return OakCamera(wishes, device=address or None)
+
+
+def _uvc(address: str, wishes: DeviceWishes) -> CameraDevice:
+    from visioncal.live.drivers.uvc import UvcCamera
+
+    return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, wishes)
+
+
+def _folder(address: str, _: DeviceWishes) -> CameraDevice:
+    from visioncal.live.drivers.images import FolderCamera
+
+    return FolderCamera(Path(_needs(address, "folder:PATH")))
+
+
+ARMS: Mapping[str, ArmOpener] = MappingProxyType({"ur": _ur, "manual": _manual})
+CAMERAS: Mapping[str, CameraOpener] = MappingProxyType(
+    {"oak": _oak, "uvc": _uvc, "folder": _folder}
+)

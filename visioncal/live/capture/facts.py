@@ -1,0 +1,165 @@
+"""What is written of a live cell: the session's own facts, and the rows of its views."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import tomli_w
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.live.capture.take import Taken
+from visioncal.live.drivers.protocols import ArmState
+from visioncal.robot import Robot, load_robot, robot_file, robot_names
+from visioncal.session import View
+from visioncal.session.columns import POSE
+from visioncal.vision.targets import load_target, target_document, target_names
+
+_TARGET_FILE = "target.toml"
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What does not change from view to view.
+
+    Attributes:
+        name: The session's name.
+        mount: Where the camera is.
+        target: The board.
+        robot: The arm's model; None where it is not known.
+        arm: What the arm calls itself.
+        camera: What the camera calls itself.
+        resolution: (width, height) of its pictures [px].
+        lens: The intrinsics that it tells, to be refined; None to have them estimated.
+        settings: What it is set to.
+        plan: The digest of the plan that is driven; empty for none.
+    """
+
+    name: str
+    mount: Mount
+    target: Target
+    robot: Robot | None
+    arm: str
+    camera: str
+    resolution: tuple[int, int]
+    lens: Camera | None
+    settings: Mapping[str, str | float]
+    plan: str
+
+    def texts(self) -> dict[str, str]:
+        """The files of the session besides its views, by name; session.toml is the last."""
+        texts: dict[str, str] = {}
+        document: dict[str, Any] = {"schema": 1, "name": self.name, "mount": self.mount}
+        document["target"] = _shipped_target(self.target)
+        if not document["target"]:
+            document["target"] = _TARGET_FILE
+            texts[_TARGET_FILE] = tomli_w.dumps(target_document(self.target))
+        document["camera"] = self._camera_table()
+        if self.robot is not None:
+            model = _shipped_robot(self.robot)
+            if not model:
+                model, text = _placed(self.robot)
+                texts[model] = text
+            document["robot"] = {"model": model, "tip": self.robot.tip}
+        texts["session.toml"] = tomli_w.dumps(document)
+        return texts
+
+    def provenance(self) -> dict[str, Any]:
+        """What a recording must have in common with the one that it goes on with, for people."""
+        return {
+            "arm": self.arm,
+            "camera": self.camera,
+            "resolution": list(self.resolution),
+            "mount": self.mount,
+            "target": target_document(self.target),
+            "robot": "" if self.robot is None else self.robot.name,
+            "plan": self.plan,
+        }
+
+    def _camera_table(self) -> dict[str, Any]:
+        table: dict[str, Any] = {"name": self.camera, "resolution": list(self.resolution)}
+        if self.lens is not None:
+            table["model"] = self.lens.model
+            table["matrix"] = self.lens.matrix.tolist()
+            table["distortion"] = self.lens.distortion.tolist()
+        return table
+
+
+def view_of(number: int, image: str, taken: Taken, facts: Facts, unix_offset_s: float) -> View:
+    """Writes a view as a row of views.csv.
+
+    Args:
+        number: Its number.
+        image: The path of its image.
+        taken: What was taken.
+        facts: What does not change.
+        unix_offset_s: What makes the host's monotonic clock UNIX time [s].
+    """
+    state, frame = taken.state, taken.frame
+    numbers = {"stamp_s": round(frame.stamp_s + unix_offset_s, 6), **_pose(state.base_from_flange)}
+    for form, values in (
+        ("q{}_rad", state.q),
+        ("current{}_a", state.currents_a),
+        ("temp{}_c", state.temperatures_c),
+    ):
+        if values is not None:
+            numbers |= {form.format(at): float(it) for at, it in enumerate(values, start=1)}
+    if state.payload_kg is not None:
+        numbers["payload_kg"] = float(state.payload_kg)
+    if state.payload_m is not None:
+        numbers |= {
+            f"payload_{it}_m": float(value)
+            for it, value in zip("xyz", state.payload_m, strict=True)
+        }
+    return View(number, image=image, numbers=numbers, text=_texts(taken, state, facts))
+
+
+def state_of(view: View) -> ArmState | None:
+    """The joints and the pose of a row; None where it has no pose."""
+    pose = view.base_from_flange()
+    if pose is None:
+        return None
+    return ArmState(view.stamp_s or 0.0, np.asarray(pose.as_matrix()), view.joints_rad)
+
+
+def _texts(taken: Taken, state: ArmState, facts: Facts) -> dict[str, str]:
+    """Columns that calibration passes through: what the devices said of themselves."""
+    texts = {
+        "safety": state.safety,
+        "blur_px": f"{taken.corners.blur_px:.2f}",
+        "motion_px": f"{taken.motion_px:.3f}",
+    }
+    if state.flange_from_tool is not None:
+        texts["tcp"] = " ".join(f"{it:.9g}" for it in _pose(state.flange_from_tool).values())
+    if taken.frame.exposure_s is not None:
+        texts["exposure_ms"] = f"{1e3 * taken.frame.exposure_s:.3f}"
+    return texts | {f"device_{name}": str(value) for name, value in facts.settings.items()}
+
+
+def _pose(pose: FloatArray) -> dict[str, float]:
+    """Seven columns of a pose (4, 4)."""
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return dict(zip(POSE, map(float, [*pose[:3, 3], *turn]), strict=True))
+
+
+def _shipped_target(target: Target) -> str:
+    """The name of a board that comes with visioncal; empty for another."""
+    if target.name in target_names() and load_target(target.name, None)[0] == target:
+        return target.name
+    return ""
+
+
+def _shipped_robot(robot: Robot) -> str:
+    """The name of an arm that comes with visioncal; empty for another."""
+    for name in robot_names():
+        shipped = load_robot(name)
+        if shipped.name == robot.name and dict(shipped.document) == dict(robot.document):
+            return name
+    return ""
+
+
+def _placed(robot: Robot) -> tuple[str, str]:
+    """An arm of one's own as a file: its name and content."""
+    named = "robot.json" if "kind" in robot.document else ""
+    return robot_file(robot.document, named)

@@ -1,0 +1,151 @@
+"""Taking views of an arm that a person moves: whenever it rests, or whenever they say so."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.core.errors import DriverError
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import FloatArray
+from visioncal.live.capture.clock import Clock
+from visioncal.live.capture.core import Capture, Step
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import Stillness
+from visioncal.live.capture.record import closed_cleanly
+from visioncal.live.capture.still import why_arm_moves
+from visioncal.live.capture.take import Taken
+from visioncal.live.drivers.protocols import Arm, ArmState
+
+# How often a guided arm is asked where it is [s].
+_POLL_S = 0.05
+# A place is new where it is so far from all others [mm], [deg].
+_NEW_MM, _NEW_DEG = 20.0, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class HeldArm:
+    """An arm that stands where its pose was told, until the next one is.
+
+    Attributes:
+        name: What it is, for people.
+        told: Its state when it was asked.
+        clock: By which the state is always new.
+    """
+
+    name: str
+    told: ArmState
+    clock: Clock
+
+    def state(self) -> ArmState:
+        """The state, as of now."""
+        return replace(self.told, stamp_s=self.clock.now())
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def follow(capture: Capture, count: int) -> list[Step]:
+    """Takes a view whenever a guided arm rests at a new place.
+
+    Args:
+        capture: The recording.
+        count: How many views; 0 until Ctrl-C.
+
+    Returns:
+        What became of each rest.
+
+    Raises:
+        DriverError: A device failed, or the arm is stopped.
+        DataError: A view cannot be written, or too many rests in a row gave none.
+    """
+    capture.catch_up()
+    been = _places(capture)
+    with closed_cleanly(capture.cell, capture.journal):
+        try:
+            while not count or len(capture.journal.views) < count:
+                state, took_s = _rest(capture.cell, been, capture.options.still)
+                been.append(state.base_from_flange)
+                place = len(capture.journal.views) + 1
+                step = capture.view(_next(capture), place, count, took_s, capture.coach.advice)
+                if isinstance(step.found, Taken):
+                    # The hand may have gone on while the rest was waited for.
+                    been.append(step.found.state.base_from_flange)
+        except KeyboardInterrupt:
+            # This is how a person ends what has no other end.
+            if not capture.journal.views:
+                raise DriverError(
+                    "ended by Ctrl-C before the first view.",
+                    next_step="Guide the arm to where the camera sees the board, and let it rest.",
+                ) from None
+    return capture.steps
+
+
+def ask_and_take(capture: Capture, arm: Arm, count: int, ask: Callable[[str], str]) -> list[Step]:
+    """Takes a view whenever a person says so, and asks for its pose.
+
+    Args:
+        capture: The recording.
+        arm: What asks for the pose.
+        count: How many views; 0 until `q`.
+        ask: Asks a question and gives the line that was typed.
+
+    Returns:
+        What became of each.
+
+    Raises:
+        DriverError: The camera failed, or Ctrl-C came.
+        DataError: A view cannot be written, or too many in a row gave none.
+    """
+    capture.catch_up()
+    camera, clock = capture.cell.camera, capture.cell.clock
+    with closed_cleanly(capture.cell, capture.journal):
+        while not count or len(capture.journal.views) < count:
+            number = _next(capture)
+            wish = capture.coach.advice()
+            hint = f" ({wish})" if wish else ""
+            if _ends(ask, f"View {number}{hint}: Enter takes it, q ends: "):
+                break
+            held = HeldArm(arm.name, arm.state(), clock)
+            capture.cell = LiveCell(held, camera, clock)
+            place = len(capture.journal.views) + 1
+            capture.view(number, place, count, 0.0, capture.coach.advice)
+    return capture.steps
+
+
+def _ends(ask: Callable[[str], str], question: str) -> bool:
+    try:
+        return ask(question).strip().lower() == "q"
+    except EOFError:
+        # A file of answers ends so.
+        return True
+
+
+def _rest(cell: LiveCell, been: Sequence[FloatArray], still: Stillness) -> tuple[ArmState, float]:
+    """Waits until the arm rests at a new place: where, and for how long it was waited [s]."""
+    begun = cell.clock.now()
+    first = cell.state()
+    while True:
+        cell.clock.sleep(_POLL_S)
+        state = cell.state()
+        if why_arm_moves(first, state, still):
+            first = state
+        elif state.stamp_s - first.stamp_s >= still.quiet_s and _is_new(state, been):
+            return state, cell.clock.now() - begun
+
+
+def _is_new(state: ArmState, been: Sequence[FloatArray]) -> bool:
+    for pose in been:
+        mm, deg = pose_difference(pose, state.base_from_flange)
+        if mm < _NEW_MM and deg < _NEW_DEG:
+            return False
+    return True
+
+
+def _places(capture: Capture) -> list[FloatArray]:
+    poses = [it.base_from_flange() for it in capture.journal.views]
+    return [np.asarray(it.as_matrix()) for it in poses if it is not None]
+
+
+def _next(capture: Capture) -> int:
+    return 1 + max((it.number for it in capture.journal.views), default=0)

@@ -1,0 +1,213 @@
+"""Views on disk as they come: each is whole and flushed before the next one is taken."""
+
+import errno
+import json
+import shutil
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import tomli_w
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import (
+    flush_folder,
+    named_errors,
+    read_bytes,
+    read_toml,
+    write_atomically,
+)
+from visioncal.core.temporary_files import remove_abandoned
+from visioncal.core.version import __version__
+from visioncal.live.capture.facts import Facts, view_of
+from visioncal.live.capture.take import Taken
+from visioncal.session import Session, View
+from visioncal.session.table import write_csv
+
+# What a recording is of, beside the session; it is there before the first view.
+PROVENANCE = "recorded.toml"
+_IMAGES, _TABLE = "images", "views.csv"
+# Noise does not get smaller by trying harder; flushing waits for every byte.
+_PNG_EFFORT = 1
+# Tables and folders take little; the last bytes of a disk are not to be counted on.
+_SPARE_BYTES = 256_000
+# Letters of a digest, which are cut short for people.
+_DIGEST = 64
+
+
+class Journal:
+    """A session's folder that grows view by view.
+
+    The table of views is replaced as a whole for each view, after its image is on the disk: at any
+    moment the folder holds the session of all views that were acknowledged, or, before the first,
+    none. The death of the process at any moment loses at most the view that is being written.
+
+    Attributes:
+        folder: The session's folder.
+        views: The views that are on the disk.
+    """
+
+    def __init__(self, folder: Path, facts: Facts, unix_offset_s: float) -> None:
+        """Takes a folder as it is; `begin` and `resume` prepare one."""
+        self.folder = folder
+        self.views: tuple[View, ...] = ()
+        self._columns: tuple[str, ...] = ()
+        self._facts, self._offset_s = facts, unix_offset_s
+
+    @classmethod
+    def begin(cls, folder: Path, facts: Facts, unix_offset_s: float, views: int) -> "Journal":
+        """Begins a session.
+
+        Args:
+            folder: Where; it must be new, or empty.
+            facts: What is recorded of.
+            unix_offset_s: What makes the host's monotonic clock UNIX time [s].
+            views: How many views are to come; 0 where that is open.
+
+        Raises:
+            DataError: The folder holds something, cannot be written, or has no room for the views.
+        """
+        with named_errors(folder):
+            taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        if taken:
+            recorded = (folder / PROVENANCE).is_file()
+            raise DataError(
+                f"{folder} exists and is not empty; a session is recorded into a new folder.",
+                culprits=[str(folder)],
+                next_step="Go on with its recording by --resume, or choose another name."
+                if recorded
+                else "Choose another name.",
+            )
+        journal = cls(folder, facts, unix_offset_s)
+        with named_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        width, height = facts.resolution
+        journal._check_room(views * width * height, f"{views} views")
+        with named_errors(folder):
+            (folder / _IMAGES).mkdir(exist_ok=True)
+        document = {"visioncal": __version__, **facts.provenance(), "settings": facts.settings}
+        journal._write(PROVENANCE, tomli_w.dumps(document))
+        return journal
+
+    @classmethod
+    def resume(cls, folder: Path, facts: Facts, unix_offset_s: float, views: int) -> "Journal":
+        """Goes on with a session, or begins it where nothing was recorded yet.
+
+        What a killed process left half written is removed.
+
+        Args:
+            folder: Where.
+            facts: What is recorded of; the same as before.
+            unix_offset_s: What makes the host's monotonic clock UNIX time [s].
+            views: How many views there are to be in all; 0 where that is open.
+
+        Raises:
+            DataError: The folder holds another recording, or something else.
+        """
+        path = folder / PROVENANCE
+        for place in (folder, folder / _IMAGES):
+            remove_abandoned(place)
+        if not path.is_file():
+            with named_errors(folder), suppress(FileNotFoundError):
+                (folder / _IMAGES).rmdir()
+            return cls.begin(folder, facts, unix_offset_s, views)
+        _check_same(read_toml(path, str(path)), facts, folder)
+        journal = cls(folder, facts, unix_offset_s)
+        with named_errors(folder):
+            (folder / _IMAGES).mkdir(exist_ok=True)
+        if (folder / _TABLE).is_file():
+            session = Session.load(folder)
+            journal.views, journal._columns = session.views, session.columns
+        return journal
+
+    def append(self, number: int, taken: Taken) -> View:
+        """Puts a view on the disk; when this returns, it stays there.
+
+        Raises:
+            DataError: It cannot be written; the session is what it was before.
+        """
+        image = f"{_IMAGES}/{number:03d}.png"
+        view = view_of(number, image, taken, self._facts, self._offset_s)
+        _, png = cv2.imencode(".png", taken.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_EFFORT])
+        data = png.tobytes()
+        self._check_room(len(data), f"view {number}")
+        self._write(image, data)
+        if not self.views:
+            for name, text in self._facts.texts().items():
+                self._write(name, text)
+        views = (*self.views, view)
+        columns = self._columns or _columns(view)
+        self._write(_TABLE, write_csv(columns, views))
+        self.views, self._columns = views, columns
+        return view
+
+    def check_room(self) -> None:
+        """Checks that the disk has room for one more view.
+
+        Raises:
+            DataError: It has not.
+        """
+        width, height = self._facts.resolution
+        self._check_room(width * height, "the next view")
+
+    def image(self, view: View) -> bytes:
+        """Reads the image of a view that is on the disk."""
+        return read_bytes(self.folder / view.image)
+
+    def _write(self, name: str, data: bytes | str) -> None:
+        path = self.folder / name
+        try:
+            write_atomically(path, data)
+            with named_errors(path):
+                flush_folder(path.parent)
+        except DataError as error:
+            cause = error.__cause__
+            if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise self._full(len(data), path.name) from error
+            raise
+
+    def _check_room(self, needed: int, what: str) -> None:
+        with named_errors(self.folder):
+            free = shutil.disk_usage(self.folder).free
+        if free < needed + _SPARE_BYTES:
+            raise self._full(needed, what)
+
+    def _full(self, needed: int, what: str) -> DataError:
+        free = shutil.disk_usage(self.folder).free
+        return DataError(
+            f"{self.folder}: too little room: {free / 1e6:.1f} MB are free, and "
+            f"{(needed + _SPARE_BYTES) / 1e6:.1f} MB are needed for {what}.",
+            culprits=[str(self.folder)],
+            next_step="Make room on that disk and go on with --resume.",
+        )
+
+
+def _columns(view: View) -> tuple[str, ...]:
+    return ("view", "image", *view.numbers, *view.text)
+
+
+def _check_same(before: dict[str, Any], facts: Facts, folder: Path) -> None:
+    """Refuses to go on with the recording of something else.
+
+    Raises:
+        DataError: Naming what differs.
+    """
+    now = facts.provenance()
+    differ = [name for name, value in now.items() if before.get(name) != value]
+    if not differ:
+        return
+    words = "; ".join(
+        f"{it} was {_short(before.get(it))} and is {_short(now[it])}" for it in differ
+    )
+    raise DataError(
+        f"{folder} was recorded of something else: {words}.",
+        culprits=[f"{folder / PROVENANCE}: {it}" for it in differ],
+        next_step="Go on with the same, or record into a new folder.",
+    )
+
+
+def _short(value: object) -> str:
+    if isinstance(value, str) and len(value) == _DIGEST:
+        return f"{value[:8]}..."
+    return json.dumps(value) if value not in ("", None) else "none"

@@ -1,0 +1,76 @@
+"""Records what joints do during a motion that somebody else drives."""
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from visioncal.core.errors import DriverError
+from visioncal.live.drivers.protocols import Joints, JointSample
+from visioncal.session import Stream
+
+# A joint that is faster than this moves [rad/s].
+_MOVING_RAD_S = 0.005
+# So much of the rest before and behind a motion is kept: filters begin and end in it [s].
+_LEAD_S = 1.0
+
+
+def record_motion(
+    joints: Joints,
+    *,
+    rest_s: float = 3.0,
+    patience_s: float = 120.0,
+    told: Callable[[str], None] = lambda _: None,
+) -> Stream:
+    """Waits for a motion, and records it until its joints have come to rest.
+
+    Args:
+        joints: Who tells what they do.
+        rest_s: Joints at rest for so long have come to the motion's end [s].
+        patience_s: How long the motion's begin is waited for [s].
+        told: Called with what is going on, in words.
+
+    Returns:
+        Times on the controller's clock, angles, speeds and currents.
+
+    Raises:
+        DriverError: No motion begins, or the joints cannot be read.
+    """
+    lead: deque[JointSample] = deque(maxlen=max(int(_LEAD_S * joints.rate_hz), 1))
+    first = joints.sample()
+    told(f"waiting for the {joints.name} to move: start its program now")
+    while not _moves(sample := joints.sample()):
+        lead.append(sample)
+        if sample.stamp_s - first.stamp_s > patience_s:
+            raise DriverError(
+                f"The {joints.name} has not moved for {patience_s:g} s.",
+                culprits=[joints.name],
+                next_step="Start the program on the pendant while this command waits.",
+            )
+    told("it moves")
+    kept, moved_s = [*lead, sample], sample.stamp_s
+    while sample.stamp_s - moved_s < rest_s:
+        sample = joints.sample()
+        kept.append(sample)
+        if _moves(sample):
+            moved_s = sample.stamp_s
+    told(f"it has come to rest after {moved_s - kept[0].stamp_s:.1f} s")
+    return _stream([it for it in kept if it.stamp_s <= moved_s + _LEAD_S])
+
+
+def _moves(sample: JointSample) -> bool:
+    return bool(np.abs(sample.dq).max() > _MOVING_RAD_S)
+
+
+def _stream(samples: list[JointSample]) -> Stream:
+    """Samples as a stream; those that did not ascend in time were sent twice."""
+    stamps_s = np.array([it.stamp_s for it in samples])
+    new = np.concatenate([[True], np.diff(stamps_s) > 0.0])
+    count = len(samples[0].q)
+    parts = [np.array([getattr(it, name) for it in samples]) for name in ("q", "dq", "currents_a")]
+    columns = [
+        name.format(joint)
+        for name in ("q{}_rad", "dq{}_rad_s", "current{}_a")
+        for joint in range(1, count + 1)
+    ]
+    return Stream(("stamp_s", *columns), np.column_stack([stamps_s, *parts])[new])

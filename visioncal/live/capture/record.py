@@ -1,0 +1,200 @@
+"""Driving the stops of a plan and taking a view at each."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from visioncal.core.errors import DataError, DriverError, VisioncalError
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import Camera, FloatArray
+from visioncal.live.capture.approach import Ways
+from visioncal.live.capture.coach import Coach
+from visioncal.live.capture.core import Capture, Step, Watcher
+from visioncal.live.capture.drive import drive, joints_of, travel_s
+from visioncal.live.capture.joint_pose_check import Agreement
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.predict import PlannedAccuracy
+from visioncal.live.drivers.protocols import MovingArm
+from visioncal.live.planning.read_back import PlanFile, Stop
+
+# A stop takes about so long besides the way to it [s].
+_STOP_S = 1.5
+# A nominal model is nearer to its own arm; beyond, the plan is for another one, or another base.
+_SAME_ARM_MM = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class Departure:
+    """What is about to happen, before anything moves.
+
+    Attributes:
+        stops: The stops that have no view yet.
+        here: (n,) where the joints are [rad].
+        first: The postures (n,) on the way to the first stop, its own last; empty where no stop is
+            left.
+        turn_rad: How far the joint turns that turns farthest on that way [rad].
+        duration_s: How long all will take, about [s].
+    """
+
+    stops: tuple[Stop, ...]
+    here: FloatArray
+    first: tuple[FloatArray, ...]
+    turn_rad: float
+    duration_s: float
+
+
+def departure(
+    cell: LiveCell, plan: PlanFile, done: Sequence[int], options: CaptureOptions
+) -> Departure:
+    """Looks at what is to be driven; nothing moves.
+
+    Args:
+        cell: The devices.
+        plan: The stops.
+        done: The views that are on the disk.
+        options: Speed and acceleration.
+
+    Raises:
+        DriverError: The arm does not tell where it is, or is stopped.
+        DataError: The plan is for another arm, or the way to the first stop cannot be shown to be
+            free.
+    """
+    here = joints_of(cell)
+    _check_model(cell, plan, here)
+    stops = tuple(it for it in plan.stops if it.view not in done)
+    if not stops:
+        return Departure((), here, (), 0.0, 0.0)
+    first = Ways(plan).to(stops[0], here)
+    pace = (options.speed, options.acceleration)
+    way = [here, *first, *(q for it in stops[1:] for q in (*it.via, it.q))]
+    legs = [travel_s(a, b, *pace) for a, b in pairwise(way)]
+    turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
+    return Departure(stops, here, first, float(turns.max()), sum(legs) + _STOP_S * len(stops))
+
+
+def record(
+    cell: LiveCell,
+    plan: PlanFile,
+    journal: Journal,
+    options: CaptureOptions,
+    watchers: Sequence[Watcher] = (),
+    *,
+    lens: Camera | None = None,
+) -> list[Step]:
+    """Records the stops of a plan that have no view yet.
+
+    However it ends, the arm stands still and every view that was told of is on the disk.
+
+    Args:
+        cell: The devices; its arm can be driven.
+        plan: The stops.
+        journal: Where the views go.
+        options: How they are taken.
+        watchers: Who is told of each.
+        lens: The intrinsics that the camera tells; else those of the plan are good enough to tell
+            tilts and distances.
+
+    Returns:
+        What became of each stop.
+
+    Raises:
+        DriverError: A device failed, the arm was stopped, or Ctrl-C came.
+        DataError: A view cannot be written, no clear way leads to a stop, or three stops in a row
+            gave no view.
+    """
+    arm = cell.arm
+    if not isinstance(arm, MovingArm):
+        raise DriverError(
+            f"{arm.name} cannot be driven.",
+            culprits=[arm.name],
+            next_step="Guide it by hand: --follow.",
+        )
+    capture = Capture(
+        cell,
+        plan.cell.target,
+        journal,
+        options,
+        Agreement(plan.cell.robot),
+        Coach(plan.cell.target, cell.camera.resolution, lens or plan.cell.camera),
+        PlannedAccuracy.of(plan),
+        watchers,
+    )
+    capture.catch_up()
+    done = {it.number for it in journal.views}
+    left = [it for it in plan.stops if it.view not in done]
+    ways = Ways(plan)
+    with closed_cleanly(cell, journal):
+        for at, stop in enumerate(left):
+            begun = cell.clock.now()
+            way = ways.to(stop, joints_of(cell))
+            drive(cell, arm, way, options, look=journal.check_room)
+            moved_s = cell.clock.now() - begun
+            place = len(plan.stops) - len(left) + at + 1
+            onward = left[at + 1].view if at + 1 < len(left) else None
+            advise = partial(capture.onward, onward)
+            capture.view(stop.view, place, len(plan.stops), moved_s, advise)
+    return capture.steps
+
+
+@contextmanager
+def closed_cleanly(cell: LiveCell, journal: Journal) -> Iterator[None]:
+    """Runs a recording, after which the arm stands still; says what is on the disk if it fails.
+
+    Raises:
+        DriverError: A device failed, or Ctrl-C came.
+        DataError: The recording could not go on for another reason.
+    """
+    try:
+        with cell.halting():
+            yield
+    except KeyboardInterrupt:
+        raise DriverError(
+            f"stopped by Ctrl-C or a signal; the arm was halted. {kept_words(journal)}",
+            culprits=["Ctrl-C"],
+            next_step="Go on with --resume.",
+        ) from None
+    except VisioncalError as error:
+        message = f"{error.message} {kept_words(journal)}"
+        step = error.next_step
+        if "--resume" not in step:
+            step = f"{step} Go on with --resume.".strip()
+        raise type(error)(message, culprits=error.culprits, next_step=step) from error
+
+
+def kept_words(journal: Journal) -> str:
+    """Says what is on the disk."""
+    count = len(journal.views)
+    if not count:
+        return f"No view was taken; {journal.folder} is no session yet."
+    return f"{count} view{'s are' if count > 1 else ' is'} safe in {journal.folder}."
+
+
+def _check_model(cell: LiveCell, plan: PlanFile, here: FloatArray) -> None:
+    """Checks that the arm is the plan's: its ways were looked at with that arm in that base.
+
+    Raises:
+        DataError: It is another one.
+    """
+    robot = plan.cell.robot
+    if len(here) != robot.joint_count:
+        raise DataError(
+            f"{cell.arm.name} has {len(here)} joints, and the plan is for {robot.name} with "
+            f"{robot.joint_count}.",
+            culprits=["--arm", "--plan"],
+            next_step="Plan for the arm that is connected.",
+        )
+    reported = cell.state().base_from_flange
+    off_mm, off_deg = pose_difference(robot.base_from_flange(here[None])[0], reported)
+    if off_mm > _SAME_ARM_MM:
+        raise DataError(
+            f"{cell.arm.name}: its flange is {off_mm:.0f} mm and {off_deg:.0f} deg from where the "
+            f"plan's {robot.name} has it at these joints (limit {_SAME_ARM_MM:.0f} mm).",
+            culprits=["--plan"],
+            next_step="Plan for the arm that is connected, in its controller's base.",
+        )

@@ -1,0 +1,29 @@
+"""Client libraries that only some users need, and the command that installs a missing one."""
+
+from importlib import import_module
+from types import ModuleType
+
+from visioncal.core.errors import DriverError
+
+# What the extras of this package install, by their names in pyproject.toml.
+_PACKAGES = {"ur": "ur-rtde>=1.6.5,<2", "oak": "depthai>=3.12,<4"}
+
+
+def client_library(module: str, extra: str) -> ModuleType:
+    """Imports a client library.
+
+    Args:
+        module: The module's name.
+        extra: The extra that brings it.
+
+    Raises:
+        DriverError: It is not installed, with the command that installs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise DriverError(
+            f"{module} cannot be imported: {error}.",
+            culprits=[module],
+            next_step=f"Install it: pip install '{_PACKAGES[extra]}'",
+        ) from error

@@ -1,0 +1,93 @@
+"""A folder of images as a camera, one file after the other."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.files import natural
+from visioncal.core.types import Camera
+from visioncal.live.drivers.protocols import Frame
+from visioncal.vision.finders.imaging import read_image
+
+_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+
+class FolderCamera:
+    """A camera device whose next picture is the folder's next file, in the order of its numbers.
+
+    It stands for a camera that somebody else triggers: the files are taken as they are found when
+    it is opened, read in grey, and each is taken for a picture of the moment at which it is asked
+    for.
+
+    Args:
+        folder: The folder.
+
+    Raises:
+        DataError: It is missing or holds no images, or the first cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        if not folder.is_dir():
+            raise DataError(f"There is no folder {folder}.", culprits=[str(folder)])
+        self._files = sorted(
+            (it for it in folder.iterdir() if it.suffix.lower() in _ENDINGS), key=natural
+        )
+        if not self._files:
+            raise DataError(
+                f"{folder} holds no images ({', '.join(_ENDINGS)}).", culprits=[str(folder)]
+            )
+        self._next = 0
+        height, width = read_image(self._files[0]).shape[:2]
+        self._resolution = (width, height)
+
+    @property
+    def name(self) -> str:
+        """Which folder it is."""
+        return f"images of {self._folder.name}"
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(width, height) of the first image [px]."""
+        return self._resolution
+
+    @property
+    def factory(self) -> Camera | None:
+        """None: a folder knows no intrinsics."""
+        return None
+
+    @property
+    def settings(self) -> Mapping[str, str | float]:
+        """Where the images come from."""
+        return MappingProxyType({"folder": self._folder.name})
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """Returns the next image, stamped now; no time limit is needed.
+
+        Raises:
+            DriverError: There is no further one.
+            DataError: It cannot be read, or has another resolution than the first.
+        """
+        del timeout_s
+        if self._next == len(self._files):
+            raise DriverError(
+                f"The {self.name} are at their end: all {len(self._files)} were given.",
+                culprits=[str(self._folder)],
+                next_step="Add images to the folder, or end the recording.",
+            )
+        file = self._files[self._next]
+        image = read_image(file)
+        height, width = image.shape[:2]
+        if (width, height) != self._resolution:
+            raise DataError(
+                f"{file} has {width}x{height} pixels; {self._resolution[0]}x{self._resolution[1]} "
+                f"are needed, as {self._files[0].name} has.",
+                culprits=[str(file)],
+            )
+        self._next += 1
+        return Frame(image, time.monotonic())
+
+    def close(self) -> None:
+        """Lets go of it; there is nothing to let go of."""

@@ -1,0 +1,241 @@
+"""Luxonis' OAK cameras through depthai: fixed focus and exposure, factory intrinsics, own times."""
+
+import math
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType, ModuleType
+
+from visioncal.core.errors import DriverError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import Camera
+from visioncal.live.drivers.oak_calibration import SOCKETS, factory_intrinsics
+from visioncal.live.drivers.oak_frames import FrameEnd, began_after, told_by
+from visioncal.live.drivers.oak_library import Handle, depthai
+from visioncal.live.drivers.protocols import DeviceWishes, Frame
+
+# Where no resolution is wished the sensor's is divided by a whole number, to about this width [px].
+_WIDTH_PX = 2048
+_RATE_HZ = 10.0
+# How long the camera may look for its exposure and focus before they are held, and how long the
+# first picture of all may take [s].
+_SETTLE_S, _FIRST_S = 1.5, 5.0
+_UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
+_OPTIONS = ("socket", "rate_hz", "raw")
+
+
+class OakCamera:
+    """One camera of an OAK, as a camera device.
+
+    What is not wished the device finds by itself once, and then it is held: the focus where the
+    factory calibrated it, else where autofocus went; exposure and gain where automatic exposure
+    went. All of it is in `settings`.
+
+    Args:
+        wishes: What is asked of it; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`, a
+            file to record every frame into, `.avi` or `.mkv`.
+        device: Which OAK, by its id, its address or its USB path; None for the only one.
+
+    Raises:
+        DriverError: depthai or the device is missing, or the device has no such camera.
+        DataError: Frames cannot be recorded into that file.
+    """
+
+    def __init__(self, wishes: DeviceWishes | None = None, *, device: str | None = None) -> None:
+        dai = depthai()
+        wishes = wishes or DeviceWishes()
+        self._socket, rate_hz = _options(wishes.more)
+        with ExitStack() as closing:
+            opened = _opened(dai, device)
+            closing.callback(opened.close)
+            with told_by(dai, "The OAK", "does not start"):
+                sensor = _sensor(opened, self._socket)
+                self._name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
+                self._resolution = wishes.resolution or _fitting(sensor.width, sensor.height)
+                calibration = opened.readCalibrationOrDefault()
+                wishes = _focused(wishes, calibration, sensor)
+                pipeline = dai.Pipeline(opened)
+                node = pipeline.create(dai.node.Camera).build(sensor.socket)
+                output = self._output(dai, node, wishes, sensor, rate_hz)
+                control = node.inputControl.createInputQueue()
+            raw = wishes.more.get("raw")
+            self._end = FrameEnd(
+                dai, pipeline, output, self._name, raw=None if raw is None else Path(raw)
+            )
+            closing.callback(self._end.close)
+            held = self._held(dai, wishes, sensor, control)
+            self._factory, known = self._intrinsics(calibration, sensor)
+            self._settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
+            self._closing = closing.pop_all()
+
+    @property
+    def name(self) -> str:
+        """Which device, which of its cameras, and its sensor."""
+        return self._name
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(width, height) of its pictures [px]."""
+        return self._resolution
+
+    @property
+    def factory(self) -> Camera | None:
+        """The factory's intrinsics at this resolution; None where `settings` say why not."""
+        return self._factory
+
+    @property
+    def settings(self) -> Mapping[str, str | float]:
+        """What is held: exposure, gain, focus, rate, and where the intrinsics are from."""
+        return self._settings
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """Returns a picture whose exposure began after the call.
+
+        Raises:
+            DriverError: None came in time: unplugged.
+        """
+        asked = time.monotonic()
+        self._end.drop_old()
+        while True:
+            frame = self._end.next(asked + timeout_s - time.monotonic())
+            if frame is None:
+                raise DriverError(
+                    f"{self.name} gave no picture within {timeout_s:g} s.",
+                    culprits=[self.name],
+                    next_step="Look at its cable and its power; then go on with --resume.",
+                )
+            if began_after(frame, asked):
+                return frame
+
+    def close(self) -> None:
+        """Stops it and lets go of the device; may be called twice."""
+        self._closing.close()
+
+    def _output(
+        self, dai: ModuleType, node: Handle, wishes: DeviceWishes, sensor: Handle, rate_hz: float
+    ) -> Handle:
+        """Sets what is known beforehand, and asks the camera's node for pictures."""
+        if wishes.focus is not None:
+            node.initialControl.setManualFocus(wishes.focus)
+        if wishes.exposure_us is not None and wishes.gain is not None:
+            node.initialControl.setManualExposure(wishes.exposure_us, wishes.gain)
+        is_colour = dai.CameraSensorType.COLOR in sensor.supportedTypes
+        kind = dai.ImgFrame.Type.BGR888i if is_colour else dai.ImgFrame.Type.GRAY8
+        # The factory's matrix is for pictures that are scaled and cropped, and still distorted.
+        crop = dai.ImgResizeMode.CROP
+        return node.requestOutput(self._resolution, kind, crop, rate_hz, False)
+
+    def _held(
+        self, dai: ModuleType, wishes: DeviceWishes, sensor: Handle, control_queue: Handle
+    ) -> dict[str, str | float]:
+        """Holds what the camera set by itself, and tells what it is."""
+        told = self._end.message(_FIRST_S)
+        until = time.monotonic() + _SETTLE_S
+        while told is not None and time.monotonic() < until:
+            told = self._end.message(1.0)
+        if told is None:
+            raise DriverError(
+                f"{self.name} starts, but gives no picture.",
+                culprits=[self.name],
+                next_step="Look at its cable: USB 3 and short; and at its power.",
+            )
+        found_us = round(1e6 * told.getExposureTime().total_seconds())
+        exposure_us = found_us if wishes.exposure_us is None else wishes.exposure_us
+        gain = told.getSensitivity() if wishes.gain is None else wishes.gain
+        held: dict[str, str | float] = {"exposure_us": exposure_us, "gain": gain}
+        control = dai.CameraControl()
+        control.setManualExposure(exposure_us, gain)
+        control.setAutoWhiteBalanceLock(True)
+        if sensor.hasAutofocus:
+            held["focus"] = told.getLensPosition() if wishes.focus is None else wishes.focus
+            control.setManualFocus(int(held["focus"]))
+        control_queue.send(control)
+        return held
+
+    def _intrinsics(
+        self, calibration: Handle, sensor: Handle
+    ) -> tuple[Camera | None, dict[str, str | float]]:
+        """The factory's intrinsics; where they cannot be used, why, as a setting."""
+        try:
+            camera = factory_intrinsics(calibration, self._socket, self._resolution)
+        except DriverError as error:
+            return None, {"factory_intrinsics": f"not used: {error.message}"}
+        focus = _calibrated_focus(calibration, sensor)
+        at = "" if focus is None else f", for focus {focus}"
+        return camera, {"factory_intrinsics": f"read from the device{at}"}
+
+
+def _options(more: Mapping[str, str]) -> tuple[str, float]:
+    """Socket and rate [Hz] out of a user's words."""
+    for name in more:
+        if name not in _OPTIONS:
+            raise DriverError(
+                f"The OAK has no option {name!r}; {', '.join(_OPTIONS)} are there.",
+                culprits=[name],
+                next_step=did_you_mean(name, _OPTIONS),
+            )
+    socket = more.get("socket", SOCKETS[0])
+    if socket not in SOCKETS:
+        raise DriverError(
+            f"The OAK has no socket {socket!r}; {SOCKETS[0]} to {SOCKETS[-1]} are the names.",
+            culprits=["socket"],
+        )
+    try:
+        rate_hz = float(more.get("rate_hz", _RATE_HZ))
+    except ValueError:
+        rate_hz = math.nan
+    if not 0.0 < rate_hz < 1e3:
+        raise DriverError(
+            f"rate_hz is {more['rate_hz']!r}; pictures a second are needed, as 10.",
+            culprits=["rate_hz"],
+        )
+    return socket, rate_hz
+
+
+def _opened(dai: ModuleType, device: str | None) -> Handle:
+    try:
+        return dai.Device() if device is None else dai.Device(dai.DeviceInfo(device))
+    except RuntimeError as error:
+        raise DriverError(
+            f"{'An OAK' if device is None else f'The OAK {device}'} cannot be opened: {error}.",
+            culprits=["oak" if device is None else device],
+            next_step="Look at its cable (USB 3, in a blue socket) and its power, and whether "
+            "another program holds it. On Linux USB needs a rule once: "
+            f"echo '{_UDEV_RULE}' | sudo tee /etc/udev/rules.d/80-movidius.rules; "
+            "sudo udevadm control --reload-rules; sudo udevadm trigger",
+        ) from error
+
+
+def _sensor(device: Handle, socket: str) -> Handle:
+    """What the device says of the sensor on a socket."""
+    sensors = {it.socket.name: it for it in device.getConnectedCameraFeatures()}
+    if socket not in sensors:
+        raise DriverError(
+            f"The OAK has no camera on {socket}; it has {', '.join(sensors) or 'none'}.",
+            culprits=[socket],
+            next_step="Name another socket, or look at the camera's ribbon cable.",
+        )
+    return sensors[socket]
+
+
+def _fitting(width: int, height: int) -> tuple[int, int]:
+    """The sensor's whole view in a size that a USB cable carries; an even number of pixels."""
+    parts = math.ceil(width / _WIDTH_PX)
+    return width // parts // 2 * 2, height // parts // 2 * 2
+
+
+def _focused(wishes: DeviceWishes, calibration: Handle, sensor: Handle) -> DeviceWishes:
+    """Focuses where the factory calibrated, unless another focus is wished."""
+    if wishes.focus is not None or not sensor.hasAutofocus:
+        return wishes
+    return replace(wishes, focus=_calibrated_focus(calibration, sensor))
+
+
+def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:
+    """The position of the lens for which the factory's intrinsics are; None for a fixed lens."""
+    if not sensor.hasAutofocus or not calibration.hasCameraCalibration(sensor.socket):
+        return None
+    position = int(calibration.getLensPosition(sensor.socket))
+    return position if position > 0 else None

@@ -1,0 +1,184 @@
+"""Frames from anywhere, through depthai's pipeline on this host as an OAK's frames come."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from datetime import timedelta
+from pathlib import Path
+from types import MappingProxyType, ModuleType
+
+from visioncal.core.errors import DriverError
+from visioncal.core.types import Camera
+from visioncal.live.drivers.oak_frames import FrameEnd, began_after
+from visioncal.live.drivers.oak_library import Handle, depthai
+from visioncal.live.drivers.protocols import Frame
+
+# A source that computes its pictures may take longer than a camera [s].
+_PATIENCE_S = 10.0
+_GLANCE_S = 0.05
+
+
+class HostedOak:
+    """A camera device whose pictures a source gives.
+
+    The source is asked for a picture when one is wanted, in a thread of the pipeline.
+
+    Args:
+        source: Gives a picture with its time, exposed after the call; None when there are no more.
+            What it raises as DriverError is raised to whoever asked for the frame.
+        resolution: (width, height) of its pictures [px].
+        factory: The intrinsics that are known of it.
+        settings: What it is set to.
+        raw: A file to record every frame into, `.avi` or `.mkv`.
+
+    Raises:
+        DriverError: depthai is not installed.
+        DataError: Frames cannot be recorded into that file.
+    """
+
+    def __init__(
+        self,
+        source: Callable[[], Frame | None],
+        resolution: tuple[int, int],
+        *,
+        factory: Camera | None = None,
+        settings: Mapping[str, str | float] | None = None,
+        raw: Path | None = None,
+    ) -> None:
+        dai = depthai()
+        self._resolution, self._factory = resolution, factory
+        self._settings = MappingProxyType(dict(settings or {}))
+        self._feed = _Feed(source)
+        pipeline = dai.Pipeline(createImplicitDevice=False)
+        node = _source_node(dai, pipeline, self._feed)
+        self._end = FrameEnd(dai, pipeline, node.out, self.name, raw=raw)
+
+    @property
+    def name(self) -> str:
+        """What it is."""
+        return "OAK pipeline without a device"
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(width, height) of its pictures [px]."""
+        return self._resolution
+
+    @property
+    def factory(self) -> Camera | None:
+        """The intrinsics that are known of it."""
+        return self._factory
+
+    @property
+    def settings(self) -> Mapping[str, str | float]:
+        """What it is set to."""
+        return self._settings
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """Returns a picture whose exposure began after the call.
+
+        Raises:
+            DriverError: The source has none, failed, or was closed.
+        """
+        asked = time.monotonic()
+        self._end.drop_old()
+        self._feed.ask()
+        while True:
+            frame = self._end.next(_GLANCE_S)
+            if frame is not None and began_after(frame, asked):
+                return self._checked(frame)
+            if frame is not None:
+                # It was under way already when this one was asked for.
+                self._feed.ask()
+            self._feed.raise_what_went_wrong()
+            now = time.monotonic()
+            waited = now - asked
+            # What the source has just made is still on its way through the pipeline.
+            quiet_s = now - max(asked, self._feed.rested_s)
+            if waited > _PATIENCE_S if self._feed.is_at_work else quiet_s > timeout_s:
+                raise DriverError(
+                    f"The {self.name} gave no picture within {waited:.1f} s.", culprits=[self.name]
+                )
+
+    def close(self) -> None:
+        """Stops the pipeline; may be called twice."""
+        self._end.close()
+
+    def _checked(self, frame: Frame) -> Frame:
+        height, width = frame.image.shape[:2]
+        if (width, height) != self._resolution:
+            raise DriverError(
+                f"The {self.name} gave a picture of {width}x{height}; "
+                f"{self._resolution[0]}x{self._resolution[1]} was promised.",
+                culprits=[self.name],
+            )
+        return frame
+
+
+class _Feed:
+    """What the pipeline's thread and the one that wants a frame tell each other."""
+
+    def __init__(self, source: Callable[[], Frame | None]) -> None:
+        self._source = source
+        self._wanted = threading.Event()
+        self._error: DriverError | None = None
+        self.is_at_work = False
+        self.rested_s = 0.0
+
+    def ask(self) -> None:
+        """Wants a picture."""
+        self._wanted.set()
+
+    def answer(self) -> Frame | None:
+        """Takes a picture where one is wanted; called by the pipeline again and again."""
+        if not self._wanted.wait(_GLANCE_S):
+            return None
+        self.is_at_work = True
+        self._wanted.clear()
+        try:
+            frame = self._source()
+            if frame is None:
+                self._error = DriverError("The source of pictures is at its end.")
+        except DriverError as error:
+            self._error = error
+            return None
+        finally:
+            self.rested_s = time.monotonic()
+            self.is_at_work = False
+        return frame
+
+    def raise_what_went_wrong(self) -> None:
+        """Raises what the source raised, once: a camera may be plugged in again."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+
+def _source_node(dai: ModuleType, pipeline: Handle, feed: _Feed) -> Handle:
+    """Makes the node that sends the feed's pictures; depthai's classes exist once it is there."""
+
+    class Source(dai.node.ThreadedHostNode):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            dai.node.ThreadedHostNode.__init__(self)
+            self.out = self.createOutput()
+
+        def run(self) -> None:
+            number = 0
+            while self.isRunning():
+                frame = feed.answer()
+                if frame is not None:
+                    self.out.send(_message(dai, frame, number))
+                    number += 1
+
+    return pipeline.create(Source)
+
+
+def _message(dai: ModuleType, frame: Frame, number: int) -> Handle:
+    """Writes a frame as a device would: depthai counts time from the end of the exposure."""
+    kinds = dai.ImgFrame.Type
+    message = dai.ImgFrame()
+    message.setCvFrame(frame.image, kinds.GRAY8 if frame.image.ndim == 2 else kinds.BGR888i)
+    exposure_s = frame.exposure_s or 0.0
+    message.cam.exposureTimeUs = round(1e6 * exposure_s)
+    message.setTimestamp(timedelta(seconds=frame.stamp_s + 0.5 * exposure_s))
+    message.setSequenceNum(number)
+    return message

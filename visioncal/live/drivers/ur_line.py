@@ -1,0 +1,82 @@
+"""Calls into the client library in a thread of their own, with a limit of time.
+
+The library's control interface serves one call at a time and, where the controller falls silent,
+may not return for minutes. One thread owns it; who calls waits no longer than the limit.
+"""
+
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+from visioncal.core.errors import DriverError
+
+T = TypeVar("T")
+# What the library throws, standard C++ exceptions, arrives as these.
+_THROWN = (RuntimeError, ValueError)
+
+
+class Line:
+    """A thread that works off calls in order, and does something small while there are none.
+
+    Args:
+        name: Who is at the other end, for messages.
+        idle: What is done while no call waits.
+        every_s: How often that is [s].
+    """
+
+    def __init__(self, name: str, idle: Callable[[], None], every_s: float) -> None:
+        self._name = name
+        self._idle, self._every_s = idle, every_s
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        # A daemon: a call that never returns must not keep the program from ending.
+        threading.Thread(target=self._work, name=name, daemon=True).start()
+
+    def call(self, work: Callable[[], T], *, limit_s: float, what: str) -> T:
+        """Runs a call in the thread.
+
+        Args:
+            work: The call.
+            limit_s: How long to wait for it [s].
+            what: What it does, for messages.
+
+        Raises:
+            DriverError: It threw, or did not return in time.
+        """
+        future: Future[T] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(work())
+            except _THROWN as error:
+                future.set_exception(error)
+
+        self._jobs.put(run)
+        try:
+            return future.result(limit_s)
+        except TimeoutError as error:
+            raise DriverError(
+                f"{self._name} did not {what} within {limit_s:.1f} s.",
+                culprits=[self._name],
+                next_step="Look at the pendant and at the network cable.",
+            ) from error
+        except _THROWN as error:
+            raise DriverError(
+                f"{self._name} could not {what}: {error}.", culprits=[self._name]
+            ) from error
+
+    def end(self) -> None:
+        """Lets the thread end behind the calls that wait."""
+        self._jobs.put(None)
+
+    def _work(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get(timeout=self._every_s)
+            except queue.Empty:
+                self._idle()
+                continue
+            if job is None:
+                return
+            job()

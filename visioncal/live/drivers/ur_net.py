@@ -1,0 +1,198 @@
+"""Plain connections to a UR controller, with a limit of time on everything.
+
+The client library waits for a silent controller with no limit, and holds Python's lock while it
+does. So whatever it is going to talk to is asked first, from here.
+"""
+
+import queue
+import socket
+import struct
+import threading
+from types import TracebackType
+from typing import BinaryIO, Self
+
+from visioncal.core.errors import DriverError
+
+DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
+# A controller in the same network answers within milliseconds.
+_CONNECT_S = 0.8
+_ANSWER_S = 1.0
+_BANNER = "Universal Robots Dashboard Server"
+_HEADER = struct.Struct(">HB")
+# Types of RTDE's frames: request of a version, what is sent, start, a state.
+_PROTOCOL, _OUTPUTS, _START, _DATA = b"VOSU"
+
+
+def resolve(host: str) -> str:
+    """Finds a host's address, as `192.168.0.10`.
+
+    Raises:
+        DriverError: The name is not known, or no server of names tells it in time.
+    """
+    found: queue.SimpleQueue[str | OSError] = queue.SimpleQueue()
+
+    def ask() -> None:
+        try:
+            found.put(socket.gethostbyname(host))
+        except OSError as error:
+            found.put(error)
+
+    # The system asks servers of names for many seconds, and takes no limit.
+    threading.Thread(target=ask, daemon=True).start()
+    try:
+        address = found.get(timeout=_ANSWER_S)
+    except queue.Empty:
+        address = TimeoutError(f"no answer within {_ANSWER_S} s")
+    if isinstance(address, str):
+        return address
+    raise DriverError(
+        f"The robot's address {host!r} is not known: {address.strerror or address}.",
+        culprits=[host],
+        next_step="Give the IP address that the pendant shows (Settings > System > Network).",
+    ) from address
+
+
+def connect(host: str, port: int, what: str) -> socket.socket:
+    """Opens a connection.
+
+    Args:
+        host: The controller's address.
+        port: Its port.
+        what: What listens there, for messages.
+
+    Raises:
+        DriverError: The host cannot be reached, or does not listen there.
+    """
+    try:
+        link = socket.create_connection((host, port), _CONNECT_S)
+    except ConnectionRefusedError as error:
+        raise DriverError(
+            f"{host} is there, but its port {port} ({what}) is closed: no UR controller with "
+            "PolyScope 3 or 5 is running there.",
+            culprits=[f"{host}:{port}"],
+            next_step="Check the address; wait until the pendant has started; open the port under "
+            "Settings > Security > Services.",
+        ) from error
+    except OSError as error:
+        raise DriverError(
+            f"{host} cannot be reached (port {port}, {what}): "
+            f"{error.strerror or f'no answer within {_CONNECT_S} s'}.",
+            culprits=[f"{host}:{port}"],
+            next_step="Check the network cable, the address, and that this computer's is in the "
+            f"same network: ping {host}",
+        ) from error
+    link.settimeout(_ANSWER_S)
+    return link
+
+
+class Dashboard:
+    """The controller's server of questions and orders in plain words, one line each.
+
+    Args:
+        host: The controller's address.
+        answer_s: How long to wait for an answer [s].
+    """
+
+    def __init__(self, host: str, answer_s: float = _ANSWER_S) -> None:
+        self._label = f"{host}:{DASHBOARD_PORT}"
+        self._socket = connect(host, DASHBOARD_PORT, "the dashboard")
+        self._socket.settimeout(answer_s)
+        self._file = self._socket.makefile("rb")
+        try:
+            self._check_banner(self._line())
+        except DriverError:
+            self.close()
+            raise
+
+    def ask(self, line: str) -> str:
+        """Sends a line and returns the answer.
+
+        Raises:
+            DriverError: None comes.
+        """
+        try:
+            self._socket.sendall(line.encode("ascii") + b"\n")
+        except OSError as error:
+            raise self._silent(error) from error
+        return self._line()
+
+    def close(self) -> None:
+        """Closes the connection."""
+        self._file.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _check_banner(self, banner: str) -> None:
+        if _BANNER not in banner:
+            raise DriverError(
+                f"{self._label} greets with {banner[:60]!r}, not as a {_BANNER}: this is no UR "
+                "controller.",
+                culprits=[self._label],
+                next_step="Give the address that the robot's pendant shows.",
+            )
+
+    def _line(self) -> str:
+        try:
+            line = self._file.readline(1000)
+        except OSError as error:
+            raise self._silent(error) from error
+        if not line:
+            raise self._silent("it closed the connection")
+        return line.decode("utf-8", "replace").strip()
+
+    def _silent(self, why: object) -> DriverError:
+        return DriverError(
+            f"The dashboard of the controller at {self._label} does not answer: {why}.",
+            culprits=[self._label],
+            next_step="Look at the pendant; start the controller anew if it does not react.",
+        )
+
+
+def check_states_come(host: str) -> None:
+    """Checks that the controller sends states, by taking one.
+
+    Raises:
+        DriverError: It is no RTDE server, or sends nothing.
+    """
+    label = f"{host}:{RTDE_PORT}"
+    with connect(host, RTDE_PORT, "RTDE") as link, link.makefile("rb") as file:
+        try:
+            link.sendall(_frame(_PROTOCOL, struct.pack(">H", 2)))
+            kind, reply = _read(file)
+            if kind != _PROTOCOL or reply != b"\x01":
+                raise DriverError(
+                    f"{label} does not speak version 2 of RTDE: a UR controller with PolyScope "
+                    "3.4 or newer is needed.",
+                    culprits=[label],
+                    next_step="Check the address; update PolyScope where it is older.",
+                )
+            link.sendall(_frame(_OUTPUTS, struct.pack(">d", 125.0) + b"timestamp"))
+            link.sendall(_frame(_START))
+            while kind != _DATA:
+                kind, _ = _read(file)
+        except (OSError, struct.error) as error:
+            raise DriverError(
+                f"The controller at {label} accepts the connection but sends no states: {error}.",
+                culprits=[label],
+                next_step="Look at the pendant; start the controller anew if it does not react.",
+            ) from error
+
+
+def _frame(kind: int, payload: bytes = b"") -> bytes:
+    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
+
+
+def _read(file: BinaryIO) -> tuple[int, bytes]:
+    """Reads a frame: its type and payload; an end of the stream is a `struct.error`."""
+    size, kind = _HEADER.unpack(file.read(_HEADER.size))
+    return kind, file.read(size - _HEADER.size)

@@ -1,0 +1,52 @@
+"""How accurate a result is predicted, and wished, to be."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.live.planning.information import WEAK_SIGMA
+
+# A sigma over this means that nothing tells: it is that of what is assumed beforehand [rad or m].
+OPEN_SIGMA = 0.25 * WEAK_SIGMA
+
+
+@dataclass(frozen=True)
+class Wish:
+    """The accuracy that is wanted, as standard deviations; None where that does not matter.
+
+    Attributes:
+        mm: Of the place [mm].
+        deg: Of the rotation [deg].
+    """
+
+    mm: float | None = None
+    deg: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("mm", "deg"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < np.inf:
+                raise DataError(
+                    f"the wished accuracy is {value} {name}; a number above zero is needed.",
+                    culprits=[f"wish_{name}"],
+                )
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Predicted standard deviations over all worlds, as root mean squares: place and rotation."""
+
+    mm: float
+    deg: float
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a direction is not determined at all; the figures are nothing to go by then."""
+        return self.mm > 1e3 * OPEN_SIGMA or self.deg > np.rad2deg(OPEN_SIGMA)
+
+    def meets(self, wish: Wish) -> bool:
+        """Whether it is as good as was wished."""
+        return (wish.mm is None or self.mm <= wish.mm) and (
+            wish.deg is None or self.deg <= wish.deg
+        )

@@ -1,0 +1,196 @@
+"""What is known of a cell before it is calibrated, and what its robot must not do."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.estimation.parts import Noise
+from visioncal.robot import Robot
+from visioncal.vision.targets import corner_positions
+
+# Beyond this angle a printed board is seen from its edge [rad].
+_STEEPEST_RAD = 1.4
+# A matrix that was typed with three digits is this far from a rotation.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Something in the cell that the arm must not touch.
+
+    Attributes:
+        name: What it is, for messages.
+        base_from_box: (4, 4) the frame of its centre [m].
+        size_m: (3,) its full lengths along that frame's axes [m].
+    """
+
+    name: str
+    base_from_box: FloatArray
+    size_m: FloatArray
+
+    def __post_init__(self) -> None:
+        _check_pose(f"box {self.name}", self.base_from_box)
+        size = np.asarray(self.size_m)
+        if size.shape != (3,) or not np.all(np.isfinite(size) & (size > 0.0)):
+            raise DataError(
+                f"box {self.name}: its size is {size.tolist()}; three lengths above zero [m] are "
+                "needed.",
+                culprits=[f"box {self.name}"],
+            )
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What every planned stop, and every way between two of them, keeps.
+
+    Attributes:
+        joint_margin_rad: Distance of the joints from their limits [rad]; as many metres for a
+            prismatic joint.
+        distance_m: Least and greatest distance of the camera from the board's centre [m]. None
+            takes distances at which the board fills the image well, and stays in it although the
+            guesses are wrong.
+        focus_m: Least and greatest depth at which the image is sharp [m]; None for any.
+        tilt_rad: Greatest angle between the line of sight and the board's normal [rad].
+        edge_px: Distance of the board from the image's edge [px].
+        clearance_m: Distance of the arm, and of what it carries, from the floor, the board, the
+            boxes and itself [m].
+        floor_m: Height of the floor in the base frame [m]; None for a cell without one.
+    """
+
+    joint_margin_rad: float = 0.05
+    distance_m: tuple[float, float] | None = None
+    focus_m: tuple[float, float] | None = None
+    tilt_rad: float = 0.9
+    edge_px: float = 20.0
+    clearance_m: float = 0.03
+    floor_m: float | None = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("joint_margin_rad", "edge_px", "clearance_m"):
+            value = getattr(self, name)
+            if not 0.0 <= value < np.inf:
+                raise DataError(f"limits: {name} is {value}; zero or more is needed.")
+        if not 0.0 < self.tilt_rad <= _STEEPEST_RAD:
+            raise DataError(
+                f"limits: tilt_rad is {self.tilt_rad}; above 0 and up to {_STEEPEST_RAD} is "
+                "needed: beyond it the camera looks at the board's edge."
+            )
+        for name in ("distance_m", "focus_m"):
+            span = getattr(self, name)
+            if span is not None and not 0.0 <= span[0] < span[1]:
+                raise DataError(
+                    f"limits: {name} is {span}; an ascending range from zero [m] is needed."
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class PlanCell:
+    """A cell whose robot is to be moved: its parts, rough guesses of what is unknown, limits.
+
+    Attributes:
+        mount: Where the camera is.
+        robot: The arm.
+        camera: The intrinsics.
+        target: The board.
+        x: (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
+        z: (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
+        sigma_rad: How well the rotations of both are known: one standard deviation per axis [rad].
+        sigma_m: The same for their translations [m].
+        noise: How well the robot stands where it says that it does.
+        pixel_px: Noise of a corner, per axis [px].
+        limits: What every stop and every way between two of them keeps.
+        boxes: What else stands in the cell.
+        spread: (12, 12) covariance of both edges together (rotation, translation; right
+            perturbations), where recorded stops tell it: then both sigmas are typical of it. None
+            where the sigmas say all.
+    """
+
+    mount: Mount
+    robot: Robot
+    camera: Camera
+    target: Target
+    x: FloatArray
+    z: FloatArray
+    sigma_rad: float
+    sigma_m: float
+    noise: Noise
+    pixel_px: float
+    limits: Limits = field(default_factory=Limits)
+    boxes: tuple[Box, ...] = ()
+    spread: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if corner_positions(self.target)[:, 2].any():
+            raise DataError(
+                f"target {self.target.name} is a rig of points outside the plane z = 0 of its "
+                "frame: which of them a view will show is not known, and no stops are planned.",
+                culprits=[f"target {self.target.name}"],
+                next_step="Plan with a flat board in the rig's place.",
+            )
+        for name, edge in (("x", self.x), ("z", self.z)):
+            _check_pose(f"the guess of {name}", edge)
+        for name in ("sigma_rad", "sigma_m"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise DataError(
+                    f"the guesses: {name} is {getattr(self, name)}; zero or more is needed."
+                )
+
+    def cam_from_target(self, q: FloatArray) -> FloatArray:
+        """Predicts where the board is seen, if the guesses are right.
+
+        Args:
+            q: (k, n) joint angles [rad].
+
+        Returns:
+            (k, 4, 4) `cam_from_target` [m].
+        """
+        return self.seen_from(self.robot.base_from_flange(q))
+
+    def seen_from(self, base_from_flange: FloatArray) -> FloatArray:
+        """Predicts (k, 4, 4) `cam_from_target` at (k, 4, 4) poses of the flange [m]."""
+        if self.mount == "eye-in-hand":
+            return np.asarray(invert(base_from_flange @ self.x) @ self.z)
+        return np.asarray(invert(self.x) @ base_from_flange @ self.z)
+
+    def flange_at(self, cam_from_target: FloatArray) -> FloatArray:
+        """Where the flange must be to see the board so: (k, 4, 4) `base_from_flange` [m]."""
+        if self.mount == "eye-in-hand":
+            return np.asarray(self.z @ invert(cam_from_target) @ invert(self.x))
+        return np.asarray(self.x @ cam_from_target @ invert(self.z))
+
+    def guesses(self, count: int, seed: int) -> tuple["PlanCell", ...]:
+        """Draws cells as they may really be: both edges within what is known of them.
+
+        Args:
+            count: How many.
+            seed: Of the draws; the same seed gives the same cells.
+
+        Returns:
+            Cells whose `x` and `z` are moved on the right by normal twists.
+        """
+        rng = np.random.default_rng(seed)
+        draws = rng.standard_normal((count, 12))
+        if self.spread is None:
+            twists = draws * np.tile(np.repeat([self.sigma_rad, self.sigma_m], 3), 2)
+        else:
+            values, vectors = np.linalg.eigh(self.spread)
+            twists = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        moves = exp(twists.reshape(count, 2, 6))
+        return tuple(replace(self, x=self.x @ by_x, z=self.z @ by_z) for by_x, by_z in moves)
+
+
+def _check_pose(what: str, pose: FloatArray) -> None:
+    pose = np.asarray(pose)
+    sound = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
+    if sound:
+        rotation = pose[:3, :3]
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        sound = bool(off < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0.0)
+    if not sound:
+        raise DataError(
+            f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed.",
+            culprits=[what],
+        )

@@ -1,0 +1,64 @@
+"""A plan as it is drawn."""
+
+import numpy as np
+
+from visioncal.live.planning.messages import accuracy_words, looks_note, summary_of
+from visioncal.live.planning.plan import Plan, PlannedStop
+from visioncal.present.recording.obstacles import Obstacle
+from visioncal.present.recording.preview import Preview, PreviewStop
+
+
+def preview_of(plan: Plan, name: str) -> Preview:
+    """What is drawn of a plan, under a name."""
+    cell = plan.cell
+    history = [np.nan if it.is_open else it.mm for it in plan.design.history]
+    return Preview(
+        name,
+        cell.mount,
+        cell.robot,
+        cell.camera,
+        cell.target,
+        cell.x,
+        cell.z,
+        tuple(PreviewStop(it.view, it.q, it.via, _note(it)) for it in plan.stops),
+        np.array(history),
+        tuple(Obstacle(it.name, it.base_from_box, it.size_m) for it in cell.boxes),
+        cell.limits.floor_m,
+        plan.map_m,
+        1e3 * plan.map_sigma_m,
+        _plan_note(plan, name),
+    )
+
+
+def _note(stop: PlannedStop) -> str:
+    degrees = ", ".join(f"{it:.1f}" for it in np.rad2deg(stop.q))
+    x, y, z = 1e3 * stop.base_from_flange[:3, 3]
+    distance = 1e3 * float(np.linalg.norm(stop.cam_from_target[:3, 3]))
+    return "\n\n".join(
+        [
+            f"**View {stop.view}** (number {stop.rank} by what it tells): {stop.words}",
+            f"Joints ({degrees}) deg; flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm; board's origin at "
+            f"{distance:.0f} mm from the camera. The whole board is in the image in "
+            f"{100 * stop.seen:.0f} % of what the cell may be.",
+        ]
+    )
+
+
+def _plan_note(plan: Plan, name: str) -> str:
+    lines = [f"# {len(plan.stops)} stops for {plan.request.purpose.name}", name, ""]
+    lines.append(f"{summary_of(plan)}.")
+    if plan.shortfall:
+        lines += ["", f"**{plan.shortfall}**"]
+    elif note := looks_note(plan):
+        lines += ["", note]
+    if plan.begun is not None and plan.begun.refusal:
+        lines += ["", f"So far: {plan.begun.refusal}"]
+    lines += [
+        "",
+        "The most telling first, each with what is predicted of it and all above it. Views are "
+        "numbered as the arm drives to them.",
+        "",
+    ]
+    ranked = sorted(plan.stops, key=lambda it: it.rank)
+    lines += [f"- **view {it.view}** ({accuracy_words(it.after)}): {it.words}" for it in ranked]
+    return "\n".join(lines)

@@ -1,0 +1,190 @@
+"""Reads the plan.json that `planning.written` writes: the stops to drive to, and their cell."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from visioncal.core.documents.jsons import parse_json
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table, read_text
+from visioncal.core.types import MOUNTS, Camera, CameraKind, FloatArray, Mount, Target
+from visioncal.estimation.parts import Noise
+from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.purposes import Purpose, purpose_of
+from visioncal.live.planning.written import SCHEMA
+from visioncal.robot import Robot
+from visioncal.vision.targets import (
+    load_target,
+    target_document,
+    target_from_document,
+    target_names,
+)
+
+_FILE = "plan.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """A stop to drive to.
+
+    Attributes:
+        view: The number of the view to be taken there.
+        q: (n,) joint angles [rad].
+        via: (j, n) postures on the way from the stop before [rad].
+        words: What it is good for.
+    """
+
+    view: int
+    q: FloatArray
+    via: FloatArray
+    words: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanFile:
+    """A plan as it was written.
+
+    Attributes:
+        cell: What it is for.
+        purpose: What its stops should tell.
+        stops: In the order in which the robot drives to them.
+        start_q: (n,) where the arm was to stand before [rad]; None where that was not said, and the
+            way to the first stop was not looked at.
+        digest: Of what went into the plan.
+    """
+
+    cell: PlanCell
+    purpose: Purpose
+    stops: tuple[Stop, ...]
+    start_q: FloatArray | None
+    digest: str
+
+
+def read_plan(path: Path | str) -> PlanFile:
+    """Reads a plan.
+
+    Args:
+        path: The plan.json, or the folder that it was written to.
+
+    Raises:
+        DataError: There is none, or it is no plan, with what is wrong.
+    """
+    path = Path(path)
+    file = path / _FILE if path.is_dir() else path
+    text = read_text(file)
+    document = parse_json(text, str(file))
+    if not isinstance(document, dict) or "stops" not in document or "cell" not in document:
+        raise DataError(
+            f"{file} is no plan: it has no stops and cell.",
+            culprits=[str(file)],
+            next_step="Make one with visioncal plan -o FOLDER.",
+        )
+    Table(document, str(file)).integer("schema", SCHEMA, SCHEMA)
+    try:
+        return _plan(document)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(
+            f"{file} is damaged: {error!r} where a plan is read.",
+            culprits=[str(file)],
+            next_step="Make it anew with visioncal plan.",
+        ) from error
+
+
+def _plan(document: Mapping[str, Any]) -> PlanFile:
+    cell = _cell(document["cell"])
+    joints = cell.robot.joint_count
+    start = document["request"].get("start_q")
+    return PlanFile(
+        cell,
+        purpose_of(document["purpose"]),
+        tuple(
+            Stop(
+                int(it["view"]),
+                _array(it["q"], (joints,)),
+                _array(it.get("via_q") or np.zeros((0, joints)), (-1, joints)),
+                str(it.get("why", "")),
+            )
+            for it in document["stops"]
+        ),
+        None if start is None else _array(start, (joints,)),
+        str(document["inputs_sha256"]),
+    )
+
+
+def _cell(content: Mapping[str, Any]) -> PlanCell:
+    mount = content["mount"]
+    if mount not in MOUNTS:
+        raise ValueError(f"mount {mount!r}")
+    guesses, noise, lens = content["guesses"], content["noise"], content["camera"]
+    x, z = _EDGES[mount]
+    limits: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in content["limits"].items()
+    }
+    # A cell without a floor has none in its file either, where the default is the base's height.
+    limits.setdefault("floor_m", None)
+    spread = guesses.get("covariance")
+    return PlanCell(
+        cast("Mount", mount),
+        Robot.from_document(content["robot"]),
+        _camera(lens),
+        _target(content["target"]),
+        _array(guesses[x], (4, 4)),
+        _array(guesses[z], (4, 4)),
+        float(guesses["sigma_rad"]),
+        float(guesses["sigma_m"]),
+        Noise.of_robot(float(noise["robot_rotation_rad"]), float(noise["robot_translation_m"])),
+        float(noise["pixel_px"]),
+        Limits(**limits),
+        tuple(
+            Box(it["name"], _array(it["base_from_box"], (4, 4)), _array(it["size_m"], (3,)))
+            for it in content["boxes"]
+        ),
+        None if spread is None else _array(spread, (12, 12)),
+    )
+
+
+_EDGES: Mapping[str, tuple[str, str]] = {
+    "eye-in-hand": ("flange_from_cam", "base_from_target"),
+    "eye-to-hand": ("base_from_cam", "flange_from_target"),
+}
+
+
+def _camera(lens: Mapping[str, Any]) -> Camera:
+    width, height = lens["resolution"]
+    kind = Table(lens, "plan.json: camera").choice("model", ("brown", "fisheye"))
+    return Camera(
+        cast("CameraKind", kind),
+        (int(width), int(height)),
+        _array(lens["matrix"], (4,)),
+        np.array(lens["distortion"], dtype=float),
+    )
+
+
+def _target(content: Mapping[str, Any]) -> Target:
+    """The board, under the name that it has where it comes with visioncal."""
+    named = target_from_document(content, "board")
+    for name in target_names():
+        shipped = load_target(name, None)[0]
+        if target_document(shipped) == target_document(named):
+            return shipped
+    return named
+
+
+def _array(values: object, shape: tuple[int, ...]) -> FloatArray:
+    """An array of finite numbers in a shape.
+
+    Raises:
+        ValueError: It is another.
+    """
+    array = np.array(values, dtype=float)
+    if not np.isfinite(array).all():
+        raise ValueError("a number that is not finite")
+    if array.ndim != len(shape) or any(
+        want not in (-1, has) for want, has in zip(shape, array.shape, strict=True)
+    ):
+        raise ValueError(f"an array of shape {array.shape} for {shape}")
+    return array

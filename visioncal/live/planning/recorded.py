@@ -1,0 +1,330 @@
+"""Where a plan begins that adds to a session: what the session tells, be it ever so little."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.observed_poses import Looked
+from visioncal.calibration.pipeline.run_state import Known
+from visioncal.calibration.pipeline.solving import Solved
+from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.pose_ambiguity import choose_by
+from visioncal.calibration.stages.refine import free_of
+from visioncal.calibration.stages.side import FramesSide
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray, Mount, Progress
+from visioncal.estimation.appearance import Free
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.chain import robot_part
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import fisher_information, normal_equations
+from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.information import Recorded
+from visioncal.robot import Robot
+from visioncal.session import Session, frame_name
+from visioncal.vision.targets import first_corners
+
+# Without a guess, what is mounted on the flange is about so far from it, per axis [m].
+_MOUNTED_M = 0.1
+# Stops cannot be found for edges that are known no better [rad and m].
+_TOO_VAGUE_RAD, _TOO_VAGUE_M = 0.5, 0.5
+# No arm repeats better; a few stops may show less by chance [rad and m].
+_LEAST_NOISE = Noise.of_robot(2e-5, 1e-5)
+# What well-kept arms repeat to, where nothing has been seen of it [rad and m].
+_TYPICAL = Noise.of_robot(5e-5, 3e-5)
+# Newton's steps to the nearest edges; the problem is as good as linear.
+_STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Rough guesses of both edges (4, 4), and how well they are known, per axis [rad and m]."""
+
+    x: FloatArray
+    z: FloatArray
+    sigma_rad: float
+    sigma_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_rad", "sigma_m"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise DataError(
+                    f"the guesses: {name} is {getattr(self, name)}; a number above zero is needed.",
+                    culprits=[name],
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A session to which stops are added.
+
+    Attributes:
+        cell: The cell as far as the session tells it.
+        recorded: What the session tells.
+        refusal: Why the session alone gives no result; empty where it does.
+        views: The number of the first view of each stop.
+    """
+
+    cell: PlanCell
+    recorded: Recorded
+    refusal: str
+    views: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SoFar:
+    """What is known of a session, and why no more."""
+
+    known: Known
+    refusal: str = field(default="")
+
+
+def so_far(session: Session, *, level: str = "hand-eye", progress: Progress | None = None) -> SoFar:
+    """Calibrates a session as far as it goes.
+
+    Args:
+        session: What was recorded.
+        level: How far to go, as `visioncal.calibrate` takes it.
+        progress: Told of long work.
+
+    Raises:
+        DataError: The input is wrong or shows no target.
+    """
+    known = Known(session, progress, level=level)
+    for at, stage in enumerate(STAGES):
+        if progress is not None:
+            progress(stage.name, at, len(STAGES))
+        try:
+            known = stage.run(known)
+        except DegenerateError as error:
+            return SoFar(known, error.message)
+    return SoFar(known)
+
+
+def begin(
+    found: SoFar,
+    *,
+    guess: Guess | None = None,
+    limits: Limits | None = None,
+    boxes: tuple[Box, ...] = (),
+) -> Begun:
+    """Puts a session as the start of a plan.
+
+    Where the stops leave a direction open, the edges are those nearest to the guess among all that
+    the stops allow; without a guess, those by which what is mounted is nearest to the flange.
+
+    Args:
+        found: What is known of the session.
+        guess: What is known of the edges besides.
+        limits: What the added stops must keep.
+        boxes: What else stands in the cell.
+
+    Raises:
+        DataError: The session lacks a robot's model, a camera or a board, or it tells too little to
+            begin without a guess.
+    """
+    known = found.known
+    robot, targets = known.robot, tuple(known.session.boards.values())
+    if robot is None or not targets or known.pixel_px is None or not known.scenes:
+        raise _lacking(known)
+    with one_blas_thread():
+        told = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
+        edges, spread = _nearest(told.problem, told.state, told.noise, known.session.mount, guess)
+    sigmas = np.sqrt(np.diag(spread).reshape(2, 2, 3).mean(axis=(0, 2)))
+    if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
+        raise _too_vague(known, len(told.views))
+    arm = told.arm
+    cell = PlanCell(
+        known.session.mount,
+        _arm(arm, robot),
+        told.free.appearance.camera,
+        targets[told.board],
+        edges[0],
+        edges[1],
+        float(sigmas[0]),
+        float(sigmas[1]),
+        told.noise,
+        known.pixel_px,
+        limits or Limits(),
+        boxes,
+        spread,
+    )
+    alike = () if known.answer is None else (it.alike for it in known.answer.misfits.values())
+    recorded = Recorded(
+        told.problem,
+        edges,
+        told.free,
+        arm.joints_rad,
+        told.noise,
+        int(first_corners(targets)[told.board]),
+        arm.errors,
+        max((it.factor for it in alike if it.is_significant), default=1.0),
+    )
+    return Begun(cell, recorded, found.refusal, told.views)
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What a session tells.
+
+    Attributes:
+        problem: Its s stops, without errors of the arm; the board that is planned for comes first.
+        state: Where to begin.
+        noise: Of the robot at the stops.
+        free: Lens and boards as the views see them.
+        arm: The robot's arm at the stops.
+        board: Which of the session's boards is planned for: the one in the most views.
+        views: (s,) the first view of each stop.
+    """
+
+    problem: Problem
+    state: State
+    noise: Noise
+    free: Free
+    arm: RobotArm
+    board: int
+    views: tuple[int, ...]
+
+
+def _fitted(known: Known, solved: Solved) -> _Told:
+    """What the fit of a session tells, even where that leaves a direction open."""
+    if solved.seen is None:
+        raise _lacking(known)
+    part, arm = solved.part, known.robot_arm
+    observed = part.observations.observed
+    most = max(dict.fromkeys(observed), key=observed.count)
+    stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
+    frames = dict(zip(part.unknown, solved.agreed.fit.state.edges, strict=True))
+    # The arm's own errors are the purpose's business: they are put in again with its priors.
+    bare = part.with_effects([it for it in part.effects if it.name != f"arm of {arm.robot}"])
+    seen_at = np.isin(np.arange(len(arm.stood)), stops)
+    camera, *boards = part.unknown
+    order = [it for it in part.tree.branches if it not in part.unknown]
+    order += [camera, most, *(it for it in boards if it != most)]
+    problem = replace(
+        bare,
+        tree=replace(part.tree, branches={it: part.tree.branches[it] for it in order}),
+        poses={name: it[stops] for name, it in part.poses.items()},
+        observations=replace(part.observations, stops=of),
+        effects=tuple(it.of_stops(seen_at) for it in bare.effects),
+    ).merged()
+    noise = solved.agreed.fit.noise
+    return _Told(
+        problem,
+        problem.start(frames),
+        replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
+        free_of(solved.seen),
+        arm.at(stops),
+        tuple(frame_name("target", it) for it in known.session.boards).index(most),
+        tuple(known.used[it] for it in first.tolist()),
+    )
+
+
+def _guessed(known: Known, guess: Guess | None) -> _Told:
+    """What stops tell that are too few for a fit, beside a guess."""
+    looked = Looked.of(known)
+    views = [it for it in known.poses if it in known.base_from_flange and it not in known.held_back]
+    if guess is None or not views:
+        raise _too_vague(known, len(views))
+    shown = [known.poses[it].board for it in views]
+    board = max(dict.fromkeys(shown), key=shown.count)
+    mine = [it for it in sorted(views) if known.poses[it].board == board]
+    looked = replace(looked, boards=(board,), used=tuple(mine))
+    looked = replace(looked, frames=looked.framed(np.stack([guess.x, guess.z])))
+    robot = robot_part(looked.arm_at(mine).poses, known.session.mount)
+    target = tuple(known.session.boards.values())[board]
+    poses = [
+        choose_by(known.poses[it], pose, target)
+        for it, pose in zip(mine, invert(robot @ guess.x) @ guess.z, strict=True)
+    ]
+    ((frame, scene),) = known.scenes.items()
+    problem, alone = looked.posed(poses).problem(mine), np.ones(len(mine), dtype=bool)
+    looks = FramesSide(problem, alone, mine, {}).looks({frame: scene}, {frame: poses})
+    looked = replace(looked, free=free_of(looks.seen(looks.first))).posed(poses)
+    problem = looked.problem(mine).merged()
+    return _Told(
+        problem,
+        problem.start(looked.frames),
+        _TYPICAL,
+        looked.free or free_of(looks.seen(looks.first)),
+        looked.arm_at_stops,
+        board,
+        tuple(looked.first_of_stops(mine)),
+    )
+
+
+def _arm(arm: RobotArm, robot: Robot) -> Robot:
+    """The arm up to the frame of the reported poses, as far as it is calibrated."""
+    if arm.model is not None:
+        return arm.model.robot
+    return robot if arm.joints_rad is None else ArmModel.of(robot, arm.joints_rad, arm.poses).robot
+
+
+def _nearest(
+    problem: Problem, state: State, noise: Noise, mount: Mount, guess: Guess | None
+) -> tuple[FloatArray, FloatArray]:
+    """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two.
+
+    These are the camera's and that of the board that is planned for.
+    """
+    weights = np.zeros((problem.size, problem.size))
+    weights[:12, :12] = np.diag(_weights(mount, guess))
+    for _ in range(_STEPS):
+        information, gradient = normal_equations(problem, state, noise)
+        away = np.zeros(problem.size)
+        away[:12] = _away(state.edges[:2], guess)
+        step = -covariance_among(information + weights, problem.moving) @ (
+            gradient + weights @ away
+        )
+        # What is shared has settled before; it may follow, but it does not move.
+        step[6 * len(state.edges) :] = 0.0
+        state = state.moved(step)
+    spread = covariance_among(fisher_information(problem, state, noise) + weights, problem.counted)
+    return state.edges, spread[:12, :12]
+
+
+def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
+    if guess is not None:
+        return np.tile(np.repeat([guess.sigma_rad**-2.0, guess.sigma_m**-2.0], 3), 2)
+    weights = np.full((2, 2, 3), 1e-6)
+    weights[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
+    return weights.ravel()
+
+
+def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
+    """(12,) steps from what is known beforehand to the edges (2, 4, 4)."""
+    if guess is not None:
+        return np.asarray(log(invert(np.stack([guess.x, guess.z])) @ edges).ravel())
+    local = [it[:3, :3].T @ it[:3, 3] for it in edges]
+    return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
+
+
+def _lacking(known: Known) -> DataError:
+    session, missing = known.session, []
+    if known.robot is None:
+        missing.append("a model of its robot ([robot] model)")
+    if not session.boards:
+        missing.append("a board (target)")
+    if known.pixel_px is None or not known.scenes:
+        missing.append("images of the board")
+    return DataError(
+        f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
+        culprits=[f"session {session.name!r}"],
+        next_step="Name the arm in session.toml ([robot] model), or by --robot."
+        if known.robot is None
+        else "",
+    )
+
+
+def _too_vague(known: Known, stops: int) -> DataError:
+    return DataError(
+        f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
+        "of the robot do not tell where camera and board are, not even roughly.",
+        culprits=[f"session {known.session.name!r}"],
+        next_step="Give rough guesses of both transforms.",
+    )

@@ -1,0 +1,224 @@
+"""From where a board is seen: views drawn around it, and the share of guesses that show it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, Mask, Target
+from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.obstacles import board_size_m
+from visioncal.live.planning.window import Window, border_tangents
+from visioncal.vision.camera import normalise
+from visioncal.vision.targets import extent_m
+
+# How large the board is drawn: the image's half short side over half the print's diagonal.
+_NEAREST, _FARTHEST = 0.75, 1.6
+# What tilt leaves of a board's short side, and how many standard deviations of where it is in the
+# image are left free around it.
+_FORESHORTENED, _DOUBTED = 0.8, 2.0
+# How far draws reach beyond the distances that turned out well.
+_WIDER = 1.05
+# The guesses are off by less than so many standard deviations, and a plan goes no farther than so
+# many times the distance at which the board would fill the image.
+_SURELY, _NEVER_BEYOND = 2.2, 6.0
+# How many cells stand for what may really be, how many of them are looked at before those that are
+# out of the question are left out, and how many points stand for a side of the print.
+_GUESSES, _LOOKED_AT, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
+# By so many rays through each side of the image the distance is found at which the board fills it.
+_BORDER_RAYS = 9
+# A lens that sees no more than this to its side, in a distance of one, is none.
+_NARROWEST = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A camera that looks at a board.
+
+    Attributes:
+        cell: The cell, as it is guessed.
+        distance_m: Least and greatest distance between camera and board's centre [m].
+        outline: (p, 3) points around the print, its corners first, in the target's frame [m].
+        centre: (3,) the print's centre [m].
+        window: The part of space that is in the image.
+        x: (g, 4, 4) draws of the guessed edge x.
+        z: (g, 4, 4) draws of the guessed edge z.
+    """
+
+    cell: PlanCell
+    distance_m: tuple[float, float]
+    outline: FloatArray
+    centre: FloatArray
+    window: Window
+    x: FloatArray
+    z: FloatArray
+
+    def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Draws views of the board.
+
+        The camera lies on a cap around the board's normal, uniform on its area, and is turned any
+        way about its line of sight; the board's centre is anywhere in the image where the board has
+        room.
+
+        Args:
+            count: How many.
+            rng: Source of randomness.
+
+        Returns:
+            (count, 4, 4) `cam_from_target` [m].
+        """
+        camera, limits = self.cell.camera, self.cell.limits
+        tilt = np.arccos(rng.uniform(np.cos(limits.tilt_rad), 1.0, count))
+        azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
+        distance = rng.uniform(*self.distance_m, size=(count, 1))
+        middle = 0.5 * (np.array(camera.resolution) - 1.0)
+        room = np.maximum(middle - limits.edge_px - self._taken_px(distance), 0.0)
+        aim = middle + rng.uniform(-1.0, 1.0, (count, 2)) * room
+        plane = np.nan_to_num(normalise(camera, aim))
+        ray = np.column_stack([plane, np.ones(count)])
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        # The target's z leaves the camera. The turn that takes z to the ray comes last.
+        spun = Rotation.from_euler("ZXZ", np.column_stack([roll, tilt, azimuth]))
+        across = np.cross([0.0, 0.0, 1.0], ray)
+        sine = np.linalg.norm(across, axis=1, keepdims=True)
+        angle = np.arctan2(sine, ray[:, 2:])
+        turn = Rotation.from_rotvec(across * angle / np.maximum(sine, 1e-12))
+        rotation = np.asarray((turn * spun).as_matrix())
+        return compose(rotation, distance * ray - rotation @ self.centre)
+
+    def _taken_px(self, distance_m: FloatArray) -> FloatArray:
+        """How much of the image's half sides a board (k, 1) takes at least, with some doubt [px].
+
+        A drawn view need not show the board; this only saves drawing many that cannot.
+        """
+        cell = self.cell
+        low, high = extent_m(cell.target)
+        across = _FORESHORTENED * 0.5 * float((high - low).min())
+        doubt = _DOUBTED * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
+        return np.asarray(cell.camera.matrix[:2].mean() * (across / distance_m + doubt))
+
+    def nearer_to(self, cam_from_target: FloatArray) -> "Sight":
+        """The same, drawing distances like those of (k, 4, 4) views that turned out well."""
+        distance = self.distances_m(cam_from_target)
+        low, high = self.distance_m
+        least, most = float(distance.min()) / _WIDER, float(distance.max()) * _WIDER
+        return replace(self, distance_m=(max(low, least), min(high, most)))
+
+    def shows(self, cam_from_target: FloatArray) -> Mask:
+        """Whether the whole print is in the image (k,) of views (k, 4, 4)."""
+        return self.window.holds(_moved(cam_from_target, self.outline))
+
+    def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
+        """In what share of the guesses' draws poses show the whole print.
+
+        Args:
+            base_from_flange: (k, 4, 4) the poses [m].
+            wanted: Where the first draws leave no hope of this share, the others are not looked at.
+
+        Returns:
+            (k,) shares; where the wanted one is not reached, not all may have been counted.
+        """
+        seen = np.zeros(len(base_from_flange))
+        looked, hope = 0, np.arange(len(base_from_flange))
+        for upto in _LOOKED_AT:
+            shows = self._drawn_shows(base_from_flange[hope], slice(looked, upto))
+            seen[hope] += shows.sum(axis=1)
+            looked = upto
+            hope = hope[(_GUESSES - upto + seen[hope]) / _GUESSES >= wanted]
+        share = np.minimum(seen / _GUESSES, np.nextafter(wanted, 0.0))
+        share[hope] = seen[hope] / _GUESSES
+        return share
+
+    def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
+        in_hand = self.cell.mount == "eye-in-hand"
+        flange = invert(base_from_flange) if in_hand else base_from_flange
+        # Its corners tell well enough for a share, and sides between them are nearly straight.
+        outlines = _moved(self.z[which], self.outline[:_CORNERS])
+        points = _moved(flange, outlines.reshape(-1, 3))
+        cam_from_here = invert(self.x[which])
+        return self.window.holds(
+            _moved(cam_from_here, points.reshape(len(flange), *outlines.shape))
+        )
+
+    def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
+        """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
+        centre = cam_from_target[:, :3, :3] @ self.centre + cam_from_target[:, :3, 3]
+        along = np.einsum("ki,ki->k", centre, cam_from_target[:, :3, 2])
+        return np.asarray(np.arccos(np.clip(along / np.linalg.norm(centre, axis=1), -1.0, 1.0)))
+
+    def distances_m(self, cam_from_target: FloatArray) -> FloatArray:
+        """Distances (k,) between the camera and the board's centre [m]."""
+        centre = cam_from_target[:, :3, :3] @ self.centre + cam_from_target[:, :3, 3]
+        return np.asarray(np.linalg.norm(centre, axis=1))
+
+    def sharp(self, cam_from_target: FloatArray) -> Mask:
+        """Whether the whole print (k,) lies within the depths at which the image is sharp."""
+        span = self.cell.limits.focus_m
+        if span is None:
+            return np.ones(len(cam_from_target), dtype=bool)
+        depth = cam_from_target[:, 2, :3] @ self.outline.T + cam_from_target[:, 2, 3, None]
+        return np.asarray(((depth >= span[0]) & (depth <= span[1])).all(axis=1))
+
+
+def sight_of(cell: PlanCell, seed: int) -> Sight:
+    """Prepares the views of a cell, with draws of what its guesses may really be.
+
+    Raises:
+        DataError: The lens sees nothing, or as good as nothing.
+    """
+    border = border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+    seen = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
+    if not len(seen) or seen.min() < _NARROWEST:
+        raise DataError(
+            "camera: no ray of this lens reaches the border of its image, or all are parallel: "
+            f"matrix is {cell.camera.matrix.tolist()}, distortion "
+            f"{cell.camera.distortion.tolist()}.",
+            culprits=["camera"],
+            next_step="Look at the intrinsics that were given.",
+        )
+    drawn = cell.guesses(_GUESSES, seed)
+    low, high = extent_m(cell.target)
+    return Sight(
+        cell,
+        cell.limits.distance_m or _distance_m(cell),
+        _outline(cell.target),
+        np.append(0.5 * (low + high), 0.0),
+        Window(cell.camera, cell.limits.edge_px),
+        np.array([it.x for it in drawn]),
+        np.array([it.z for it in drawn]),
+    )
+
+
+def _distance_m(cell: PlanCell) -> tuple[float, float]:
+    """Distances at which the board fills the image, and stays in it if the guesses are off [m].
+
+    At a distance d the board is off by the errors of both places, by d times the error of the
+    camera's direction, and by half its own size times the error of its own.
+    """
+    border = border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+    half = float(np.nanmin(np.abs(border).max(axis=-1)))
+    radius = 0.5 * board_size_m(cell.target)
+    full = radius / half
+    farthest = _FARTHEST * full
+    for d in np.linspace(full, _NEVER_BEYOND * full, 60):
+        turned = cell.sigma_rad * np.hypot(d, radius)
+        if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
+            return _NEAREST * full, max(farthest, 1.15 * float(d))
+    return _NEAREST * full, _NEVER_BEYOND * full
+
+
+def _moved(a_from_b: FloatArray, points: FloatArray) -> FloatArray:
+    """Moves (..., p, 3) points by (..., 4, 4) transforms."""
+    turned = points @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    return np.asarray(turned + a_from_b[..., None, :3, 3])
+
+
+def _outline(target: Target) -> FloatArray:
+    """(p, 3) points around the print [m]."""
+    low, high = extent_m(target)
+    knots = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    shares = np.arange(_SIDE_POINTS)[:, None, None] / _SIDE_POINTS
+    points = knots + shares * (np.roll(knots, -1, axis=0) - knots)
+    return np.pad(points.reshape(-1, 2), ((0, 0), (0, 1)))

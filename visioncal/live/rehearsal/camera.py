@@ -1,0 +1,138 @@
+"""The camera of a rehearsal: pictures of a simulated cell, at a camera's pace, of where the arm is.
+
+It free-runs as a camera does: exposures begin at even times, whether or not anybody asks.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from visioncal.core.errors import DriverError
+from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.live.drivers.protocols import Frame
+from visioncal.simulation import Cell
+from visioncal.simulation.live import LiveView
+
+# Moments of an exposure at which the arm is asked for its joints, the beginning and end included.
+_MOMENTS = 5
+
+# Dark, as the inside of a lens cap [grey level].
+_DARK = 12
+
+Fault = Literal["none", "unplugged", "frozen", "covered"]
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When a camera takes pictures.
+
+    Attributes:
+        rate_hz: Pictures a second.
+        exposure_s: How long each is exposed [s].
+    """
+
+    rate_hz: float = 15.0
+    exposure_s: float = 0.008
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The time, and how to wait; tests put others in their place."""
+
+    now: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+
+
+class RehearsalCamera:
+    """A camera device that sees a simulated cell.
+
+    Args:
+        cell: The cell: its true arm, edges and lens, its board and its noise. Its true arm must be
+            the one whose joints are told.
+        true_joints: Tells the arm's true joints, (k, n) [rad], at k past moments of the monotonic
+            clock, (k,) [s]. Where it raises DriverError the arm is taken to stand where it was last
+            known: a camera works on when a controller dies.
+        pace: When it takes pictures.
+        clock: The time.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        true_joints: Callable[[FloatArray], FloatArray],
+        *,
+        pace: Pace | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._cell = cell
+        self._view = LiveView(cell)
+        self._true_joints = true_joints
+        self._pace = pace or Pace()
+        self._clock = clock or Clock()
+        self._began = self._clock.now()
+        self._last: tuple[FloatArray, Image] | None = None
+        self.fault: Fault = "none"
+
+    @property
+    def name(self) -> str:
+        """What it is."""
+        return "simulated camera"
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(width, height) of its pictures [px]."""
+        return self._cell.options.camera.resolution
+
+    @property
+    def factory(self) -> Camera | None:
+        """The intrinsics as the cell states them; None where it states none."""
+        return self._cell.stated_camera if self._cell.options.state_intrinsics else None
+
+    @property
+    def settings(self) -> Mapping[str, str | float]:
+        """Its exposure and rate."""
+        pace = self._pace
+        return MappingProxyType({"exposure_us": 1e6 * pace.exposure_s, "rate_hz": pace.rate_hz})
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """Returns a picture whose exposure began after the call.
+
+        Raises:
+            DriverError: It is unplugged, or the next exposure ends later than that.
+        """
+        asked = self._clock.now()
+        exposure_s, rate_hz = self._pace.exposure_s, self._pace.rate_hz
+        begins = self._began + np.ceil((asked - self._began) * rate_hz) / rate_hz
+        late = begins + exposure_s > asked + timeout_s
+        if late or self.fault == "unplugged":
+            self._clock.sleep(timeout_s)
+            raise DriverError(
+                f"The {self.name} gave no picture within {timeout_s:g} s.",
+                culprits=[self.name],
+                next_step="Look at its cable and its power, then go on with --resume.",
+            )
+        self._clock.sleep(max(begins + exposure_s - asked, 0.0))
+        return Frame(self._taken(begins), begins + 0.5 * exposure_s, exposure_s)
+
+    def close(self) -> None:
+        """Lets go of it; there is nothing to let go of."""
+
+    def _taken(self, begins: float) -> Image:
+        if self.fault == "frozen" and self._last is not None:
+            return self._last[1].copy()
+        if self.fault == "covered":
+            return np.full(self.resolution[::-1], _DARK, dtype=np.uint8)
+        moments = np.linspace(begins, begins + self._pace.exposure_s, _MOMENTS)
+        try:
+            joints = self._true_joints(moments)
+        except DriverError:
+            if self._last is None:
+                raise
+            joints = self._last[0]
+        image = self._view.picture(joints)
+        self._last = (joints[-1:], image)
+        return image

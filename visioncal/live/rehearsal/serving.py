@@ -1,0 +1,142 @@
+"""The ports of a simulated controller, served by one loop."""
+
+import asyncio
+import re
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from visioncal.live.rehearsal.dashboard import BANNER, DASHBOARD_PORT, answer
+from visioncal.live.rehearsal.machine import Machine
+from visioncal.live.rehearsal.options import ControllerOptions
+from visioncal.live.rehearsal.primary import PRIMARY_PORTS, state_message
+from visioncal.live.rehearsal.rtde_port import RtdePort
+from visioncal.live.rehearsal.rtde_wire import RTDE_PORT
+from visioncal.live.rehearsal.script import ControlScript
+from visioncal.live.rehearsal.truth import TRUTH_PORT, TruthChannel
+from visioncal.live.rehearsal.variables import Moment
+
+SCRIPT_PORT = 30003
+PORTS = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, TRUTH_PORT, *PRIMARY_PORTS)
+_PRIMARY_EVERY_S = 0.1
+# How often a frozen controller looks whether it may go on.
+_FROZEN_S = 0.02
+# The last line of the client's program.
+_END = re.compile(rb"^end\s*$", re.MULTILINE)
+
+_Handler: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+
+@dataclass
+class _Silence:
+    """Whether the controller keeps its connections and says nothing."""
+
+    frozen: bool = False
+
+    def set(self, frozen: bool) -> None:
+        self.frozen = frozen
+
+    async def over(self) -> None:
+        while self.frozen:
+            await asyncio.sleep(_FROZEN_S)
+
+
+class ControllerServer:
+    """A simulated controller on one host."""
+
+    def __init__(self, options: ControllerOptions, host: str) -> None:
+        self._options, self._host = options, host
+        self._silence = _Silence()
+
+    async def run(self, ready: Callable[[], None]) -> None:
+        """Serves until it is cancelled.
+
+        Args:
+            ready: Called once all ports listen.
+
+        Raises:
+            OSError: A port is taken.
+        """
+        began_s = time.monotonic()
+        machine = Machine(self._options, began_s)
+        script = ControlScript(machine)
+        rtde = RtdePort(script, self._options, self._silence.over)
+        handlers: dict[int, _Handler] = {
+            RTDE_PORT: rtde.serve,
+            DASHBOARD_PORT: lambda r, w: self._dashboard(machine, r, w),
+            SCRIPT_PORT: lambda r, w: self._script(script, r, w),
+            TRUTH_PORT: lambda r, w: _truth(TruthChannel(machine, self._silence.set), r, w),
+        }
+        handlers |= {it: lambda r, w: self._primary(machine, r, w) for it in PRIMARY_PORTS}
+        with ExitStack() as servers:
+            for port, handler in handlers.items():
+                server = await asyncio.start_server(_quietly(handler), self._host, port)
+                servers.callback(server.close)
+            ready()
+            await self._tick(machine, script, rtde, began_s)
+
+    async def _tick(
+        self, machine: Machine, script: ControlScript, rtde: RtdePort, began_s: float
+    ) -> None:
+        """Lets time pass: the script acts, and the states go out, each of a whole cycle.
+
+        Cycles that a busy computer missed are left out, not made up for.
+        """
+        cycle = 0
+        while True:
+            cycle = max(cycle + 1, int((time.monotonic() - began_s) * self._options.rate_hz))
+            up_s = cycle / self._options.rate_hz
+            await asyncio.sleep(began_s + up_s - time.monotonic())
+            script.tick(time.monotonic())
+            if not self._silence.frozen:
+                rtde.send(Moment(machine, script.registers, began_s + up_s, up_s))
+
+    async def _dashboard(
+        self, machine: Machine, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        await self._silence.over()
+        writer.write(BANNER.encode() + b"\n")
+        while line := await reader.readline():
+            await self._silence.over()
+            reply = answer(machine, line.decode("utf-8", "replace"), time.monotonic())
+            writer.write(reply.encode() + b"\n")
+
+    async def _script(
+        self, script: ControlScript, reader: asyncio.StreamReader, _: asyncio.StreamWriter
+    ) -> None:
+        text = b""
+        while part := await reader.read(65536):
+            text += part
+            if _END.search(text):
+                await self._silence.over()
+                script.begin(time.monotonic())
+                text = b""
+
+    async def _primary(
+        self, machine: Machine, _: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        while not writer.is_closing():
+            await self._silence.over()
+            writer.write(state_message(machine, time.monotonic()))
+            await writer.drain()
+            await asyncio.sleep(_PRIMARY_EVERY_S)
+
+
+async def _truth(
+    channel: TruthChannel, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+) -> None:
+    while line := await reader.readline():
+        writer.write(channel.answer(line, time.monotonic()))
+
+
+def _quietly(handler: _Handler) -> _Handler:
+    """A client may go at any time; its connection is closed and forgotten."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(ConnectionError, asyncio.IncompleteReadError):
+            await handler(reader, writer)
+        writer.close()
+
+    return serve

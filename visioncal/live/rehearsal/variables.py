@@ -1,0 +1,193 @@
+"""What a simulated controller tells of itself, by RTDE's names."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.live.rehearsal.kinematics import tool_pose
+from visioncal.live.rehearsal.machine import Machine
+from visioncal.live.rehearsal.rtde_wire import Value
+from visioncal.live.rehearsal.script import Registers
+from visioncal.simulation.arms import link_frames
+
+_RUNTIME = {"stopped": 1, "playing": 2, "paused": 4}
+_MODES = {"POWER_OFF": 3, "IDLE": 5, "RUNNING": 7}
+_SAFETY_MODES = {"normal": 1, "protective-stop": 3, "emergency-stop": 7}
+# Bits of `safety_status_bits`: normal mode, protective stop, robot emergency stop, emergency stop.
+_SAFETY_BITS = {"normal": 1 << 0, "protective-stop": 1 << 2, "emergency-stop": 1 << 6 | 1 << 7}
+_POWER_ON, _PROGRAM_RUNNING, _POWER_BUTTON = 1 << 0, 1 << 1, 1 << 3
+_GRAVITY = 9.81
+# A plausible arm: mass of each link as a share of the whole [1], torque of a motor's ampere after
+# its gear [Nm/A], and what friction takes [A].
+_MASS_KG = {"ur3e": 11.2, "ur5e": 20.6, "ur10e": 33.5}
+_SHARES = np.array([0.20, 0.40, 0.16, 0.09, 0.09, 0.06])
+_TORQUE_PER_A = np.array([13.0, 13.0, 13.0, 9.0, 9.0, 9.0])
+_FRICTION_A = np.array([0.5, 0.5, 0.4, 0.2, 0.2, 0.2])
+# Joints at rest in a room of 23 C end up at these temperatures [C], within half an hour.
+_WARM_C = np.array([31.0, 32.5, 33.0, 34.5, 35.5, 36.0])
+_ROOM_C, _WARMING_S = 23.0, 1800.0
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The machine at one moment.
+
+    Attributes:
+        machine: The arm.
+        registers: The script's.
+        now_s: The moment, on the monotonic clock [s].
+        up_s: How long the controller has been running [s].
+    """
+
+    machine: Machine
+    registers: Registers
+    now_s: float
+    up_s: float
+
+    @cached_property
+    def joints(self) -> tuple[FloatArray, FloatArray]:
+        """Angles [rad] and speeds [rad/s]."""
+        return self.machine.joints(self.now_s)
+
+    @cached_property
+    def tcp_pose(self) -> tuple[float, ...]:
+        """The tool's pose as the controller reckons it."""
+        return tuple(tool_pose(self.machine, self.joints[0]).tolist())
+
+    @cached_property
+    def currents(self) -> tuple[float, ...]:
+        """Motor currents that hold the links and the load, and overcome friction [A]."""
+        arm = self.machine.believed
+        frames = link_frames(arm, self.joints[0][None])[0]
+        origins, axes = frames[:, :3, 3], frames[:-1, :3, 2]
+        centres = 0.5 * (origins[:-1] + origins[1:])
+        load = origins[-1] + frames[-1, :3, :3] @ self.machine.payload_m
+        masses = np.append(_MASS_KG[arm.name] * _SHARES, self.machine.payload_kg)
+        levers = np.vstack([centres, load])[None] - origins[:-1, None]
+        # The pull of body k about joint i, for the bodies behind that joint.
+        pulls = np.cross(levers, [0.0, 0.0, _GRAVITY])
+        torques = np.einsum("ik,k,ikx,ix->i", np.triu(np.ones((6, 7))), masses, pulls, axes)
+        friction = _FRICTION_A * np.tanh(self.joints[1] / 0.01)
+        return tuple((torques / _TORQUE_PER_A + friction).tolist())
+
+    @property
+    def temperatures(self) -> tuple[float, ...]:
+        """Joint temperatures [C]."""
+        warm = 1.0 - math.exp(-self.up_s / _WARMING_S)
+        return tuple((_ROOM_C + warm * (_WARM_C - _ROOM_C)).tolist())
+
+    @property
+    def status_bits(self) -> int:
+        """Power, program, power button."""
+        power = _POWER_ON if self.machine.mode != "POWER_OFF" else 0
+        program = _PROGRAM_RUNNING if self.machine.program == "playing" else 0
+        return power | program | _POWER_BUTTON
+
+
+_NOTHING = (0.0,) * 6
+_Tell = Callable[[Moment], Value]
+
+
+def _zeros(_: Moment) -> Value:
+    return _NOTHING
+
+
+def _zero(_: Moment) -> Value:
+    return 0.0
+
+
+def _one(_: Moment) -> Value:
+    return 1.0
+
+
+def _angles(moment: Moment) -> Value:
+    return tuple(moment.joints[0].tolist())
+
+
+def _speeds(moment: Moment) -> Value:
+    return tuple(moment.joints[1].tolist())
+
+
+def _constant(value: Value) -> _Tell:
+    return lambda _: value
+
+
+def _int_register(place: int) -> _Tell:
+    return lambda moment: moment.registers.int_out[place]
+
+
+def _double_register(place: int) -> _Tell:
+    return lambda moment: moment.registers.double_out[place]
+
+
+def _table() -> dict[str, tuple[str, _Tell]]:
+    """The variables by name: type, and how the value is had."""
+    six, three = "VECTOR6D", "VECTOR3D"
+    table: dict[str, tuple[str, _Tell]] = {
+        "timestamp": ("DOUBLE", lambda it: it.up_s),
+        "actual_q": (six, _angles),
+        "target_q": (six, _angles),
+        "actual_qd": (six, _speeds),
+        "target_qd": (six, _speeds),
+        "actual_current": (six, lambda it: it.currents),
+        "target_current": (six, lambda it: it.currents),
+        "actual_TCP_pose": (six, lambda it: it.tcp_pose),
+        "target_TCP_pose": (six, lambda it: it.tcp_pose),
+        "joint_temperatures": (six, lambda it: it.temperatures),
+        "joint_mode": ("VECTOR6INT32", _constant((253,) * 6)),
+        "robot_mode": ("INT32", lambda it: _MODES.get(it.machine.mode, -1)),
+        "safety_mode": ("INT32", lambda it: _SAFETY_MODES[it.machine.safety]),
+        "runtime_state": ("UINT32", lambda it: _RUNTIME[it.machine.program]),
+        "robot_status_bits": ("UINT32", lambda it: it.status_bits),
+        "safety_status_bits": ("UINT32", lambda it: _SAFETY_BITS[it.machine.safety]),
+        "payload": ("DOUBLE", lambda it: it.machine.payload_kg),
+        "payload_cog": (three, lambda it: tuple(it.machine.payload_m.tolist())),
+        "actual_tool_accelerometer": (three, _constant((0.0, 0.0, _GRAVITY))),
+        "actual_main_voltage": ("DOUBLE", _constant(48.0)),
+        "actual_robot_voltage": ("DOUBLE", _constant(48.0)),
+        "actual_joint_voltage": (six, _constant((48.0,) * 6)),
+        "actual_digital_input_bits": ("UINT64", _zero),
+        "actual_digital_output_bits": ("UINT64", _zero),
+    }
+    table |= dict.fromkeys(("speed_scaling", "target_speed_fraction"), ("DOUBLE", _one))
+    numbers = ("actual_execution_time", "actual_momentum", "actual_robot_current")
+    analog = [f"standard_analog_{way}{place}" for way in ("input", "output") for place in (0, 1)]
+    table |= dict.fromkeys((*numbers, *analog), ("DOUBLE", _zero))
+    vectors = ("target_qdd", "target_moment", "joint_control_output", "actual_TCP_speed")
+    more = ("actual_TCP_force", "target_TCP_speed", "ft_raw_wrench", "payload_inertia")
+    table |= dict.fromkeys((*vectors, *more), (six, _zeros))
+    for place in range(48):
+        table[f"output_int_register_{place}"] = ("INT32", _int_register(place))
+        table[f"output_double_register_{place}"] = ("DOUBLE", _double_register(place))
+    return table
+
+
+VARIABLES: Mapping[str, tuple[str, _Tell]] = _table()
+
+
+def input_type(name: str) -> str:
+    """The type of a variable that a client may write; empty where there is none."""
+    if name.startswith("input_int_register_"):
+        return "INT32"
+    if name.startswith("input_double_register_"):
+        return "DOUBLE"
+    others = {
+        "external_force_torque": "VECTOR6D",
+        "speed_slider_mask": "UINT32",
+        "speed_slider_fraction": "DOUBLE",
+        "standard_digital_output_mask": "UINT8",
+        "standard_digital_output": "UINT8",
+        "configurable_digital_output_mask": "UINT8",
+        "configurable_digital_output": "UINT8",
+        "tool_digital_output_mask": "UINT8",
+        "tool_digital_output": "UINT8",
+        "standard_analog_output_mask": "UINT8",
+        "standard_analog_output_type": "UINT8",
+        "standard_analog_output_0": "DOUBLE",
+        "standard_analog_output_1": "DOUBLE",
+    }
+    return others.get(name, "")

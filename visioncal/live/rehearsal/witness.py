@@ -1,0 +1,93 @@
+"""What a recording of a simulated cell was worth, by what really happened."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import FloatArray
+from visioncal.live.capture.core import Step
+from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.take import Taken
+from visioncal.live.planning.read_back import PlanFile
+from visioncal.live.rehearsal.bench import Bench
+from visioncal.live.rehearsal.truth import TruthClient
+from visioncal.simulation.arms import forward
+
+
+@dataclass(eq=False)
+class Witness:
+    """A watcher that asks where the arm really was in the middle of each exposure.
+
+    Attributes:
+        bench: The simulated cell.
+        away_mm: How far the flange was from where the recorded joints have the same, true arm, for
+            each view: what moved, and how exactly the arm comes back to a posture [mm].
+    """
+
+    bench: Bench
+    away_mm: list[float] = field(default_factory=list)
+
+    def stepped(self, step: Step) -> None:
+        """Looks at a view."""
+        found = step.found
+        if not isinstance(found, Taken) or found.state.q is None:
+            return
+        with closing(TruthClient(self.bench.controller.host)) as truth:
+            really = truth.state([found.frame.stamp_s]).base_from_flange[0]
+        recorded = forward(self.bench.cell.truth.true_arm, found.state.q[None])[0]
+        self.away_mm.append(pose_difference(recorded, really)[0])
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How long the views of a recording took, each on average [s].
+
+    Attributes:
+        views: How many there are.
+        motion_s: The motion alone, by speed and acceleration.
+        driving_s: What it took beyond that, to begin and to end each part of the way.
+        settling_s: Until all stood still.
+        added_s: Everything else: pictures, detection, checks, writing.
+        most_added_s: The same of the slowest view.
+    """
+
+    views: int
+    motion_s: float
+    driving_s: float
+    settling_s: float
+    added_s: float
+    most_added_s: float
+
+
+def pace_of(
+    steps: Sequence[Step], plan: PlanFile, start_q: FloatArray, options: CaptureOptions
+) -> Pace:
+    """Tells motion and settling from what a recording adds to them.
+
+    Args:
+        steps: A recording of a plan's stops from the first on, in their order.
+        plan: The stops.
+        start_q: (n,) where the arm stood in the beginning [rad].
+        options: Speed and acceleration.
+    """
+    here, motions = start_q, []
+    for _, stop in zip(steps, plan.stops, strict=False):
+        way = [here, *stop.via, stop.q]
+        pace = (options.speed, options.acceleration)
+        motions.append(sum(travel_s(a, b, *pace) for a, b in pairwise(way)))
+        here = stop.q
+    times = [it.times for it in steps]
+    motion_s, added = float(np.mean(motions)), [it.worked_s for it in times]
+    return Pace(
+        len(steps),
+        motion_s,
+        float(np.mean([it.moved_s for it in times])) - motion_s,
+        float(np.mean([it.settled_s for it in times])),
+        float(np.mean(added)),
+        max(added),
+    )

@@ -1,0 +1,114 @@
+"""Charts of what the views cover: the image, the directions of sight, the axes of rotation."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.types import FloatArray
+from visioncal.present.recording import paths
+from visioncal.results import Calibration
+from visioncal.results.evidence import ViewEvidence
+
+# The image is divided so, for the eye to find what no corner reached.
+_CELLS = (8, 5)
+# Rings of equal angle in the charts of directions and of axes.
+DIRECTIONS_RINGS_DEG = (15, 30, 45, 60)
+AXES_RINGS_DEG = (30, 60, 90)
+# Smaller turns have axes that are mostly noise.
+_LEAST_TURN_RAD = np.deg2rad(1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PointChart:
+    """Points of views in a plane whose x goes to the right and whose y goes down.
+
+    Attributes:
+        entity: Where it is in the recording.
+        points: By view, (k, 2).
+        lines: What is drawn behind them, (k, 2) each.
+        words: Texts with their places.
+    """
+
+    entity: str
+    points: Mapping[int, FloatArray]
+    lines: Sequence[FloatArray]
+    words: Sequence[tuple[tuple[float, float], str]]
+
+
+def image_chart(
+    calibration: Calibration, evidence: Mapping[int, ViewEvidence]
+) -> PointChart | None:
+    """All corners of all views in one image; None where there are none."""
+    points = {view: it.corners.px for view, it in evidence.items() if it.corners is not None}
+    if not points or calibration.camera is None:
+        return None
+    return corners_chart(calibration.camera.camera.resolution, points)
+
+
+def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray]) -> PointChart:
+    """Corners (k, 2) by view in one image [px]."""
+    width, height = resolution
+    # Pixel centres are at integers, so the image begins half a pixel before the first one.
+    x = np.linspace(0, width, _CELLS[0] + 1) - 0.5
+    y = np.linspace(0, height, _CELLS[1] + 1) - 0.5
+    lines = [np.array([[it, y[0]], [it, y[-1]]]) for it in x]
+    lines += [np.array([[x[0], it], [x[-1], it]]) for it in y]
+    return PointChart(paths.IMAGE_COVERAGE, points, lines, [])
+
+
+def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
+    """Where the camera looked from: how far from the target's normal [deg], and to which side."""
+    points = {
+        # The target's z axis points into the board, away from who looks at it.
+        view: _disc(it.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
+        for view, it in evidence.items()
+        if it.cam_from_target is not None
+    }
+    if not points:
+        return None
+    return _disc_chart(paths.DIRECTIONS, points, DIRECTIONS_RINGS_DEG)
+
+
+def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
+    """The axis about which the flange turned from each view to the next, in the flange's frame.
+
+    The middle is the flange's z axis, the rim its x, y plane; an axis and its reverse are one.
+    """
+    poses = [(it.view, it.base_from_flange) for it in evidence if it.base_from_flange is not None]
+    points: dict[int, FloatArray] = {}
+    for (_, base_from_last), (view, base_from_next) in pairwise(poses):
+        turn = Rotation.from_matrix(base_from_last[:3, :3].T @ base_from_next[:3, :3]).as_rotvec()
+        angle_rad = float(np.linalg.norm(turn))
+        if angle_rad > _LEAST_TURN_RAD:
+            axis = turn / (angle_rad if turn[2] > 0 else -angle_rad)
+            points[view] = _disc(axis[None])
+    return _disc_chart(paths.ROTATION_AXES, points, AXES_RINGS_DEG) if points else None
+
+
+def _disc(towards: FloatArray) -> FloatArray:
+    """(k, 3) unit vectors as (k, 2) points: their angle from z [deg], in their direction."""
+    angle_deg = np.rad2deg(np.arccos(np.clip(towards[:, 2], -1.0, 1.0)))
+    azimuth = np.arctan2(towards[:, 1], towards[:, 0])
+    return np.asarray(angle_deg[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1))
+
+
+def _disc_chart(
+    entity: str, points: Mapping[int, FloatArray], rings_deg: Sequence[int]
+) -> PointChart:
+    """A chart with rings of equal angle, and the axes x and y."""
+    turn = np.linspace(0.0, 2 * np.pi, 73)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    rim = float(rings_deg[-1])
+    lines = [ring * circle for ring in rings_deg]
+    lines += [np.array([[-rim, 0], [rim, 0]]), np.array([[0, -rim], [0, rim]])]
+    diagonal = 1.06 * rim / np.sqrt(2)
+    words = [
+        ((1.08 * rim, 0.0), "x"),
+        ((0.0, 1.08 * rim), "y"),
+        # Of the rim alone: words would hide the points of the middle.
+        ((diagonal, -diagonal), f"{rim:g}\N{DEGREE SIGN}"),
+    ]
+    return PointChart(entity, points, lines, words)

@@ -1,0 +1,162 @@
+"""The recording of a dynamic identification: the arm as it moved, and its torques."""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from rerun.blueprint import BlueprintLike
+
+from visioncal.core.files import written_beside
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import FloatArray
+from visioncal.dynamics import Identified, Prediction, Run
+from visioncal.present.recording import colours, paths
+from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.recorder import Recorder
+from visioncal.present.recording.writer import RecordingWriter
+
+# One motion follows the other after so long [s]; the arm is drawn so often [Hz].
+_PAUSE_S, _DRAWN_HZ = 1.0, 20.0
+_LINES = (
+    (paths.MEASURED_TORQUE, colours.GRID, 2.5),
+    (paths.KNOWN_TORQUE, colours.STATED, 1.0),
+    (paths.PREDICTED_TORQUE, colours.USED, 1.2),
+)
+
+
+def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | None = None) -> None:
+    """Writes a session with what its torques told: measured and predicted over time.
+
+    One motion follows the other on the timeline.
+
+    Args:
+        path: The `.rrd` to write; it appears whole or not at all. `read_session` gives the session
+            back.
+        run: What was fitted and predicted.
+        blueprint: The layout to open it in.
+
+    Raises:
+        DataError: The file cannot be written, or an image of the session cannot be read.
+    """
+    session = run.session
+    with (
+        written_beside(path) as aside,
+        RecordingWriter(
+            aside, session, announced=len(session.views), blueprint=blueprint, label=path
+        ) as writer,
+    ):
+        writer.add_session(session)
+        writer.draw(partial(_log, run))
+
+
+def _log(run: Run, recorder: Recorder) -> None:
+    """Draws all motions."""
+    recorder.stream.reset_time()
+    _log_static(recorder.stream, run.identified, run.predictions)
+    begin_s = 0.0
+    for it in run.predictions:
+        times_s = begin_s + it.times_s - it.times_s[0]
+        _log_series(recorder.stream, it, times_s)
+        _log_motion(recorder, run.identified, it, times_s)
+        begin_s = float(times_s[-1]) + _PAUSE_S
+
+
+def _log_static(
+    stream: rr.RecordingStream, identified: Identified, found: Sequence[Prediction]
+) -> None:
+    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
+    stream.log(paths.BASE, base, rr.CoordinateFrame(paths.BASE_FRAME), static=True)
+    for part in ("links", "joints"):
+        entity = f"{paths.ROBOT}/{part}"
+        stream.log(entity, rr.CoordinateFrame(paths.BASE_FRAME), static=True)
+    with_known = any(it.known_nm is not None for it in found)
+    for joint in range(identified.robot.joint_count):
+        torque = paths.of_joint(paths.TORQUES, joint)
+        for name, colour, width in _LINES:
+            if name != paths.KNOWN_TORQUE or with_known:
+                line = rr.SeriesLines(colors=[colour], widths=[width], names=[name])
+                stream.log(f"{torque}/{name}", line, static=True)
+        for group in (paths.TORQUE_ERRORS, paths.SPEEDS):
+            line = rr.SeriesLines(names=[identified.robot.joint_names[joint]])
+            stream.log(paths.of_joint(group, joint), line, static=True)
+    for entity, text in (
+        (paths.DYNAMICS_NOTE, "\n".join(_torque_lines(identified))),
+        (paths.PARAMETERS_NOTE, "\n".join(_parameter_lines(identified))),
+    ):
+        stream.log(entity, rr.TextDocument(text, media_type="text/markdown"), static=True)
+
+
+def _log_series(stream: rr.RecordingStream, found: Prediction, times_s: FloatArray) -> None:
+    # What is no number ends the line, so that the next motion begins another.
+    index = rr.TimeColumn(paths.MOTION_TIMELINE, duration=[*times_s, times_s[-1] + 0.5 * _PAUSE_S])
+    lines = {
+        paths.MEASURED_TORQUE: found.measured_nm,
+        paths.PREDICTED_TORQUE: found.predicted_nm,
+        paths.KNOWN_TORQUE: found.known_nm,
+    }
+    for joint in range(found.q.shape[1]):
+        torque = paths.of_joint(paths.TORQUES, joint)
+        columns = {
+            f"{torque}/{name}": values[:, joint]
+            for name, values in lines.items()
+            if values is not None
+        }
+        columns[paths.of_joint(paths.TORQUE_ERRORS, joint)] = (
+            found.measured_nm - found.predicted_nm
+        )[:, joint]
+        columns[paths.of_joint(paths.SPEEDS, joint)] = found.dq[:, joint]
+        for entity, values in columns.items():
+            scalars = rr.Scalars.columns(scalars=[*values, np.nan])
+            stream.send_columns(entity, [index], scalars)
+
+
+def _log_motion(
+    recorder: Recorder, identified: Identified, found: Prediction, times_s: FloatArray
+) -> None:
+    """Draws the arm, not more often than eyes can follow."""
+    steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
+    rows = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
+    recorder.stream.reset_time()
+    for row in rows:
+        recorder.stream.set_time(paths.MOTION_TIMELINE, duration=float(times_s[row]))
+        log_arm(recorder.stream, identified.robot.link_frames(found.q[row]))
+    recorder.stream.reset_time()
+    recorder.keep()
+
+
+def _torque_lines(identified: Identified) -> Iterator[str]:
+    """A table of torques and errors, in Markdown."""
+    (first, *_), found = identified.streams, identified.validation
+    yield f"## {identified.robot.name}: {identified.base.rank} base parameters"
+    yield ""
+    yield "| joint | torque [N m] | noise [N m] | error, unseen motion [N m] | of the torque |"
+    yield "| --- | --- | --- | --- | --- |"
+    for at, joint in enumerate(identified.robot.joint_names):
+        error, share = "\N{EN DASH}", "\N{EN DASH}"
+        if found is not None:
+            error = significant(float(found.rms_nm[at]))
+            share = f"{significant(100.0 * float(found.shares[at]))} %"
+        torque, noise = (significant(float(it[at])) for it in (first.torque_nm, first.noise_nm))
+        yield f"| {joint} | {torque} | {noise} | {error} | {share} |"
+    for stream in identified.streams:
+        for note in stream.notes:
+            yield ""
+            yield note
+
+
+def _parameter_lines(identified: Identified) -> Iterator[str]:
+    """The base parameters, in Markdown."""
+    yield "| base parameter | value | sigma | told to |"
+    yield "| --- | --- | --- | --- |"
+    for name, value, sigma, told in zip(
+        identified.base.names,
+        identified.values.tolist(),
+        identified.sigmas.tolist(),
+        identified.determined,
+        strict=True,
+    ):
+        # A star is Markdown's own.
+        plain = name.replace("*", r"\*")
+        yield f"| {plain} | {matched(value, sigma)} | {significant(sigma)} | {told} |"

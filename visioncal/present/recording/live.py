@@ -1,0 +1,153 @@
+"""A recording at work, drawn view by view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import rerun as rr
+
+from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
+from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.charts import Charts
+from visioncal.present.recording.coverage import corners_chart
+from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
+from visioncal.robot import Robot
+
+# Sizes of what is drawn [m].
+_AXIS_M, _LINE_M, _POINT_M = 0.08, 0.001, 0.003
+# Pictures go through a socket while the arm waits; nobody measures in them.
+_JPEG = 80
+
+
+@dataclass(frozen=True, eq=False)
+class LiveCell:
+    """What is drawn of a cell besides its views.
+
+    Attributes:
+        mount: Where the camera is.
+        target: The board.
+        resolution: (width, height) of the images [px].
+        robot: The arm; None where its model is not known.
+        camera: The lens; None where it is not known.
+        x: (4, 4) where the camera is guessed to be, on the flange or in the base [m]; None where
+            that is not known, and neither camera nor board are drawn.
+        z: (4, 4) where the board is guessed to be, in the base or on the flange [m].
+    """
+
+    mount: Mount
+    target: Target
+    resolution: tuple[int, int]
+    robot: Robot | None
+    camera: Camera | None
+    x: FloatArray | None
+    z: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class LiveView:
+    """What is drawn of a view.
+
+    Attributes:
+        view: Its number.
+        image: (h, w) or (h, w, 3) blue, green, red.
+        px: (n, 2) the corners in it [px].
+        base_from_flange: (4, 4) [m].
+        q: (n,) joint angles [rad]; None where they are not known.
+        sigma_mm: What is predicted so far; None where nothing is [mm].
+        note: In Markdown.
+    """
+
+    view: int
+    image: Image
+    px: FloatArray
+    base_from_flange: FloatArray
+    q: FloatArray | None
+    sigma_mm: float | None
+    note: str
+
+
+@dataclass(eq=False)
+class LiveDrawing:
+    """Draws a recording into a stream of rerun."""
+
+    stream: rr.RecordingStream
+    cell: LiveCell
+    _px: dict[int, FloatArray] = field(default_factory=dict)
+    _places: list[FloatArray] = field(default_factory=list)
+
+    def begin(self) -> None:
+        """Draws what stands still."""
+        stream, cell = self.stream, self.cell
+        base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
+        stream.log(paths.BASE, base, static=True)
+        frames = [(paths.BASE, paths.BASE_FRAME), (paths.FLANGE, paths.FLANGE_FRAME)]
+        if cell.x is not None:
+            frames += [(paths.CAMERA, paths.CAM_FRAME), (paths.TARGET, paths.TARGET_FRAME)]
+            on_target = rr.CoordinateFrame(paths.TARGET_FRAME)
+            stream.log(f"{paths.TARGET}/sheet", on_target, board.sheet(cell.target), static=True)
+        for entity, frame in frames:
+            axes = rr.TransformAxes3D(_AXIS_M, show_frame=True)
+            stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
+        in_base = rr.CoordinateFrame(paths.BASE_FRAME)
+        for entity in ("links", "joints"):
+            stream.log(f"{paths.ROBOT}/{entity}", in_base, static=True)
+        if cell.camera is not None:
+            log_image_plane(stream, cell.camera, 1.0)
+
+    def draw(self, view: LiveView) -> None:
+        """Draws a view, and all so far with it."""
+        stream = self.stream
+        stream.set_time(paths.TIMELINE, sequence=view.view)
+        self._draw_image(view)
+        self._draw_cell(view)
+        self._px[view.view] = view.px
+        chart = corners_chart(self.cell.resolution, self._px)
+        charts = Charts((chart,), (), frozenset(self._px))
+        charts.log_static(stream)
+        charts.log_view(stream, view.view)
+        if view.sigma_mm is not None:
+            stream.log(paths.LIVE_SIGMA, rr.Scalars(view.sigma_mm))
+        note = rr.TextDocument(view.note, media_type="text/markdown")
+        stream.log(paths.LIVE_NOTE, note)
+
+    def _draw_image(self, view: LiveView) -> None:
+        in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
+        model = rr.ColorModel.L if view.image.ndim == 2 else rr.ColorModel.BGR
+        picture = rr.Image(view.image, color_model=model).compress(jpeg_quality=_JPEG)
+        self.stream.log(paths.IMAGE, in_image, picture)
+        # Rerun counts from the image's corner, not from the first pixel's centre.
+        points = rr.Points2D(view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5))
+        self.stream.log(paths.DETECTED, in_image, points)
+
+    def _draw_cell(self, view: LiveView) -> None:
+        cell, stream, flange = self.cell, self.stream, view.base_from_flange
+        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, flange)
+        if cell.robot is not None and view.q is not None:
+            log_arm(stream, cell.robot.link_frames(view.q))
+        self._places.append(flange)
+        in_base = rr.CoordinateFrame(paths.BASE_FRAME)
+        points = rr.Points3D(
+            [it[:3, 3] for it in self._places], colors=colours.USED, radii=_POINT_M
+        )
+        stream.log(f"{paths.STOPS}/{paths.USED}", in_base, points)
+        if cell.x is None or cell.z is None:
+            return
+        in_hand = cell.mount == "eye-in-hand"
+        placed = (flange @ cell.x, cell.z) if in_hand else (cell.x, flange @ cell.z)
+        log_pose(stream, paths.CAMERA, paths.CAM_FRAME, placed[0])
+        log_pose(stream, paths.TARGET, paths.TARGET_FRAME, placed[1])
+        strips = [it for pose in self._places for it in self._carried(pose)]
+        if strips:
+            lines = rr.LineStrips3D(strips, colors=colours.USED, radii=_LINE_M)
+            stream.log(f"{paths.STOPS}/{paths.USED}/carried", in_base, lines)
+
+    def _carried(self, flange: FloatArray) -> Sequence[FloatArray]:
+        """The camera's frustum or the board's rim at a place of the flange, (k, 3) lines."""
+        cell = self.cell
+        if cell.mount == "eye-in-hand":
+            shapes = [] if cell.camera is None else frustum(cell.camera, SMALL_FRUSTUM)
+            pose = flange @ np.asarray(cell.x)
+        else:
+            shapes, pose = [board.closed_outline(cell.target)], flange @ np.asarray(cell.z)
+        return [it @ pose[:3, :3].T + pose[:3, 3] for it in shapes]

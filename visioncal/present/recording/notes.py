@@ -1,0 +1,250 @@
+"""Text and plots of a result: the verdict, the solvers, and the residuals of every view."""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+
+import rerun as rr
+
+from visioncal.core.transforms import pose_difference
+from visioncal.present.recording import colours, paths
+from visioncal.present.recording.findings import SOURCES, Arm, Board, Findings, Uncertainty
+from visioncal.present.recording.kinematics import Kinematics
+from visioncal.results import Calibration, Edge, Rms, ViewResult
+
+HEADLINES = {"good": "Good", "check": "Check before use", "bad": "Bad: do not use"}
+_PLOTS = {
+    paths.POSITION_MM: "residual_mm",
+    paths.ORIENTATION_DEG: "residual_deg",
+    paths.REPROJECTION_PX: "rms_px",
+}
+_MARKS = (
+    (paths.USED, "used", colours.USED, rr.components.MarkerShape.Circle, 3.5),
+    (paths.REJECTED, "not used", colours.REJECTED, rr.components.MarkerShape.Cross, 6.0),
+    (
+        paths.BEYOND,
+        "not used, beyond the scale",
+        colours.REJECTED,
+        rr.components.MarkerShape.Up,
+        6.0,
+    ),
+)
+# The scale of a plot ends here, in largest residuals of the used views.
+_ROOM = 1.25
+
+
+def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
+    """Logs the verdict, the comparison of the solvers, and how the residuals' plots look."""
+    for entity, text in (
+        (paths.VERDICT, verdict_markdown(calibration)),
+        (paths.FIGURES, figures_markdown(calibration)),
+        (paths.SOLVERS, solvers_markdown(calibration)),
+    ):
+        stream.log(entity, _markdown(text), static=True)
+    for plot in _PLOTS:
+        for name, label, colour, marker, size in _MARKS:
+            points = rr.SeriesPoints(colors=colour, markers=marker, marker_sizes=size, names=label)
+            stream.log(f"{plot}/{name}", points, static=True)
+
+
+def scales(calibration: Calibration) -> dict[str, float]:
+    """By plot, where its scale ends: views that were not used must not flatten the others."""
+    ends = {}
+    for plot, attribute in _PLOTS.items():
+        known = [getattr(view, attribute) for view in calibration.views if view.used]
+        ends[plot] = _ROOM * max((it for it in known if it is not None), default=math.inf)
+    return ends
+
+
+def log_view(stream: rr.RecordingStream, view: ViewResult, ends: Mapping[str, float]) -> None:
+    """Logs one view's residuals and what became of it, at the stream's current time.
+
+    Args:
+        stream: Where to.
+        view: What became of the view.
+        ends: Where the plots' scales end, of `scales`.
+    """
+    for plot, attribute in _PLOTS.items():
+        name, value = paths.USED if view.used else paths.REJECTED, getattr(view, attribute)
+        if value is None and not view.used:
+            # Marked on the axis: a gap would look as if there were no such view.
+            value = 0.0
+        if not view.used and value > ends[plot]:
+            name, value = paths.BEYOND, ends[plot]
+        if value is not None:
+            stream.log(f"{plot}/{name}", rr.Scalars(float(value)))
+    stream.log(paths.VIEW_NOTE, _markdown(view_markdown(view)))
+
+
+def verdict_markdown(calibration: Calibration) -> str:
+    """The verdict with its reasons, the transforms, and the views that were left out."""
+    verdict = calibration.verdict
+    lines = [f"# {HEADLINES[verdict.status]}", ""]
+    lines += [f"- {plain(reason)}" for reason in verdict.lines]
+    lines += [
+        f"- {plain(name)}: {HEADLINES[it.verdict.status]}, see Tools and fixtures."
+        for name, it in calibration.frames.items()
+        if it.verdict.status != "good"
+    ]
+    lines += [
+        "",
+        "| transform | x, y, z [mm] | rotation vector [deg] | sigma |",
+        "|---|---|---|---|",
+    ]
+    lines += [
+        f"| {plain(name)} {edge_line(it, oriented=it.oriented)}"
+        for name, it in calibration.edges.items()
+    ]
+    lines += [
+        f"| {plain(name)} {edge_line(it.edge, oriented=it.oriented)}"
+        for name, it in calibration.frames.items()
+    ]
+    known = Findings.of(calibration).uncertainty
+    if known is not None:
+        lines += ["", _work_line(known)]
+    rejected = [view for view in calibration.views if not view.used]
+    used = len(calibration.views) - len(rejected)
+    lines += ["", f"{used} of {len(calibration.views)} views used."]
+    lines += [f"- View {view.view}: {plain(view.reason)}" for view in rejected]
+    return "\n".join(lines)
+
+
+def edge_line(edge: Edge, *, oriented: bool = True) -> str:
+    """A row of a table: position, rotation and sigma of a transform.
+
+    Args:
+        edge: The transform.
+        oriented: Whether its rotation was measured.
+    """
+    position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
+    if not oriented:
+        return f"| {position} | not measured | {edge.sigma_mm:.2g} mm |"
+    turn = ", ".join(f"{value:.3f}" for value in edge.transform.rotation.as_rotvec(degrees=True))
+    return f"| {position} | {turn} | {edge.sigma_mm:.2g} mm, {edge.sigma_deg:.2g} deg |"
+
+
+def _work_line(known: Uncertainty) -> str:
+    largest = plain(next(iter(known.parts_mm)))
+    return (
+        f"Where the views look, a point is placed to {known.total_mm:.2g} mm (sigma; 95 % within "
+        f"{known.radius95_mm:.2g} mm); the largest part comes from the "
+        f"{largest.replace('_', ' ')}."
+    )
+
+
+def figures_markdown(calibration: Calibration) -> str:
+    """The residuals of the fit and of what it had not seen, the noise, and what else was found."""
+    found = Findings.of(calibration)
+    lines = ["# Residuals, rms", "", "| views | mm | deg | px |", "|---|---:|---:|---:|"]
+    validation = calibration.validation
+    lines.append(_rms_line("used, as fitted", calibration.rms))
+    lines.append(_rms_line(f"left out in turn ({plain(validation.method)})", validation.held_out))
+    if validation.holdout is not None:
+        lines.append(_rms_line("declared hold-out", validation.holdout))
+    intervals = {} if found.uncertainty is None else found.uncertainty.noise_95
+    lines += ["", "# Noise, per axis", "", "| standard deviation | | 95 % |", "|---|---:|---:|"]
+    for name, value in calibration.noise.items():
+        low_high = " to ".join(f"{it:.2g}" for it in intervals.get(name, ()))
+        lines.append(f"| {_noise_label(name)} | {value:.2g} | {low_high} |")
+    kinematics = Kinematics.of(calibration)
+    level = [] if kinematics is None else ["", "# Level of the arm", "", plain(kinematics.reason)]
+    return "\n".join([*lines, *_findings_lines(found), *level])
+
+
+def _findings_lines(found: Findings) -> Iterator[str]:
+    known = found.uncertainty
+    if known is not None:
+        yield from ("", "# Where the uncertainty comes from", "", _work_line(known), "")
+        yield from ("| source | sigma mm | of the variance |", "|---|---:|---:|")
+        for name, value in known.parts_mm.items():
+            label = plain(SOURCES.get(name, name))
+            yield f"| {label} | {value:.2g} | {known.percent(name)} |"
+        yield f"| total | {known.total_mm:.2g} | |"
+    for name, board in found.boards.items():
+        if board.sigma:
+            yield from ("", f"# Board {plain(name)}".strip(), "", _board_line(board))
+    if found.arm is not None:
+        yield from ("", "# Arm", "", _arm_line(found.arm))
+
+
+def _board_line(board: Board) -> str:
+    scale = "as stated"
+    if "scale" in board.estimated:
+        sigma = board.sigma["scale"]
+        away = 100 * board.shape["scale"]
+        scale = f"{away:+.2g} % against the stated one (sigma {100 * sigma:.1g} %)"
+    bend = "none: flat within what is seen"
+    if board.is_bent:
+        bend = f"its corners lie within {board.bend_mm:.2g} mm of depth"
+    return f"Size: {scale}. Bend: {bend}."
+
+
+def _arm_line(arm: Arm) -> str:
+    treated = "were estimated along" if arm.estimated else "could not be estimated along"
+    return (
+        f"Residuals follow the arm's posture: its links are typically off by {arm.sigma_mm:.2g} mm "
+        f"and {arm.sigma_deg:.2g} deg (likelihood ratio {arm.likelihood_ratio:.0f}, noise stays "
+        f"under 15). These errors {treated}."
+    )
+
+
+def _noise_label(name: str) -> str:
+    """`robot_translation_mm` as words with the unit: `robot translation [mm]`."""
+    words, _, unit = name.rpartition("_")
+    return plain(f"{words.replace('_', ' ')} [{unit}]")
+
+
+def _rms_line(label: str, rms: Rms) -> str:
+    px = "" if rms.px is None else f"{rms.px:.2g}"
+    deg = "" if rms.deg is None else f"{rms.deg:.2g}"
+    return f"| {label} | {rms.mm:.2g} | {deg} | {px} |"
+
+
+def solvers_markdown(calibration: Calibration) -> str:
+    """A table of the solvers: their residuals, and how far their edges are from the result's."""
+    edges = list(calibration.edges)
+    titles = ["solver", "rms mm", "rms deg"]
+    titles += [f"{plain(name)} off by {unit}" for name in edges for unit in ("mm", "deg")]
+    lines = ["# Solvers compared", "", f"| {' | '.join(titles)} |"]
+    lines.append("|---" + "|---:" * (len(titles) - 1) + "|")
+    for solver, result in calibration.solvers.items():
+        deg = "" if result.rms_deg is None else f"{result.rms_deg:.3g}"
+        cells = [plain(solver), f"{result.rms_mm:.3g}", deg]
+        for name in edges:
+            if name in result.transforms:
+                ours, theirs = calibration.transforms[name], result.transforms[name]
+                differences = pose_difference(ours.as_matrix(), theirs.as_matrix())
+                cells += [_difference(value) for value in differences]
+            else:
+                cells += ["", ""]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _difference(value: float) -> str:
+    """A difference from the result; rounding errors of the result's own row are none."""
+    return f"{value:.2g}" if value > 1e-9 else "0"
+
+
+def view_markdown(view: ViewResult) -> str:
+    """What became of one view."""
+    lines = [f"# View {view.view}: {'used' if view.used else 'not used'}", ""]
+    if view.reason:
+        lines += [plain(view.reason), ""]
+    figures = (
+        ("corners", view.corners, ""),
+        ("reprojection", view.rms_px, " px"),
+        ("position residual", view.residual_mm, " mm"),
+        ("orientation residual", view.residual_deg, " deg"),
+    )
+    known = [f"{label} {value:.3g}{unit}" for label, value, unit in figures if value is not None]
+    return "\n".join([*lines, ", ".join(known)])
+
+
+def plain(text: str) -> str:
+    """Escapes text from outside: the viewer would load pictures and follow links in Markdown."""
+    return re.sub(r"([\\`*_{}\[\]()#+\-.!|<>~&])", r"\\\1", " ".join(text.split()))
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

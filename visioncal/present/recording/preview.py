@@ -1,0 +1,274 @@
+"""The preview of a plan: stops that nobody has driven to yet."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from rerun.blueprint import BlueprintLike
+
+from visioncal.core.files import written_beside
+from visioncal.core.transforms import invert
+from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.charts import Charts
+from visioncal.present.recording.coverage import (
+    corners_chart,
+    directions_chart,
+    rotation_axes_chart,
+)
+from visioncal.present.recording.obstacles import Obstacle, log_obstacles
+from visioncal.present.recording.recorder import Recorder
+from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
+from visioncal.present.recording.workspace import log_map
+from visioncal.results.evidence import ViewEvidence
+from visioncal.robot import Robot
+from visioncal.vision.camera import project
+from visioncal.vision.targets import corner_positions
+
+# Sizes of what is drawn, as shares of the cell's size.
+_AXIS, _LINE, _POINT = 0.12, 0.002, 0.004
+# The way is drawn in steps of so much of a joint's turn [rad].
+_STEP_RAD = 0.05
+# A lens bends the board's sides: they are drawn with so many points.
+_SIDE_POINTS = 9
+
+
+@dataclass(frozen=True, eq=False)
+class PreviewStop:
+    """A stop: its view's number, joint angles (n,), and those (j, n) on the way to it [rad]."""
+
+    view: int
+    q: FloatArray
+    via: FloatArray
+    note: str
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """What is drawn of a plan.
+
+    Attributes:
+        name: What to call the recording.
+        mount: Where the camera is.
+        robot: The arm.
+        camera: The lens.
+        target: The board.
+        x: (4, 4) where the camera is guessed to be, on the flange or in the base [m].
+        z: (4, 4) where the board is guessed to be, in the base or on the flange [m].
+        stops: In the order in which the robot drives to them.
+        sigmas_mm: Predicted after so many stops; NaN where something is open [mm].
+        obstacles: What is in the way.
+        floor_m: Height of the floor in the base [m]; None for none.
+        places_m: (w, 3) places of the workspace [m], may be empty.
+        places_sigma_mm: (w,) predicted there [mm].
+        note: The plan in Markdown.
+    """
+
+    name: str
+    mount: Mount
+    robot: Robot
+    camera: Camera
+    target: Target
+    x: FloatArray
+    z: FloatArray
+    stops: Sequence[PreviewStop]
+    sigmas_mm: FloatArray
+    obstacles: Sequence[Obstacle]
+    floor_m: float | None
+    places_m: FloatArray
+    places_sigma_mm: FloatArray
+    note: str
+
+    @property
+    def base_from_flange(self) -> FloatArray:
+        """(k, 4, 4) the flange at the stops [m]."""
+        return self.robot.base_from_flange(np.array([it.q for it in self.stops]))
+
+    @property
+    def size_m(self) -> float:
+        """Typical distance of the flange from the base [m]."""
+        return float(np.median(np.linalg.norm(self.base_from_flange[:, :3, 3], axis=1)))
+
+    def placed(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where camera and board are in the base, (4, 4) each, with the flange at a place [m]."""
+        if self.mount == "eye-in-hand":
+            return base_from_flange @ self.x, self.z
+        return self.x, base_from_flange @ self.z
+
+
+def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None) -> None:
+    """Writes the preview of a plan as a recording.
+
+    It has two timelines: one step a stop, and the way of the arm in small steps.
+
+    Args:
+        path: The `.rrd` to write; it appears whole or not at all.
+        preview: What is drawn.
+        blueprint: The layout to open it in.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    with written_beside(path) as aside, Recorder(aside) as recorder:
+        stream = recorder.stream
+        stream.send_recording_name(preview.name)
+        recorder.lay_out(blueprint)
+        charts = _charts(preview)
+        _log_static(stream, preview, charts)
+        _log_stops(recorder, preview, charts)
+
+
+def _charts(preview: Preview) -> Charts:
+    evidence, px = {}, {}
+    for stop, flange in zip(preview.stops, preview.base_from_flange, strict=True):
+        base_from_cam, base_from_target = preview.placed(flange)
+        cam_from_target = invert(base_from_cam) @ base_from_target
+        evidence[stop.view] = ViewEvidence(
+            stop.view, base_from_flange=flange, cam_from_target=cam_from_target
+        )
+        px[stop.view] = _corners_px(preview, cam_from_target)
+    found = (
+        corners_chart(preview.camera.resolution, px),
+        directions_chart(evidence),
+        rotation_axes_chart(list(evidence.values())),
+    )
+    return Charts(tuple(it for it in found if it is not None), (), frozenset(evidence))
+
+
+def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:
+    points = corner_positions(preview.target) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    return project(preview.camera, points)
+
+
+def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) -> None:
+    size_m = preview.size_m
+    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
+    stream.log(paths.BASE, base, static=True)
+    for entity, frame, times in (
+        (paths.BASE, paths.BASE_FRAME, 2.0),
+        (paths.FLANGE, paths.FLANGE_FRAME, 1.0),
+        (paths.CAMERA, paths.CAM_FRAME, 0.7),
+        (paths.TARGET, paths.TARGET_FRAME, 0.7),
+    ):
+        axes = rr.TransformAxes3D(times * _AXIS * size_m, show_frame=True)
+        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
+    in_base = rr.CoordinateFrame(paths.BASE_FRAME)
+    for entity in ("links", "joints"):
+        stream.log(f"{paths.ROBOT}/{entity}", in_base, static=True)
+    log_image_plane(stream, preview.camera, size_m)
+    width, height = preview.camera.resolution
+    border = rr.Boxes2D(mins=[[0.0, 0.0]], sizes=[[width, height]], colors=colours.GRID)
+    in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
+    stream.log(f"{paths.IMAGE}/border", in_image, border, static=True)
+    sheet = board.sheet(preview.target)
+    on_target = rr.CoordinateFrame(paths.TARGET_FRAME)
+    stream.log(f"{paths.TARGET}/sheet", on_target, sheet, static=True)
+    log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
+    _log_carried(stream, preview, size_m)
+    if len(preview.places_m):
+        log_map(stream, preview.places_m, preview.places_sigma_mm, size_m)
+    charts.log_static(stream)
+    note = rr.TextDocument(preview.note, media_type="text/markdown")
+    stream.log(paths.PLAN_NOTE, note, static=True)
+    known = np.isfinite(preview.sigmas_mm)
+    if known.any():
+        bars = rr.BarChart(
+            preview.sigmas_mm[known],
+            abscissa=np.flatnonzero(known).astype(float),
+            color=colours.USED,
+        )
+        stream.log(paths.PREDICTED_SIGMA, bars, static=True)
+
+
+def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) -> None:
+    """Draws what the flange carries at all stops, and its way between them."""
+    frame = rr.CoordinateFrame(paths.BASE_FRAME)
+    flange = preview.base_from_flange
+    strips, centres = [], []
+    for pose in flange:
+        base_from_cam, base_from_target = preview.placed(pose)
+        if preview.mount == "eye-in-hand":
+            base_from_carried = base_from_cam
+            shapes = frustum(preview.camera, SMALL_FRUSTUM * size_m)
+        else:
+            base_from_carried = base_from_target
+            shapes = [board.closed_outline(preview.target)]
+        centres.append(base_from_carried[:3, 3])
+        strips += [it @ base_from_carried[:3, :3].T + centres[-1] for it in shapes]
+    lines = rr.LineStrips3D(strips, colors=colours.USED, radii=0.5 * _LINE * size_m)
+    stream.log(f"{paths.STOPS}/{paths.USED}/carried", frame, lines, static=True)
+    points = rr.Points3D(
+        centres,
+        colors=colours.USED,
+        radii=_POINT * size_m,
+        labels=[str(it.view) for it in preview.stops],
+        show_labels=True,
+    )
+    stream.log(f"{paths.STOPS}/{paths.USED}", frame, points, static=True)
+    way = np.array([q for _, steps in _way(preview) for q in steps])
+    held = preview.x if preview.mount == "eye-in-hand" else preview.z
+    places = (preview.robot.base_from_flange(way) @ held)[:, :3, 3]
+    drawn = rr.LineStrips3D([places], colors=colours.THIS_VIEW, radii=0.7 * _LINE * size_m)
+    stream.log(paths.WAY, frame, drawn, static=True)
+
+
+def _way(preview: Preview) -> Iterator[tuple[PreviewStop, list[FloatArray]]]:
+    """Each stop with the postures (n,) on the way to it, the last of which is its own."""
+    last: FloatArray | None = None
+    for stop in preview.stops:
+        corners = [*([] if last is None else [last]), *stop.via, stop.q]
+        steps = [] if last is not None else [corners[0]]
+        for begin, end in pairwise(corners):
+            count = max(int(np.ceil(np.abs(end - begin).max() / _STEP_RAD)), 1)
+            steps += [begin + share * (end - begin) for share in np.arange(1, count + 1) / count]
+        last = stop.q
+        yield stop, steps
+
+
+def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
+    stream, step = recorder.stream, 0
+    for row, (stop, steps) in enumerate(_way(preview)):
+        for q in steps[:-1]:
+            stream.reset_time()
+            stream.set_time(paths.WAY_TIMELINE, sequence=step)
+            _log_cell(stream, preview, q)
+            step += 1
+        recorder.at(row)
+        stream.set_time(paths.WAY_TIMELINE, sequence=step)
+        step += 1
+        cam_from_target = _log_cell(stream, preview, stop.q)
+        charts.log_view(stream, stop.view)
+        _log_image(stream, preview, cam_from_target)
+        text = rr.TextDocument(stop.note, media_type="text/markdown")
+        stream.log(paths.STOP_NOTE, text)
+    recorder.keep()
+
+
+def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray) -> None:
+    """Draws the board as the camera will see it."""
+    frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
+    outline = board.closed_outline(preview.target)
+    shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
+    sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
+    seen = sides @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    # Rerun counts from the image's corner, not from the first pixel's centre.
+    rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
+    stream.log(f"{paths.IMAGE}/board", frame, rim)
+    px = _corners_px(preview, cam_from_target) + 0.5
+    points = rr.Points2D(px, colors=colours.PREDICTED, radii=rr.Radius.ui_points(2.5))
+    stream.log(paths.PREDICTED, frame, points)
+
+
+def _log_cell(stream: rr.RecordingStream, preview: Preview, q: FloatArray) -> FloatArray:
+    """Draws the arm and what it carries; gives `cam_from_target` (4, 4)."""
+    links = preview.robot.link_frames(q)
+    base_from_cam, base_from_target = preview.placed(links[-1])
+    log_arm(stream, links)
+    log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, links[-1])
+    log_pose(stream, paths.CAMERA, paths.CAM_FRAME, base_from_cam)
+    log_pose(stream, paths.TARGET, paths.TARGET_FRAME, base_from_target)
+    return invert(base_from_cam) @ base_from_target

@@ -1,0 +1,99 @@
+"""Opens a stream of rerun that writes to a file, and finds out whether it could."""
+
+import os
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import rerun as rr
+from rerun.blueprint import BlueprintLike
+
+from visioncal.present.recording import paths
+from visioncal.present.recording.frames import scan
+
+# Room for one more view, however large its image, and for the end of the file.
+_ROOM_BYTES = 100_000_000
+
+
+class Recorder:
+    """A stream of rerun that writes to a file.
+
+    Attributes:
+        stream: Where to log.
+    """
+
+    def __init__(self, path: Path, *, recording_id: str | None = None) -> None:
+        """Begins the file.
+
+        Args:
+            path: The `.rrd`; one that is there is replaced.
+            recording_id: Of the recording that the file is a part of; None where it is one.
+
+        Raises:
+            OSError: The file cannot be created.
+        """
+        self._path = path
+        self.stream = rr.RecordingStream(
+            paths.APPLICATION, recording_id=recording_id, send_properties=recording_id is None
+        )
+        _check_room(path.parent)
+        try:
+            self.stream.save(path)
+        except RuntimeError as error:
+            # This is how rerun reports a file that it cannot create.
+            raise OSError(str(error)) from error
+
+    def lay_out(self, blueprint: BlueprintLike | None) -> None:
+        """Adds the layout to open the recording in, if there is one.
+
+        It is a hundred kilobytes, and comes after the facts: a cut within it loses none of them.
+        It is made active because a browser has begun to draw by the time it arrives.
+        """
+        if blueprint is not None:
+            self.stream.send_blueprint(blueprint, make_active=True, make_default=True)
+            # Not between the parts of what comes next.
+            self.keep()
+
+    def at(self, row: int) -> None:
+        """Says which view is logged next, by its place in the session.
+
+        Raises:
+            OSError: There is too little room for another view.
+        """
+        _check_room(self._path.parent)
+        self.stream.set_time(paths.TIMELINE, sequence=row)
+
+    def keep(self) -> None:
+        """Hands what was logged to the operating system: it survives the death of the process."""
+        self.stream.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Writes the end of the file, and waits until it is on the disk.
+
+        Raises:
+            OSError: The file could not be written.
+        """
+        self.stream.disconnect()
+        if kind is not None:
+            return
+        # Rerun only prints that it could not write.
+        if not scan(self._path).finished:
+            raise OSError("its end is missing; the disk may be full")
+        with self._path.open("r+b") as file:
+            os.fsync(file.fileno())
+
+
+def _check_room(folder: Path) -> None:
+    """Stops in time: on a full disk, rerun's own thread dies and whoever waits for it hangs."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < _ROOM_BYTES:
+        raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")

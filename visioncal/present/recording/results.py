@@ -1,0 +1,294 @@
+"""What was computed from a session, kept in its recording: drawn, and exact.
+
+A result counts when its last message, the calibration's text, is there; of several, the last one
+counts.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from rerun.blueprint import BlueprintLike
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import named_errors, sha256
+from visioncal.core.temporary_files import aside_file
+from visioncal.core.types import Corners, FloatArray
+from visioncal.present.recording import armtext, explained, notes, overlays, paths, tools
+from visioncal.present.recording.frames import Frame, append, read_payload, scan
+from visioncal.present.recording.messages import recording_id
+from visioncal.present.recording.reader import chunks, read_session
+from visioncal.present.recording.recorder import Recorder
+from visioncal.present.recording.scene import Scene
+from visioncal.present.recording.thermal import Drift
+from visioncal.results import Calibration, to_document
+from visioncal.results.evidence import ViewEvidence
+from visioncal.session import Session
+
+_EVIDENCE, _RESULT = "visioncal.Evidence", "visioncal.Result"
+
+
+def append_results(
+    path: Path,
+    session: Session,
+    calibration: Calibration | None,
+    evidence: Sequence[ViewEvidence],
+    blueprint: BlueprintLike | None = None,
+) -> None:
+    """Adds what was computed to a recording; its images and facts stay as they are, byte by byte.
+
+    Where this is interrupted, the results that were there before still count.
+
+    Args:
+        path: The `.rrd`.
+        session: The session in it.
+        calibration: Its result; None draws the cell as it was recorded.
+        evidence: What was seen and computed of the views, in any order.
+        blueprint: A layout to open it in, in place of the one that it has.
+
+    Raises:
+        DataError: The recording cannot be read or written, or holds another session.
+    """
+    owner = _recording_of(path, session)
+    with named_errors(path), aside_file(path.parent) as aside:
+        with Recorder(aside, recording_id=owner) as recorder:
+            recorder.lay_out(blueprint)
+            log_results(recorder, session, calibration, evidence)
+        append(path, aside)
+
+
+def log_results(
+    recorder: Recorder,
+    session: Session,
+    calibration: Calibration | None,
+    evidence: Sequence[ViewEvidence],
+) -> None:
+    """Logs what was computed: first what is drawn of it, then what makes it count.
+
+    Raises:
+        DataError: The evidence names a view that the session does not have, or what was found
+            beside the edges cannot be read.
+        OSError: The file cannot be written.
+    """
+    seen_of = {it.view: it for it in evidence}
+    rows = {view.number: row for row, view in enumerate(session.views)}
+    unknown = [f"view {number}" for number in sorted(seen_of.keys() - rows.keys())]
+    if unknown:
+        raise DataError(
+            f"The evidence names {', '.join(unknown)}, which the session {session.name!r} does "
+            "not have.",
+            culprits=unknown,
+        )
+    _draw(recorder, session, calibration, seen_of)
+    result = uuid4().hex
+    for place, seen in enumerate(evidence):
+        recorder.at(rows[seen.view])
+        _log_evidence(recorder.stream, seen, result, place)
+    # Rerun orders what it holds as it likes: what makes the result count must come after the rest.
+    recorder.keep()
+    _log_result(recorder.stream, calibration, result, len(evidence))
+    recorder.keep()
+
+
+def read_calibration(path: Path) -> Calibration | None:
+    """Reads the result that a recording holds.
+
+    Returns:
+        The one that was added last; None where there is none.
+
+    Raises:
+        DataError: The file cannot be read, or the result is damaged.
+    """
+    text = _read_result(path).text
+    if not text:
+        return None
+    return Calibration.from_json(text, str(path))
+
+
+def read_evidence(path: Path) -> tuple[ViewEvidence, ...]:
+    """Reads what was seen and computed of the views, exactly as it was written.
+
+    Returns:
+        What belongs to the result that was added last, in the order in which it was given; empty
+        where there is none.
+
+    Raises:
+        DataError: The file cannot be read, or the evidence is damaged.
+    """
+    result = _read_result(path)
+    if len(result.evidence) != result.evidence_count:
+        raise _damaged(path)
+    return result.evidence
+
+
+def _recording_of(path: Path, session: Session) -> str:
+    """The id of a recording, which what is added to it must bear too."""
+    recorded = read_session(path)
+    ours, theirs = ([it.number for it in one.views] for one in (session, recorded))
+    if ours != theirs:
+        raise DataError(
+            f"{path} holds {len(theirs)} views, the session {session.name!r} has {len(ours)} "
+            "or others.",
+            culprits=[str(path)],
+            next_step="Load the session from the recording that its results are added to.",
+        )
+    header, _, _ = next(chunks(scan(path), (paths.SESSION,), []))
+    return recording_id(read_payload(path, header))
+
+
+def _draw(
+    recorder: Recorder,
+    session: Session,
+    calibration: Calibration | None,
+    evidence: Mapping[int, ViewEvidence],
+) -> None:
+    stream = recorder.stream
+    scene = Scene.of(session, calibration, evidence)
+    overlay = overlays.Overlay.of(session, calibration, evidence)
+    explains = explained.is_drawn(evidence.values())
+    scene.log_static(stream)
+    if calibration is not None:
+        notes.log_static(stream, calibration)
+        tools.log_static(stream, calibration)
+        armtext.log_static(stream, calibration)
+    results = {} if calibration is None else {it.view: it for it in calibration.views}
+    ends = {} if calibration is None else notes.scales(calibration)
+    drift = None if calibration is None else Drift.of(calibration)
+    for row, view in enumerate(session.views):
+        recorder.at(row)
+        seen = evidence.get(view.number, ViewEvidence(view.number))
+        scene.log_view(stream, view, seen)
+        overlay.log_view(stream, seen)
+        if explains:
+            explained.log_view(stream, seen)
+        if view.number in results:
+            notes.log_view(stream, results[view.number], ends)
+        if drift is not None:
+            drift.log_view(stream, view.number)
+    recorder.keep()
+
+
+def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, place: int) -> None:
+    """Keeps what was computed of a view; what is drawn has single precision."""
+    components = {
+        "result": pa.array([result], pa.string()),
+        "place": pa.array([place], pa.int64()),
+        "view": pa.array([seen.view], pa.int64()),
+    }
+    if seen.corners is not None:
+        components["corner_ids"] = pa.array(seen.corners.ids, pa.int64())
+        components["corner_px"] = _exact(seen.corners.px)
+        components["blur_px"] = _exact(seen.corners.blur_px)
+    for name in ("predicted_px", "base_from_flange", "cam_from_target"):
+        values = getattr(seen, name)
+        if values is not None:
+            components[name] = _exact(values)
+    seal = _seal({name: values.to_pylist() for name, values in components.items()})
+    components["seal"] = pa.array([seal], pa.string())
+    stream.log(paths.EVIDENCE, rr.DynamicArchetype(_EVIDENCE, components=components))
+
+
+def _log_result(
+    stream: rr.RecordingStream, calibration: Calibration | None, result: str, evidence_count: int
+) -> None:
+    text = "" if calibration is None else json.dumps(to_document(calibration), indent=2)
+    components = {
+        "result": pa.array([result], pa.string()),
+        "evidence_count": pa.array([evidence_count], pa.int64()),
+        "seal": pa.array([sha256(text.encode())], pa.string()),
+    }
+    stream.log(
+        paths.CALIBRATION,
+        rr.TextDocument(text, media_type="application/json"),
+        rr.DynamicArchetype(_RESULT, components=components),
+        static=True,
+    )
+
+
+def _exact(values: FloatArray | float) -> pa.Array:
+    return pa.array(np.ravel(values), pa.float64())
+
+
+def _seal(values: Mapping[str, list[Any]]) -> str:
+    return sha256(json.dumps(values, sort_keys=True).encode())
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A result as it is kept; its text is empty where there was no calibration."""
+
+    text: str = ""
+    evidence_count: int = 0
+    evidence: tuple[ViewEvidence, ...] = ()
+
+
+def _read_result(path: Path) -> _Result:
+    """Reads the last result, with what is intact of its evidence."""
+    last: dict[str, Any] = {}
+    evidence: dict[str, dict[int, ViewEvidence]] = {}
+    damaged: list[Frame] = []
+    entities = (paths.CALIBRATION, paths.EVIDENCE)
+    try:
+        for _, entity, batch in chunks(scan(path), entities, damaged):
+            for place in range(batch.num_rows):
+                if entity == paths.EVIDENCE:
+                    values = _values(batch, place, _EVIDENCE)
+                    seen = _evidence(values)
+                    evidence.setdefault(values["result"][0], {})[values["place"][0]] = seen
+                else:
+                    last = _values(batch, place, _RESULT) | _values(batch, place, "TextDocument")
+                    # What was damaged before this one is no newer result.
+                    damaged.clear()
+        if damaged or (last and sha256(last["text"][0].encode()) != last["seal"][0]):
+            raise _damaged(path)
+        if not last:
+            return _Result()
+        (result,), (count,), (text,) = last["result"], last["evidence_count"], last["text"]
+    except (KeyError, ValueError, TypeError) as error:
+        raise _damaged(path) from error
+    found = evidence.get(result, {})
+    return _Result(text, count, tuple(found[place] for place in sorted(found)))
+
+
+def _evidence(values: Mapping[str, Any]) -> ViewEvidence:
+    """Reads what belongs to one view, after a check of its seal."""
+    sealed = {name: entry for name, entry in values.items() if name != "seal"}
+    if values["seal"] != [_seal(sealed)]:
+        raise ValueError("the evidence was changed after it was written")
+
+    def floats(name: str, *shape: int) -> FloatArray | None:
+        return np.array(values[name], dtype=float).reshape(shape) if name in values else None
+
+    (view,) = values["view"]
+    px, corners = floats("corner_px", -1, 2), None
+    if px is not None:
+        ids = np.array(values["corner_ids"], dtype=np.int64)
+        corners = Corners(view, ids, px, float(values["blur_px"][0]))
+    return ViewEvidence(
+        view,
+        corners,
+        floats("predicted_px", -1, 2),
+        floats("base_from_flange", 4, 4),
+        floats("cam_from_target", 4, 4),
+    )
+
+
+def _values(batch: pa.RecordBatch, place: int, archetype: str) -> dict[str, Any]:
+    """The components of an archetype that one row of a chunk has."""
+    columns = [name for name in batch.schema.names if name.startswith(f"{archetype}:")]
+    values = {name.removeprefix(f"{archetype}:"): batch.column(name)[place] for name in columns}
+    return {name: value.as_py() for name, value in values.items() if value.is_valid}
+
+
+def _damaged(path: Path) -> DataError:
+    return DataError(
+        f"{path} is damaged: its last result was changed after it was written.",
+        culprits=[str(path)],
+        next_step="Calibrate the session in it again.",
+    )

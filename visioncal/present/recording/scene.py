@@ -1,0 +1,316 @@
+"""The cell in 3D: robot, camera and target, as the calibration puts them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from visioncal.core.types import Camera, FloatArray, Target
+from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording.arm import log_arm
+from visioncal.present.recording.charts import Charts
+from visioncal.present.recording.findings import target_frames
+from visioncal.present.recording.uncertainty import Uncertainty
+from visioncal.present.recording.workspace import ArmPicture
+from visioncal.results import Calibration
+from visioncal.results.evidence import ViewEvidence
+from visioncal.session import Session, View
+from visioncal.vision.camera import matrix_3x3
+
+# Sizes of what is drawn, as shares of the cell's size: how far the flange is from the base.
+_AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
+# The views that are not the current one, drawn as small frusta or boards.
+SMALL_FRUSTUM = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is drawn of the cell. All poses are logged in the base frame.
+
+    Attributes:
+        session: The session.
+        calibration: Its result, if there is one; without it only the flange is drawn.
+        base_from_flange: (4, 4) by the view's number, where known.
+        size_m: Typical distance of the flange from the base [m].
+        uncertainty: What is drawn of the result's uncertainty.
+        charts: The charts over all views.
+        arm: What is drawn of a calibrated arm.
+    """
+
+    session: Session
+    calibration: Calibration | None
+    base_from_flange: Mapping[int, FloatArray]
+    size_m: float
+    uncertainty: Uncertainty | None
+    charts: Charts | None
+    arm: ArmPicture | None
+
+    @classmethod
+    def of(
+        cls,
+        session: Session,
+        calibration: Calibration | None,
+        evidence: Mapping[int, ViewEvidence],
+    ) -> "Scene":
+        """Collects the poses of the flange, from the evidence or else as they were recorded."""
+        poses: dict[int, FloatArray] = {}
+        for view in session.views:
+            seen = evidence.get(view.number)
+            reported = view.base_from_flange()
+            if seen is not None and seen.base_from_flange is not None:
+                poses[view.number] = seen.base_from_flange
+            elif reported is not None and not session.is_network:
+                # Of several robots, each pose is in a base of its own, which nothing places.
+                poses[view.number] = reported.as_matrix()
+        distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()]
+        size_m = float(np.median(distances)) if distances else 1.0
+        if calibration is None:
+            return cls(session, None, poses, size_m, None, None, None)
+        return cls(
+            session,
+            calibration,
+            poses,
+            size_m,
+            Uncertainty.of(calibration, evidence, size_m, target_frames(calibration, session)),
+            Charts.of(session, calibration, evidence),
+            ArmPicture.of(session, calibration, size_m),
+        )
+
+    def log_static(self, stream: rr.RecordingStream) -> None:
+        """Logs what does not change from view to view."""
+        # The edge to the cell keeps the base known in views that know no other frame.
+        stream.log(
+            paths.BASE,
+            rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME),
+            static=True,
+        )
+        for entity in ("links", "joints", "reach"):
+            frame = rr.CoordinateFrame(paths.BASE_FRAME)
+            stream.log(f"{paths.ROBOT}/{entity}", frame, static=True)
+        self._log_axes(stream, paths.BASE, paths.BASE_FRAME, 2.0)
+        self._log_axes(stream, paths.FLANGE, paths.FLANGE_FRAME, 1.0)
+        if self.calibration is None:
+            self._log_stops(stream)
+            return
+        for end in self._ends:
+            self._log_axes(stream, paths.entity_of(end), end, 0.7)
+        if self.calibration.camera is not None:
+            log_image_plane(stream, self.calibration.camera.camera, self.size_m)
+        for end, target in self._boards.items():
+            frame, sheet = rr.CoordinateFrame(end), board.sheet(target)
+            stream.log(f"{paths.entity_of(end)}/sheet", frame, sheet, static=True)
+        self._log_mount(stream)
+        self._log_frames(stream, self.calibration)
+        self._log_stops(stream)
+        if self.uncertainty is not None:
+            self.uncertainty.log_static(stream)
+        if self.charts is not None:
+            self.charts.log_static(stream)
+        if self.arm is not None:
+            self.arm.log_static(stream)
+
+    def log_view(self, stream: rr.RecordingStream, view: View, seen: ViewEvidence) -> None:
+        """Logs where everything is in one view, at the stream's current time."""
+        base_from_flange = self.base_from_flange.get(view.number)
+        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, base_from_flange)
+        self._log_arm(stream, view)
+        if self.calibration is None:
+            return
+        for end in self._ends:
+            base_from_end = self._base_from(end, base_from_flange)
+            log_pose(stream, paths.entity_of(end), end, base_from_end)
+        self._log_seen_target(stream, self._base_from("cam", base_from_flange), view, seen)
+        if self.uncertainty is not None:
+            self.uncertainty.log_view(stream, view.number)
+        if self.charts is not None:
+            self.charts.log_view(stream, view.number)
+        if self.arm is not None:
+            self.arm.log_view(stream, view.number)
+
+    @property
+    def _ends(self) -> list[str]:
+        """The frames that the calibration places: camera and targets, or instrument and probe."""
+        edges = {} if self.calibration is None else self.calibration.edges
+        return [name.rpartition("_from_")[2] for name in edges]
+
+    @property
+    def _boards(self) -> dict[str, Target]:
+        """The targets by their frames, as far as the calibration places them."""
+        boards = self.session.boards.items()
+        frames = {f"target_{name}" if name else paths.TARGET_FRAME: it for name, it in boards}
+        return {frame: it for frame, it in frames.items() if frame in self._ends}
+
+    def _base_from(self, end: str, base_from_flange: FloatArray | None) -> FloatArray | None:
+        """Where the calibration puts `cam` or `target` in one view; None where it is unknown."""
+        edges = {} if self.calibration is None else self.calibration.transforms
+        if f"base_from_{end}" in edges:
+            return np.asarray(edges[f"base_from_{end}"].as_matrix())
+        if base_from_flange is not None and f"flange_from_{end}" in edges:
+            return np.asarray(base_from_flange @ edges[f"flange_from_{end}"].as_matrix())
+        return None
+
+    def _radius(self, share: float) -> float:
+        return share * self.size_m
+
+    def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str, times: float) -> None:
+        """Draws a frame's axes with its name."""
+        axes = rr.TransformAxes3D(times * _AXIS * self.size_m, show_frame=True)
+        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
+
+    def _log_frames(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
+        """Draws tools, which the flange takes along, and fixtures, which stand in the base."""
+        for name, frame in calibration.frames.items():
+            parent, _, child = name.partition("_from_")
+            pose = rr.Transform3D(
+                translation=frame.edge.matrix[:3, 3],
+                mat3x3=frame.edge.matrix[:3, :3],
+                parent_frame=parent,
+                child_frame=child,
+            )
+            stream.log(paths.entity_of(child), pose, static=True)
+            self._log_axes(stream, paths.entity_of(child), child, 0.5)
+
+    def _log_mount(self, stream: rr.RecordingStream) -> None:
+        """Draws the edges that hang on the flange, as lines."""
+        edges = {} if self.calibration is None else self.calibration.transforms
+        for name, edge in edges.items():
+            if name.startswith("flange_from_"):
+                line = rr.LineStrips3D(
+                    [[np.zeros(3), edge.translation]],
+                    colors=colours.JOINT,
+                    radii=self._radius(2 * _LINE),
+                )
+                frame = rr.CoordinateFrame(paths.FLANGE_FRAME)
+                stream.log(f"{paths.FLANGE}/{name}", frame, line, static=True)
+
+    def _log_stops(self, stream: rr.RecordingStream) -> None:
+        """All places of the flange; those of views that were not used in another colour."""
+        views = () if self.calibration is None else self.calibration.views
+        rejected = {view.view for view in views if not view.used}
+        for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
+            poses = [
+                pose
+                for view, pose in self.base_from_flange.items()
+                if (view in rejected) is (name == paths.REJECTED)
+            ]
+            if not poses:
+                continue
+            frame = rr.CoordinateFrame(paths.BASE_FRAME)
+            points = rr.Points3D(
+                [pose[:3, 3] for pose in poses], colors=colour, radii=self._radius(_POINT)
+            )
+            stream.log(f"{paths.STOPS}/{name}", frame, points, static=True)
+            strips = [strip for pose in poses for strip in self._carried(pose)]
+            if strips:
+                lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
+                stream.log(f"{paths.STOPS}/{name}/carried", frame, lines, static=True)
+
+    def _carried(self, base_from_flange: FloatArray) -> list[FloatArray]:
+        """What the flange carries at one stop, as (k, 3) lines in the base: camera or boards."""
+        if self.calibration is None:
+            return []
+        if self.calibration.mount == "eye-in-hand":
+            camera = self.calibration.camera
+            rim = [] if camera is None else frustum(camera.camera, SMALL_FRUSTUM * self.size_m)
+            shapes = [("cam", it) for it in rim]
+        else:
+            shapes = [(end, board.closed_outline(it)) for end, it in self._boards.items()]
+        return [
+            shape @ base_from_end[:3, :3].T + base_from_end[:3, 3]
+            for end, shape in shapes
+            if (base_from_end := self._base_from(end, base_from_flange)) is not None
+        ]
+
+    def _log_arm(self, stream: rr.RecordingStream, view: View) -> None:
+        """Draws the robot, or only a line to its flange where its joints are not known."""
+        robot = None if self.calibration is None else self.calibration.calibrated_robot
+        q, base_from_flange = view.joints_rad, self.base_from_flange.get(view.number)
+        if robot is not None and q is not None and len(q) == robot.joint_count:
+            log_arm(stream, robot.link_frames(q))
+            return
+        stream.log(paths.ROBOT, rr.Clear(recursive=True))
+        if base_from_flange is not None:
+            line = rr.LineStrips3D(
+                [[np.zeros(3), base_from_flange[:3, 3]]],
+                colors=colours.JOINT,
+                radii=self._radius(2 * _LINE),
+            )
+            stream.log(f"{paths.ROBOT}/reach", line)
+
+    def _log_seen_target(
+        self,
+        stream: rr.RecordingStream,
+        base_from_cam: FloatArray | None,
+        view: View,
+        seen: ViewEvidence,
+    ) -> None:
+        """Draws the target's outline where this view alone sees it."""
+        target = self.session.boards.get(self.session.board_of(view))
+        if target is None:
+            return
+        rejected = self.calibration is not None and any(
+            it.view == seen.view and not it.used for it in self.calibration.views
+        )
+        strips = []
+        if seen.cam_from_target is not None and base_from_cam is not None:
+            base_from_target = base_from_cam @ seen.cam_from_target
+            corners = board.closed_outline(target)
+            strips.append(corners @ base_from_target[:3, :3].T + base_from_target[:3, 3])
+        # Without strips, this takes those of the view before off the screen.
+        colour = colours.REJECTED if rejected else colours.DETECTED
+        line = rr.LineStrips3D(strips, colors=colour, radii=self._radius(_LINE))
+        stream.log(paths.SEEN_TARGET, rr.CoordinateFrame(paths.BASE_FRAME), line)
+
+
+def log_image_plane(stream: rr.RecordingStream, camera: Camera, size_m: float) -> None:
+    """Hangs the image into the camera's frame, as large as a cell of some size [m] asks for."""
+    plane = image_plane(camera, size_m, (paths.CAM_FRAME, paths.IMAGE_FRAME))
+    stream.log(paths.IMAGE, rr.CoordinateFrame(paths.IMAGE_FRAME), plane, static=True)
+
+
+def image_plane(camera: Camera, size_m: float, frames: tuple[str, str]) -> rr.Pinhole:
+    """How an image hangs in a camera's frame.
+
+    Args:
+        camera: The lens.
+        size_m: Of the cell [m].
+        frames: Of the camera, and of its image.
+    """
+    matrix = matrix_3x3(camera)
+    # Rerun puts the image's corner, not the first pixel's centre, at the origin.
+    matrix[:2, 2] += 0.5
+    return rr.Pinhole(
+        image_from_camera=matrix,
+        resolution=camera.resolution,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_FRUSTUM * size_m,
+        parent_frame=frames[0],
+        child_frame=frames[1],
+    )
+
+
+def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
+    """The edges of a camera's field of view down to a depth [m], as lines in its frame."""
+    width, height = camera.resolution
+    fx, fy, cx, cy = camera.matrix
+    corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
+    plane = (corners_px - [cx, cy]) / [fx, fy]
+    rim = depth_m * np.column_stack([plane, np.ones(5)])
+    return [rim, *(np.stack([np.zeros(3), corner]) for corner in rim[:4])]
+
+
+def log_pose(
+    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray | None
+) -> None:
+    """Places a frame; an unknown one must not keep the place of the view before."""
+    if base_from_frame is None:
+        stream.log(entity, rr.Clear(recursive=False))
+        return
+    pose = rr.Transform3D(
+        translation=base_from_frame[:3, 3],
+        mat3x3=base_from_frame[:3, :3],
+        parent_frame=paths.BASE_FRAME,
+        child_frame=frame,
+    )
+    stream.log(entity, pose)

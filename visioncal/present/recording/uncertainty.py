@@ -1,0 +1,213 @@
+"""How well the edges are known, in the cell: ellipsoids, and where each view puts the target.
+
+Both are far too small to be seen at their true size, so both are drawn larger by one factor,
+which their names tell.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.transforms import invert, mean_transform
+from visioncal.core.types import FloatArray
+from visioncal.present.recording import colours, paths
+from visioncal.results import Calibration, Edge
+from visioncal.results.evidence import ViewEvidence
+
+# Half axes of the ellipsoid that holds a point in 95 % of cases, in standard deviations: the root
+# of the chi-square distribution's quantile for three degrees of freedom.
+SIGMAS_95 = 2.795
+# How large the largest of them is drawn, as a share of the cell's size.
+_SHARE = 0.07
+# Placements beyond this are drawn here, as shares of the same: wrong views lie anywhere.
+_REACH = 0.2
+_POINT, _LINE = 0.005, 0.0015
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What is drawn of the uncertainty.
+
+    Attributes:
+        edges: The edges that have a covariance, by name; tools and fixtures among them.
+        scatter_m: By view, how far from the mean it puts its target: (3,) in the target's frame.
+        frames: By view, the frame of its target.
+        used: The views that the fit used.
+        factor: How many times larger than it is everything is drawn.
+        size_m: The cell's size [m].
+    """
+
+    edges: Mapping[str, Edge]
+    scatter_m: Mapping[int, FloatArray]
+    frames: Mapping[int, str]
+    used: frozenset[int]
+    factor: int
+    size_m: float
+
+    @classmethod
+    def of(
+        cls,
+        calibration: Calibration,
+        evidence: Mapping[int, ViewEvidence],
+        size_m: float,
+        frames: Mapping[int, str] | None = None,
+    ) -> "Uncertainty":
+        """Collects the placements and chooses the factor by the used views.
+
+        Args:
+            calibration: The result.
+            evidence: What each view shows.
+            size_m: The cell's size [m].
+            frames: By view, the frame of its target; the only one's where None.
+        """
+        used = frozenset(view.view for view in calibration.views if view.used)
+        if frames is None:
+            frames = dict.fromkeys(evidence, list(calibration.edges)[1].rpartition("_from_")[2])
+        scatter_m: dict[int, FloatArray] = {}
+        for frame in sorted(set(frames.values())):
+            some = {view: it for view, it in evidence.items() if frames.get(view) == frame}
+            scatter_m |= _scatter_m(calibration, some, used)
+        edges = {name: it for name, it in calibration.placed.items() if it.covariance.any()}
+        sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
+        sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
+        factor = round_factor(_SHARE * size_m, max(sizes_m, default=0.0))
+        return cls(edges, scatter_m, frames, used, factor, size_m)
+
+    def log_static(self, stream: rr.RecordingStream) -> None:
+        """Draws the ellipsoids, and all views' placements of the target."""
+        for name, edge in self.edges.items():
+            self._log_ellipsoid(stream, name, edge)
+        for name, colour, wanted in (
+            (paths.USED, colours.USED, True),
+            (paths.REJECTED, colours.REJECTED, False),
+        ):
+            some = [view for view in self.scatter_m if (view in self.used) is wanted]
+            for frame in self._frames_of(some):
+                self._log_scatter(stream, name, frame, some, colour, static=True)
+        for frame in self._frames_of(self.scatter_m):
+            self._log_beyond(stream, frame)
+
+    def _frames_of(self, views: Iterable[int]) -> list[str]:
+        return sorted({self.frames[view] for view in views})
+
+    def _log_ellipsoid(self, stream: rr.RecordingStream, name: str, edge: Edge) -> None:
+        child = name.rpartition("_from_")[2]
+        entity = f"{paths.entity_of(child)}/{name}_95_percent_magnified_{self.factor}x"
+        frame = rr.CoordinateFrame(child)
+        sigmas_m, axes = _axes(edge)
+        ellipsoid = rr.Ellipsoids3D(
+            half_sizes=[SIGMAS_95 * self.factor * sigmas_m],
+            quaternions=[Rotation.from_matrix(axes).as_quat()],
+            colors=colours.UNCERTAINTY,
+            line_radii=_LINE * self.size_m,
+        )
+        stream.log(entity, frame, ellipsoid, static=True)
+        if child not in (paths.CAM_FRAME, paths.TARGET_FRAME, *self.frames.values()):
+            # All are drawn alike, and tools are close to the camera: more labels would hide them.
+            return
+        # Above the camera and beside the board, clear of the name of the frame.
+        label = rr.Points3D(
+            [[0.0, -1.2 * _SHARE * self.size_m, 0.0]],
+            radii=0.0,
+            colors=colours.UNCERTAINTY,
+            labels=f"95 %, {self.factor} x",
+            show_labels=True,
+        )
+        stream.log(f"{entity}/label", frame, label, static=True)
+
+    def log_view(self, stream: rr.RecordingStream, view: int) -> None:
+        """Marks one view's placement of the target, at the stream's current time."""
+        some = [view] if view in self.scatter_m else []
+        # Of the other targets, this takes the mark of the view before off the screen.
+        for frame in self._frames_of(self.scatter_m):
+            self._log_scatter(stream, paths.THIS_VIEW, frame, some, colours.THIS_VIEW, static=False)
+
+    def _log_scatter(
+        self,
+        stream: rr.RecordingStream,
+        name: str,
+        frame: str,
+        views: Sequence[int],
+        colour: tuple[int, int, int],
+        *,
+        static: bool,
+    ) -> None:
+        positions_m = np.reshape(
+            [
+                self._within_reach(self.factor * self.scatter_m[view])
+                for view in views
+                if self.frames[view] == frame
+            ],
+            (-1, 3),
+        )
+        larger = 1.5 if name == paths.THIS_VIEW else 1.0
+        points = rr.Points3D(positions_m, colors=colour, radii=larger * _POINT * self.size_m)
+        entity = f"{self._placements(frame)}/{name}"
+        stream.log(entity, rr.CoordinateFrame(frame), points, static=static)
+
+    def _placements(self, frame: str) -> str:
+        return f"{paths.entity_of(frame)}/placements_magnified_{self.factor}x"
+
+    def _log_beyond(self, stream: rr.RecordingStream, frame: str) -> None:
+        """Arrows towards the placements that lie too far out to be drawn."""
+        mine = [it for view, it in self.scatter_m.items() if self.frames[view] == frame]
+        drawn_m = [self.factor * it for it in mine]
+        far = [it for it in drawn_m if np.linalg.norm(it) > _REACH * self.size_m]
+        if far:
+            arrows = rr.Arrows3D(
+                vectors=[self._within_reach(it) for it in far],
+                origins=np.zeros((len(far), 3)),
+                colors=colours.REJECTED,
+                radii=_LINE * self.size_m,
+            )
+            entity = f"{self._placements(frame)}/{paths.BEYOND}"
+            stream.log(entity, rr.CoordinateFrame(frame), arrows, static=True)
+
+    def _within_reach(self, drawn_m: FloatArray) -> FloatArray:
+        reach_m = _REACH * self.size_m
+        return drawn_m * min(1.0, reach_m / max(float(np.linalg.norm(drawn_m)), 1e-12))
+
+
+def _axes(edge: Edge) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations (3,) [m] along the columns of a (3, 3) rotation, in the child's frame."""
+    variances_m2, axes = np.linalg.eigh(edge.covariance[3:, 3:])
+    return np.sqrt(np.clip(variances_m2, 0.0, None)), axes * np.sign(np.linalg.det(axes))
+
+
+def _scatter_m(
+    calibration: Calibration, evidence: Mapping[int, ViewEvidence], used: frozenset[int]
+) -> dict[int, FloatArray]:
+    """By view, the target's place less its mean over the used views, in the target's frame."""
+    placed = {
+        view: pose
+        for view, it in evidence.items()
+        if (pose := _placed(calibration, it)) is not None
+    }
+    some = [placed[view] for view in used if view in placed]
+    if not some:
+        return {}
+    mean_from_parent = invert(mean_transform(np.stack(some)))
+    return {view: (mean_from_parent @ pose)[:3, 3] for view, pose in placed.items()}
+
+
+def _placed(calibration: Calibration, seen: ViewEvidence) -> FloatArray | None:
+    """(4, 4) the target as this view alone puts it, in the frame that carries it."""
+    if seen.base_from_flange is None or seen.cam_from_target is None:
+        return None
+    # The camera's edge, or the instrument's, is the first.
+    edge = next(iter(calibration.edges.values())).transform.as_matrix()
+    in_hand = calibration.mount == "eye-in-hand"
+    robot = seen.base_from_flange if in_hand else invert(seen.base_from_flange)
+    return np.asarray(robot @ edge @ seen.cam_from_target)
+
+
+def round_factor(wanted_m: float, size_m: float) -> int:
+    """The largest of 1, 2, 5, 10, 20 ... by which a size stays under the wanted one."""
+    if not size_m > 0.0:
+        return 1
+    ratio = max(wanted_m / size_m, 1.0)
+    decade = 10 ** int(np.floor(np.log10(ratio)))
+    return int(max(step * decade for step in (1, 2, 5) if step * decade <= ratio))

@@ -1,0 +1,166 @@
+"""What the report says of the calibrated arm."""
+
+from dataclasses import dataclass
+
+from visioncal.core.number_format import significant
+from visioncal.estimation.arm import SIGNIFICANT
+from visioncal.present.recording.armtext import ParameterRow, parameter_row
+from visioncal.present.recording.kinematics import NOMINAL, Kinematics, Level, joint_words
+from visioncal.present.report.content import Fact
+
+_COLUMNS = 2
+_MOST_WORTH = 5
+_CONVENTIONS = {
+    "standard": "Denavit and Hartenberg's form, each joint's link behind it",
+    "modified": "Craig's modified form, each joint's link before it",
+    "hayati": "Hayati's form, which has no leap where axes are parallel",
+}
+_INDICES = (
+    ("o1", "O1", "geometric mean, over the root of the number of stops (Borm and Menq 1991)"),
+    ("o2", "O2", "smallest over largest (Driels and Pathre 1990)"),
+    ("o3", "O3", "smallest (Nahvi, Hollerbach and Hayward 1994)"),
+    ("o4", "O4", "square of the smallest over the largest (Nahvi and Hollerbach 1996)"),
+    ("o5", "O5", "inverse of the sum of their inverses (Sun and Hollerbach 2008)"),
+)
+
+
+@dataclass(frozen=True)
+class LevelRow:
+    """A level of the arm's model, as text."""
+
+    words: str
+    taken: bool
+    unknowns: str
+    rms_mm: str
+    rms_deg: str
+    held_out_mm: str
+    held_out_deg: str
+    likelihood_ratio: str
+
+
+@dataclass(frozen=True)
+class WorthRow:
+    """A stop, and by how much the variance over the workspace would grow without it, in words."""
+
+    view: str
+    growth: str
+
+
+@dataclass(frozen=True)
+class ArmCard:
+    """All that is said of the arm.
+
+    Attributes:
+        sentences: Which level was taken and why, and what the arm is worth.
+        levels: What was tried; empty where that was the arm as stated alone.
+        significant: What the likelihood ratio stays under by chance.
+        convention: The form of the parameters, in words.
+        sure: How many changes are beyond chance, in words; empty where no sigma is known.
+        joints: The parameters by joint, in columns that stand side by side.
+        told: What the stops tell.
+        details: Further figures of that.
+        not_told: What they cannot tell.
+        most_worth: The stops that tell most.
+        least_worth: The one that tells least; empty where all are among the former.
+    """
+
+    sentences: tuple[str, ...]
+    levels: tuple[LevelRow, ...]
+    significant: str
+    convention: str
+    sure: str
+    joints: tuple[tuple[tuple[str, tuple[ParameterRow, ...]], ...], ...]
+    told: tuple[Fact, ...]
+    details: tuple[Fact, ...]
+    not_told: tuple[str, ...]
+    most_worth: tuple[WorthRow, ...]
+    least_worth: tuple[WorthRow, ...]
+
+
+def arm_card(found: Kinematics) -> ArmCard:
+    """Writes what was found of the arm as text."""
+    sentences = [found.reason]
+    if found.workspace_mm is not None:
+        median, p95 = map(significant, found.workspace_mm)
+        sentences.append(
+            f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
+            f"(median; 95 % of the places: under {p95} mm)."
+        )
+    worth = [WorthRow(f"view {view}", _percent(share)) for view, share in found.worth]
+    return ArmCard(
+        tuple(sentences),
+        tuple(_level(it, it.name == found.level) for it in found.levels[: _tried(found)]),
+        f"{SIGNIFICANT:.0f}",
+        _CONVENTIONS.get(found.convention, ""),
+        _sure(found),
+        _columns(found),
+        _told(found),
+        tuple(_details(found)),
+        found.not_told,
+        tuple(worth[:_MOST_WORTH]),
+        tuple(worth[_MOST_WORTH:][-1:]),
+    )
+
+
+def _tried(found: Kinematics) -> int:
+    return len(found.levels) if len(found.levels) > 1 else 0
+
+
+def _level(level: Level, taken: bool) -> LevelRow:
+    return LevelRow(
+        level.words,
+        taken,
+        str(level.unknowns),
+        significant(level.rms_mm),
+        significant(level.rms_deg),
+        significant(level.held_out_mm),
+        significant(level.held_out_deg),
+        significant(None) if level.name == NOMINAL else f"{level.likelihood_ratio:.0f}",
+    )
+
+
+def _sure(found: Kinematics) -> str:
+    known = [it for it in found.parameters if it.sigma is not None]
+    sure = sum(it.is_sure for it in known)
+    return f"{sure} of {len(found.parameters)}" if known else ""
+
+
+def _columns(
+    found: Kinematics,
+) -> tuple[tuple[tuple[str, tuple[ParameterRow, ...]], ...], ...]:
+    """Joints with their parameters, half of them in each column."""
+    joints = [
+        (joint_words(name), tuple(parameter_row(it) for it in them))
+        for name, them in found.grouped().items()
+    ]
+    height = max(-(-len(joints) // _COLUMNS), 1)
+    return tuple(tuple(joints[start : start + height]) for start in range(0, len(joints), height))
+
+
+def _told(found: Kinematics) -> tuple[Fact, ...]:
+    known = found.observability
+    if "told" not in known:
+        return ()
+    told, most = int(known["told"]), int(known.get("identifiable", known["told"]))
+    facts = [Fact("directions told", f"{told} of {most}", "that any stops could tell")]
+    if "condition" in known:
+        facts.append(
+            Fact("condition", significant(known["condition"]), "best over worst told, scaled")
+        )
+    return tuple(facts)
+
+
+def _details(found: Kinematics) -> list[Fact]:
+    known = found.observability
+    facts = []
+    if "columns" in known:
+        note = "both transforms' and the arm's, redundant ones among them"
+        facts.append(Fact("values carried", str(int(known["columns"])), note))
+    facts += [
+        Fact(label, f"{known[name]:.3g}", note) for name, label, note in _INDICES if name in known
+    ]
+    return facts
+
+
+def _percent(share: float) -> str:
+    return f"{significant(100 * max(share, 0.0))} %"

@@ -1,0 +1,268 @@
+"""The report of an aligned cell: one HTML file that says how well its frames are tied."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from visioncal.core.files import write_atomically
+from visioncal.core.number_format import significant
+from visioncal.core.version import __version__
+from visioncal.present.recording import cellmap
+from visioncal.present.report import bars, content, network, svg, tools
+from visioncal.present.report.bars import Bar
+from visioncal.present.report.content import Fact
+from visioncal.results import HELD_BACK, Alignment, Calibration, CameraResult, Sight
+
+_DEG = "\N{DEGREE SIGN}"
+_WIDE_IN = 9.2
+# Of a frame's sigma, as it counts in its square.
+_LEAST_SHARE = 0.1
+_KINDS = {
+    "robot": "flange",
+    "camera": "cam",
+    "board": "target",
+    "instrument": "instrument",
+    "point": "point",
+}
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """One row of the table of how well frames are known in each other: a name, and its cells."""
+
+    name: str
+    cells: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """How well the frames of one body are known in each other, as text.
+
+    Attributes:
+        title: What carries them.
+        columns: The frames.
+        rows: One for each frame in which the others are told.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[PairRow, ...]
+
+
+def write_cell_report(path: Path, found: Alignment) -> None:
+    """Writes the report as one HTML file that needs no network and no script.
+
+    Args:
+        path: The file to write; it appears whole or not at all.
+        found: What to report.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    write_atomically(path, render_cell(found))
+
+
+def render_cell(found: Alignment) -> str:
+    """Renders the report as HTML text; see `write_cell_report`."""
+    environment = Environment(
+        loader=PackageLoader("visioncal", "present/report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    cards = [
+        content.edge_card(name, edge, oriented=edge.oriented) for name, edge in found.edges.items()
+    ]
+    return environment.get_template("cell.html.j2").render(
+        found=found,
+        headline=content.headline(found.verdict),
+        created=content.readable_time(found.created),
+        kinds=_kinds(found),
+        key_figures=_key_figures(found),
+        graph=network.graph(found),
+        links=[_link_row(it) for it in cellmap.pairs(found)],
+        tables=[it for body in ("cell", *found.robots) if (it := pair_table(found, body))],
+        edges=cards,
+        frames=tools.frame_cards(Calibration.whole(found)),
+        sources=source_table(found),
+        noise=_noise_facts(found),
+        arms=_arm_facts(found),
+        lenses=[(name, _lens_facts(it)) for name, it in found.cameras.items()],
+        residual_plot=residuals(found),
+        left_out=[it for it in found.sights if not it.used],
+        version=__version__,
+        python=platform.python_version(),
+        versions=content.dependency_versions(),
+    )
+
+
+def _kinds(found: Alignment) -> str:
+    """How many robots, cameras, boards and the like there are, in words."""
+    former = {it.before for it in found.moved}
+    words = []
+    for kind, start in _KINDS.items():
+        count = sum(it.startswith(start) and it not in former for it in found.frames)
+        if count:
+            words.append(f"{count} {kind}{'' if count == 1 else 's'}")
+    return ", ".join(words)
+
+
+def _key_figures(found: Alignment) -> list[Fact]:
+    used = sum(it.used for it in found.sights)
+    facts = [*content.need_facts(found.need, found.verdict)]
+    facts.append(Fact("observations used", f"{used} of {len(found.sights)}"))
+    bases = [it for it in found.frames if it.startswith("base") and found.frames[it] == "cell"]
+    for base in [it for it in bases if it != bases[0]]:
+        edge = found.between(bases[0], base)
+        worth = f"{significant(edge.sigma_mm)} mm"
+        facts.append(
+            Fact(f"{base} in {bases[0]}, sigma", worth, f"{significant(edge.sigma_deg)}{_DEG}")
+        )
+    worst = cellmap.weakest_frame(found)
+    if worst:
+        facts.append(Fact("least known", worst, f"{significant(found.edge_of(worst).sigma_mm)} mm"))
+    return facts
+
+
+def _link_row(pair: cellmap.Pair) -> dict[str, str | int]:
+    return {
+        "seer": pair.seer,
+        "seen": pair.seen,
+        "used": pair.used,
+        "left_out": pair.left_out,
+        "mm": significant(pair.rms_mm),
+        "deg": significant(pair.rms_deg),
+        "unseen_mm": significant(pair.unseen_mm),
+        "unseen_deg": significant(pair.unseen_deg),
+    }
+
+
+def pair_table(found: Alignment, body: str) -> PairTable | None:
+    """How well frames of one body are known in each other [mm, deg]; None of fewer than two.
+
+    Args:
+        found: The cell.
+        body: What carries them: the cell, or a flange.
+    """
+    left = {*found.robots, *(it.before for it in found.moved)}
+    frames = [it for it, on in found.frames.items() if on == body and it not in left]
+    if body != "cell":
+        frames = [body, *frames]
+    if len(frames) < 2:
+        return None
+    # In the frame of a point alone nothing has a place: its axes are chosen.
+    turned = [it for it in frames if _is_turned(found, it)]
+    rows = tuple(PairRow(a, tuple(_between(found, a, b) for b in frames)) for a in turned)
+    return PairTable("the cell" if body == "cell" else body, tuple(frames), rows)
+
+
+def _between(found: Alignment, first: str, second: str) -> str:
+    if first == second:
+        return ""
+    edge = found.between(first, second)
+    degrees = f", {significant(edge.sigma_deg)}{_DEG}" if _is_turned(found, second) else ""
+    return f"{significant(edge.sigma_mm)} mm{degrees}"
+
+
+def _is_turned(found: Alignment, frame: str) -> bool:
+    """Whether a frame's rotation was measured, or is what others are told in."""
+    return frame in (*found.robots, found.reference) or found.edge_of(frame).oriented
+
+
+def source_table(found: Alignment) -> PairTable | None:
+    """What each frame's place is uncertain by, source by source [mm]; None where that is unknown.
+
+    A source that counts for less than a hundredth of every frame's variance is left out.
+    """
+    budgets: Mapping[str, Mapping[str, float]] = found.stages.get("uncertainty", {}).get(
+        "budget_mm", {}
+    )
+    if not budgets:
+        return None
+    names = dict.fromkeys(name for it in budgets.values() for name in it)
+    shown = [
+        name
+        for name in names
+        if any(it.get(name, 0.0) > _LEAST_SHARE * it["total"] for it in budgets.values())
+    ]
+    rows = tuple(
+        PairRow(edge, tuple(significant(it.get(name)) for name in shown))
+        for edge, it in budgets.items()
+    )
+    return PairTable("", tuple(shown), rows)
+
+
+def _noise_facts(found: Alignment) -> list[Fact]:
+    units = {"mm": "mm", "deg": _DEG, "px": "px", "level": "times what is said of it"}
+    intervals = found.stages.get("uncertainty", {}).get("noise_95", {})
+    facts = []
+    for name, levels in found.noise.items():
+        words = []
+        for key, value in levels.items():
+            words.append(f"{significant(value)} {units[key.rpartition('_')[2]]}")
+            if key in intervals.get(name, {}):
+                low, high = map(significant, intervals[name][key])
+                words[-1] += f" (95 %: {low} to {high})"
+        label = f"robot {name}" if name in found.robots.values() else name
+        facts.append(Fact(label, ", ".join(words)))
+    return facts
+
+
+def _arm_facts(found: Alignment) -> list[Fact]:
+    """How far each arm is calibrated, where that was asked."""
+    facts = []
+    for name, arm in found.arms.items():
+        if "kinematics" in arm.stages:
+            kinematics = arm.stages["kinematics"]
+            left_out = {it["level"]: it["held_out_mm"] for it in kinematics["levels"]}
+            level = kinematics["level"]
+            now, stated = (f"{significant(left_out[it])} mm" for it in (level, "nominal"))
+            more = "" if level == "nominal" else f", as stated {stated}"
+            facts.append(Fact(f"robot {name}", level, f"stops left out: {now}{more}"))
+    return facts
+
+
+def _lens_facts(camera: CameraResult) -> list[Fact]:
+    lens = camera.camera
+    width, height = lens.resolution
+    fx, fy, cx, cy = lens.matrix
+    return [
+        Fact("model", lens.model, f"{width} \N{MULTIPLICATION SIGN} {height} px"),
+        Fact("fx, fy, cx, cy", f"{fx:.2f}, {fy:.2f}, {cx:.2f}, {cy:.2f}", "px"),
+        Fact("distortion", ", ".join(f"{it:.4g}" for it in lens.distortion)),
+        Fact("origin", "estimated from this session" if camera.estimated else "as stated"),
+    ]
+
+
+def residuals(found: Alignment) -> Markup:
+    """How far each observation is from what the rest predicts, camera by camera."""
+    seers = list(dict.fromkeys(it.seer for it in found.sights))
+    mine = {seer: [it for it in found.sights if it.seer == seer] for seer in seers}
+    shown = {seer: rows for seer, rows in mine.items() if any(it.residual_mm for it in rows)}
+    if not shown:
+        return Markup("")
+    with svg.style():
+        figure = svg.new_figure(_WIDE_IN, 1.45 * len(shown) + 0.25)
+        panels = figure.subplots(len(shown), squeeze=False)[:, 0]
+        for axes, (seer, rows) in zip(panels, shown.items(), strict=True):
+            bars.draw(axes, [_bar(it) for it in rows], _rms(rows))
+            axes.set_ylabel("mm")
+            axes.set_title(seer, loc="left", fontsize=9)
+        panels[-1].set_xlabel("view")
+        return svg.inline(figure, "cell-residuals", "Bars: residuals of each observation")
+
+
+def _bar(sight: Sight) -> Bar:
+    far = sight.residual_mm is not None and sight.reason != HELD_BACK
+    colour = svg.ACCENT if sight.used else svg.BAD if far else svg.MUTED
+    return Bar(str(sight.view), sight.residual_mm, sight.used, colour)
+
+
+def _rms(rows: Sequence[Sight]) -> float | None:
+    used = [it.residual_mm**2 for it in rows if it.used and it.residual_mm is not None]
+    return float(sum(used) / len(used)) ** 0.5 if used else None

@@ -1,0 +1,131 @@
+"""The page of a check: one HTML file that says whether a calibration still holds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from visioncal.core.files import write_atomically
+from visioncal.core.types import FloatArray
+from visioncal.core.version import __version__
+from visioncal.present.report import svg
+from visioncal.present.report.templating import template
+
+_WIDE_IN, _HIGH_IN = 9.2, 3.6
+# Bars of a stop, side by side, and how many labels have room below them.
+_BAR, _MOST_LABELS = 0.38, 20
+
+
+@dataclass(frozen=True)
+class ChangeRow:
+    """A change that was compared, as text; `named` are those that the check takes for true."""
+
+    words: str
+    share: str
+    named: bool
+
+
+@dataclass(frozen=True)
+class TriggerRow:
+    """A reason to calibrate again, as text, and whether it is `fired`, `quiet` or `unknown`."""
+
+    state: str
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class CheckPage:
+    """What the page of a check says.
+
+    Attributes:
+        session: Name of the check's session.
+        against: Name and time of the calibration.
+        passed: Whether it still holds.
+        sentences: What was found and what to do, the most important first.
+        changes: What may have changed, the likeliest first.
+        undone: What the likeliest change is, where one was found; else empty.
+        stops: Names of the m stops, by their views.
+        before: (m, 2) how far each places the target from where the calibration has it
+            [mm, deg].
+        after: (m, 2) the same with that change undone.
+        triggers: Reasons to calibrate again.
+        warnings: What is odd, in sentences.
+        not_used: Views that were not used, and why.
+    """
+
+    session: str
+    against: str
+    passed: bool
+    sentences: Sequence[str]
+    changes: Sequence[ChangeRow]
+    undone: str
+    stops: Sequence[str]
+    before: FloatArray
+    after: FloatArray
+    triggers: Sequence[TriggerRow]
+    warnings: Sequence[str]
+    not_used: Sequence[tuple[int, str]]
+
+
+def write_check(path: Path, page: CheckPage) -> None:
+    """Writes the page as one HTML file that needs no network and no script.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    write_atomically(path, render_check(page))
+
+
+def render_check(page: CheckPage) -> str:
+    """Renders the page as HTML text."""
+    return template("check.html.j2").render(
+        page=page,
+        version=__version__,
+        rows=[
+            (name, *(f"{it:.3f}" for it in (before[0], after[0], before[1], after[1])))
+            for name, before, after in zip(page.stops, page.before, page.after, strict=True)
+        ],
+        rms=[
+            f"{it:.3f}"
+            for it in np.sqrt(np.mean(np.square([page.before, page.after]), axis=1)).T.ravel()
+        ],
+        plot=_residuals(page),
+    )
+
+
+def _residuals(page: CheckPage) -> Markup:
+    """Residuals stop by stop: as the calibration has the cell, and with the change undone."""
+    with svg.style():
+        figure = svg.new_figure(_WIDE_IN, _HIGH_IN)
+        position, rotation = figure.subplots(2, 1, sharex=True)
+        for column, axes, label in (
+            (0, position, "position [mm]"),
+            (1, rotation, "rotation [deg]"),
+        ):
+            _bars(axes, page, column)
+            axes.set_ylabel(label)
+        step = -(-len(page.stops) // _MOST_LABELS)
+        places = range(0, len(page.stops), step)
+        rotation.set_xticks(list(places), [page.stops[it] for it in places])
+        rotation.set_xlabel("stop, by its views")
+        if page.undone:
+            figure.legend(*position.get_legend_handles_labels(), loc="outside upper right", ncols=2)
+        return svg.inline(figure, "check", "Residuals of each stop, before and after the change")
+
+
+def _bars(axes: Axes, page: CheckPage, column: int) -> None:
+    places = np.arange(len(page.stops))
+    if page.undone:
+        colours = svg.BAD, svg.ACCENT
+        axes.bar(places - 0.5 * _BAR, page.before[:, column], _BAR, color=colours[0],
+                 label="as calibrated")  # fmt: skip
+        axes.bar(places + 0.5 * _BAR, page.after[:, column], _BAR, color=colours[1],
+                 label="with the change undone")  # fmt: skip
+    else:
+        axes.bar(places, page.before[:, column], 1.5 * _BAR, color=svg.ACCENT)
+    axes.grid(visible=False, axis="x")
+    axes.yaxis.set_major_locator(MaxNLocator(4))

@@ -1,0 +1,404 @@
+"""What the report says: rows of ready text, made from a calibration."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import FloatArray
+from visioncal.present.recording.findings import read_stage
+from visioncal.present.recording.kinematics import Kinematics
+from visioncal.present.report.advice import Suspects, contradicts, outlying_views
+from visioncal.results import (
+    Calibration,
+    Edge,
+    NeedMet,
+    Rms,
+    SolverResult,
+    Verdict,
+    ViewResult,
+)
+from visioncal.results.compare import intrinsics_names
+from visioncal.vision.camera import intrinsics
+
+PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
+_DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
+
+_VIEW_COLUMNS = 3
+
+_MOUNTS = {
+    "eye-in-hand": "the camera rides on the robot",
+    "eye-to-hand": "the camera stands still and the robot carries the target",
+    "instrument": "a measuring instrument stands still and reads what the robot carries",
+}
+HEADLINES = {
+    "good": "Good: ready to use",
+    "check": "Check: usable once the points below are settled",
+    "bad": "Bad: do not use this result",
+}
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A labelled figure or phrase."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class EdgeCard:
+    """One estimated transform, as text.
+
+    Attributes:
+        name: Its name, such as `flange_from_cam`.
+        meaning: What it is, in words.
+        sigma_mm: Standard deviation of its translation [mm].
+        sigma_deg: Standard deviation of its rotation [deg]; empty where that was not measured.
+        rows: The components with their deviations and units.
+        matrix: The 4x4 matrix, to be copied.
+    """
+
+    name: str
+    meaning: str
+    sigma_mm: str
+    sigma_deg: str
+    rows: tuple[Fact, ...]
+    matrix: str
+
+
+@dataclass(frozen=True)
+class SolverRow:
+    """One solver: its residuals, and how far each of its edges is from the result's.
+
+    The solver that gave the result has no differences.
+    """
+
+    name: str
+    rms_mm: str
+    rms_deg: str
+    differences: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class ViewRow:
+    """One view, as text.
+
+    `mark` is `used`, `look` (used, but outlying), `left-out` (it contradicts the others) or
+    `rejected`.
+    """
+
+    number: int
+    mark: str
+    corners: str
+    px: str
+    mm: str
+    deg: str
+
+
+@dataclass(frozen=True)
+class ResidualRow:
+    """Root mean square residuals of one set of views, as text."""
+
+    label: str
+    mm: str
+    deg: str
+    px: str
+
+
+def headline(verdict: Verdict) -> str:
+    """The verdict in a few words."""
+    return HEADLINES[verdict.status]
+
+
+def readable_time(created: str) -> str:
+    """When something was computed, for people; it stands in ISO 8601."""
+    try:
+        time = datetime.fromisoformat(created)
+    except ValueError:
+        return created
+    return f"{time:%Y-%m-%d %H:%M %Z}".strip()
+
+
+def edge_cards(calibration: Calibration) -> tuple[EdgeCard, ...]:
+    """The estimated transforms, the wanted one first."""
+    return tuple(
+        edge_card(name, edge, oriented=edge.oriented) for name, edge in calibration.edges.items()
+    )
+
+
+def edge_card(name: str, edge: Edge, *, oriented: bool = True) -> EdgeCard:
+    """Writes a transform as text.
+
+    Args:
+        name: Its name, such as `flange_from_cam`.
+        edge: The transform.
+        oriented: Whether its rotation was measured; else it is the parent's own.
+    """
+    parent, _, child = name.partition("_from_")
+    rotation = edge.matrix[:3, :3]
+    # The perturbation is in the child's frame; the components are along the parent's axes.
+    covariance_m2 = rotation @ edge.covariance[3:, 3:] @ rotation.T
+    sigmas_mm = 1e3 * np.sqrt(np.clip(np.diag(covariance_m2), 0.0, None))
+    translation_mm = 1e3 * edge.transform.translation
+    rows = [
+        Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {_rounded(sigma)} mm")
+        for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
+    ]
+    if oriented:
+        rows += _rotation_facts(edge)
+    else:
+        rows.append(Fact("rotation", "not measured", f"taken as that of {frame_words(parent)}"))
+    return EdgeCard(
+        name,
+        f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}.",
+        _rounded(edge.sigma_mm),
+        _rounded(edge.sigma_deg) if oriented else "",
+        tuple(rows),
+        _matrix_text(edge.matrix),
+    )
+
+
+def _rotation_facts(edge: Edge) -> list[Fact]:
+    sigma_axis_deg = edge.sigma_deg / np.sqrt(3.0)
+    decimals = decimals_for(0.5 * np.deg2rad(sigma_axis_deg))
+    rotation = edge.transform.rotation
+    rotvec_deg = ", ".join(
+        matched(value, sigma_axis_deg) for value in rotation.as_rotvec(degrees=True)
+    )
+    quaternion = ", ".join(fixed(value, decimals) for value in rotation.as_quat())
+    return [
+        Fact("rotation vector", f"[{rotvec_deg}]", "deg"),
+        Fact("quaternion x, y, z, w", f"[{quaternion}]"),
+    ]
+
+
+def frame_words(frame: str) -> str:
+    """What a frame is the frame of."""
+    return {"cam": "the camera", "base": "the robot's base"}.get(frame, f"the {frame}")
+
+
+def _rounded(sigma: float) -> str:
+    return significant(sigma, 2)
+
+
+def _matrix_text(matrix: FloatArray) -> str:
+    rows = [", ".join(f"{value: .9f}" for value in row) for row in matrix]
+    return "[[" + "],\n [".join(rows) + "]]"
+
+
+def answering_solver(calibration: Calibration) -> str | None:
+    """The solver whose transforms are the result; None where none's are."""
+    for name, result in calibration.solvers.items():
+        if all(
+            edge in result.matrices and np.array_equal(result.matrices[edge], it.matrix)
+            for edge, it in calibration.edges.items()
+        ):
+            return name
+    return None
+
+
+def solver_rows(calibration: Calibration) -> tuple[SolverRow, ...]:
+    """The solvers, each with its distance from the result in position [mm] and angle [deg]."""
+    answer = answering_solver(calibration)
+    return tuple(
+        _solver_row(calibration, name, it, is_answer=name == answer)
+        for name, it in calibration.solvers.items()
+    )
+
+
+def _solver_row(
+    calibration: Calibration, name: str, result: SolverResult, *, is_answer: bool
+) -> SolverRow:
+    differences = []
+    for edge_name, edge in calibration.edges.items():
+        if is_answer or edge_name not in result.matrices:
+            differences.append((significant(None), significant(None)))
+            continue
+        mm, deg = pose_difference(edge.matrix, result.matrices[edge_name])
+        differences.append((significant(mm), significant(deg)))
+    label = f"{name} (result)" if is_answer else name
+    return SolverRow(
+        label, significant(result.rms_mm), significant(result.rms_deg), tuple(differences)
+    )
+
+
+def residual_rows(calibration: Calibration) -> tuple[ResidualRow, ...]:
+    """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
+    validation = calibration.validation
+    sets: list[tuple[str, Rms | None]] = [
+        ("used views, as fitted", calibration.rms),
+        (f"left out in turn ({validation.method})", validation.held_out),
+        ("declared hold-out views", validation.holdout),
+    ]
+    return tuple(
+        ResidualRow(label, significant(rms.mm), significant(rms.deg), significant(rms.px))
+        for label, rms in sets
+        if rms is not None
+    )
+
+
+def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
+    """The handful of figures that most readers come for."""
+    edge = next(iter(calibration.edges.values()))
+    sensor = "instrument" if calibration.mount == "instrument" else "camera"
+    used = sum(view.used for view in calibration.views)
+    facts = [
+        Fact(f"{sensor} position, sigma", f"{_rounded(edge.sigma_mm)} mm"),
+        Fact(f"{sensor} orientation, sigma", f"{_rounded(edge.sigma_deg)}\N{DEGREE SIGN}"),
+        Fact(
+            "held-out residual",
+            f"{significant(calibration.validation.held_out.mm)} mm",
+            ""
+            if calibration.validation.held_out.deg is None
+            else f"{significant(calibration.validation.held_out.deg)}\N{DEGREE SIGN}",
+        ),
+        Fact("views used", f"{used} of {len(calibration.views)}"),
+    ]
+    if calibration.rms.px is not None:
+        facts.insert(3, Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
+    arm = Kinematics.of(calibration)
+    if arm is not None and arm.workspace_mm is not None:
+        sigma = f"{significant(arm.workspace_mm[0])} mm"
+        facts.insert(2, Fact("all over the workspace, sigma", sigma))
+    return (*need_facts(calibration.need, calibration.verdict), *facts)
+
+
+def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
+    """What the task needs and how likely that is met, and what the result is good for."""
+    facts = []
+    if met is not None:
+        both = ((met.need.mm, " mm"), (met.need.deg, "\N{DEGREE SIGN}"))
+        asked = " and ".join(f"{value:g}{unit}" for value, unit in both if value is not None)
+        facts.append(Fact(f"picks within {asked}", percent(met.probability)))
+    if verdict.good_for_mm is not None:
+        facts.append(
+            Fact("good for tasks of", f"{significant(verdict.good_for_mm)} mm", "and more")
+        )
+    return tuple(facts)
+
+
+def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
+    """How the result was obtained."""
+    used = sum(view.used for view in calibration.views)
+    facts = [
+        Fact("mount", calibration.mount, _MOUNTS[calibration.mount]),
+        Fact("views", f"{used} used of {len(calibration.views)}"),
+    ]
+    answer = answering_solver(calibration)
+    if answer is not None:
+        note = (
+            "fit of both transforms, weighted by the noise"
+            if answer == "joint"
+            else "a closed form"
+        )
+        facts.append(Fact("solver", answer, note))
+    if calibration.robot is not None:
+        facts.append(Fact("robot model", str(calibration.robot.document.get("name", "given"))))
+    if calibration.camera is not None:
+        camera = calibration.camera.camera
+        width, height = camera.resolution
+        facts.append(Fact("camera", f"{camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"))
+    clock = read_stage(calibration, "clock", _clock_facts)
+    return (*facts, *_instrument_facts(calibration), *(clock or ()))
+
+
+def _clock_facts(clock: Mapping[str, Any]) -> tuple[Fact, ...]:
+    """How far the camera's clock is ahead of the robot's, and when an image's rows are taken."""
+    shutter = clock.get("shutter")
+    if shutter is None:
+        return (_clock_fact(clock),)
+    sigma_ms = 1e3 * float(shutter["readout_sigma_s"])
+    late = f"{matched(1e3 * float(shutter['readout_s']), sigma_ms)} ms"
+    note = f"{PLUS_MINUS} {significant(sigma_ms)}, from an image's first row to its last"
+    return _clock_fact(clock), Fact(f"{shutter['kind']} shutter", late, note)
+
+
+def _clock_fact(clock: Mapping[str, Any]) -> Fact:
+    ahead_ms, method = 1e3 * float(clock["camera_minus_robot_s"]), str(clock["method"])
+    if "sigma_s" not in clock:
+        return Fact("camera's clock", f"{ahead_ms:+.4g} ms", "taken so: views at rest")
+    sigma_ms = 1e3 * float(clock["sigma_s"])
+    note = f"{PLUS_MINUS} {significant(sigma_ms)}, ahead of the robot's, by {method}"
+    return Fact("camera's clock", f"{matched(ahead_ms, sigma_ms)} ms", note)
+
+
+def _instrument_facts(calibration: Calibration) -> tuple[Fact, ...]:
+    """What an instrument read, and where the points sit on the flange; empty without one."""
+    stated = read_stage(calibration, "instrument", lambda it: (str(it["words"]), str(it["reads"])))
+    points = read_stage(calibration, "points", lambda rows: [_point_fact(it) for it in rows])
+    if stated is None:
+        return ()
+    words, reads = stated
+    return (Fact("instrument", words, f"it read {reads}"), *(points or ()))
+
+
+def _point_fact(point: Mapping[str, Any]) -> Fact:
+    sigma_mm = float(point["sigma_mm"])
+    axis_mm = sigma_mm / np.sqrt(3.0)
+    place = ", ".join(matched(1e3 * float(point[name]), axis_mm) for name in ("x_m", "y_m", "z_m"))
+    note = f"{PLUS_MINUS} {significant(sigma_mm)}, on the flange"
+    return Fact(f"point {point['point']}", f"[{place}] mm", note)
+
+
+def lens_facts(calibration: Calibration) -> tuple[Fact, ...]:
+    """The intrinsics, each with its standard deviation where it was estimated."""
+    result = calibration.camera
+    if result is None:
+        return ()
+    values = intrinsics(result.camera)
+    names = intrinsics_names(result.camera)
+    units = ["px"] * len(result.camera.matrix) + [""] * len(result.camera.distortion)
+    if result.covariance is None or len(result.covariance) != len(values):
+        shown = [f"{value:.2f}" for value in result.camera.matrix]
+        shown += [f"{value:.5g}" for value in result.camera.distortion]
+        return tuple(Fact(*it) for it in zip(names, shown, units, strict=True))
+    sigmas = np.sqrt(np.clip(np.diag(result.covariance), 0.0, None))
+    return tuple(
+        Fact(name, matched(value, sigma), f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip())
+        for name, value, sigma, unit in zip(names, values, sigmas, units, strict=True)
+    )
+
+
+def lens_origin(calibration: Calibration) -> str:
+    """Where the intrinsics are from, in words."""
+    estimated = calibration.camera is not None and calibration.camera.estimated
+    return "estimated from this session" if estimated else "as given by the session"
+
+
+def view_columns(
+    views: Sequence[ViewResult], found: Sequence[Suspects]
+) -> tuple[tuple[ViewRow, ...], ...]:
+    """The views of the session in its order, split into columns that stand side by side."""
+    outlying = outlying_views(found)
+    rows = [_view_row(view, outlying) for view in views]
+    height = max(-(-len(rows) // _VIEW_COLUMNS), 1)
+    return tuple(tuple(rows[start : start + height]) for start in range(0, len(rows), height))
+
+
+def _view_row(view: ViewResult, outlying: Collection[int]) -> ViewRow:
+    return ViewRow(
+        view.view,
+        _mark(view, outlying),
+        significant(None) if view.corners is None else str(view.corners),
+        significant(view.rms_px),
+        significant(view.residual_mm),
+        significant(view.residual_deg),
+    )
+
+
+def _mark(view: ViewResult, outlying: Collection[int]) -> str:
+    if view.used:
+        return "look" if view.view in outlying else "used"
+    return "left-out" if contradicts(view) else "rejected"
+
+
+def dependency_versions() -> tuple[Fact, ...]:
+    """Versions of the libraries that compute the result, as installed here."""
+    return tuple(Fact(name, metadata.version(name)) for name in _DEPENDENCIES)

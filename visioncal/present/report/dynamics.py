@@ -1,0 +1,211 @@
+"""The report of a dynamic identification: one HTML file, as that of a calibration."""
+
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+
+from visioncal.core.files import write_atomically
+from visioncal.core.number_format import matched, significant
+from visioncal.core.types import FloatArray
+from visioncal.core.version import __version__
+from visioncal.dynamics import Identified, Prediction, Run, judge, stribeck_rows
+from visioncal.present.report import content, torqueplots
+from visioncal.present.report.content import Fact
+from visioncal.present.report.templating import template
+
+_UNITS = {
+    "m": "kg",
+    "I": "kg m\N{SUPERSCRIPT TWO}",
+    "Fc": "N m",
+    "Fv": "N m s/rad",
+    "offset": "N m",
+}
+_FIRST_MOMENT = "kg m"
+# So many of the fitted motions are shown: more look alike.
+_MOST_FITTED = 2
+
+
+@dataclass(frozen=True)
+class TorqueRow:
+    """How well the torques of a joint are predicted, as text."""
+
+    joint: str
+    torque: str
+    noise: str
+    fitted: str
+    unseen: str
+    share: str
+    consistent: str
+    known: str
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A base parameter, as text; `mark` is `sure`, `used` or `rejected`."""
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+    told: str
+    mark: str
+
+
+@dataclass(frozen=True)
+class LinkRow:
+    """A link as a body, as text: mass and centre, and the mass that was known before."""
+
+    joint: str
+    kg: str
+    known_kg: str
+    centre_mm: str
+
+
+def write_dynamics_report(path: Path, run: Run) -> None:
+    """Writes the report as one HTML file that needs no network and no script.
+
+    Args:
+        path: The file to write; it appears whole or not at all.
+        run: What to report.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    write_atomically(path, render_dynamics(run))
+
+
+def render_dynamics(run: Run) -> str:
+    """Renders the report as HTML text; see `write_dynamics_report`."""
+    identified = run.identified
+    source = identified.facts.get("session", {})
+    judged = judge(identified)
+    shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
+    shown += [(it, "fitted") for it in run.fitted[:_MOST_FITTED]]
+    return template("dynamics.html.j2").render(
+        robot=identified.robot.name,
+        session=source.get("name", ""),
+        sha256=source.get("sha256", ""),
+        created=content.readable_time(str(identified.facts.get("created", ""))),
+        judged=judged,
+        headline=content.HEADLINES[judged.status],
+        key_figures=tuple(_key_figures(identified)),
+        notes=tuple(note for it in identified.streams for note in it.notes),
+        torques=tuple(_torque_rows(identified)),
+        unseen="" if identified.validation is None else identified.validation.label,
+        parameters=tuple(_parameter_rows(identified)),
+        counts=_counts(identified),
+        links=tuple(_link_rows(identified)),
+        humps=tuple(_hump_facts(identified)),
+        plots=tuple(_plots(shown)),
+        friction_plot=torqueplots.friction(identified, run.predictions),
+        version=__version__,
+        python=platform.python_version(),
+        versions=content.dependency_versions(),
+    )
+
+
+def _plots(shown: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Markup]]:
+    """Torques over time, with a title each."""
+    for number, (prediction, how) in enumerate(shown, start=1):
+        yield f"{prediction.label}, {how}", torqueplots.torques(prediction, number)
+
+
+def _key_figures(identified: Identified) -> Iterator[Fact]:
+    base, found = identified.base, identified.validation
+    yield Fact("base parameters", str(base.rank), f"of {len(base.model.names)}")
+    told = identified.determined
+    yield Fact("told to 2 %", str(told.count("2 %")), f"to 10 %: {told.count('10 %')} more")
+    if found is not None:
+        worst = int(np.argmax(found.shares))
+        median = significant(100.0 * float(np.median(found.shares)))
+        high = significant(100.0 * float(found.shares[worst]))
+        yield Fact("error on unseen motion", f"{median} %", f"up to {high} % (joint {worst + 1})")
+    samples = sum(it.samples for it in identified.streams)
+    yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
+
+
+def _torque_rows(identified: Identified) -> Iterator[TorqueRow]:
+    (first, *_), found = identified.streams, identified.validation
+    nothing = "\N{EN DASH}"
+    for at, joint in enumerate(identified.robot.joint_names):
+        seen = (
+            (nothing, nothing, nothing, nothing)
+            if found is None
+            else (
+                significant(float(found.rms_nm[at])),
+                significant(100.0 * float(found.shares[at])),
+                _at(found.consistent_rms_nm, at),
+                _at(found.known_rms_nm, at),
+            )
+        )
+        yield TorqueRow(
+            joint,
+            significant(float(first.torque_nm[at])),
+            significant(float(first.noise_nm[at])),
+            significant(float(first.rms_nm[at])),
+            *seen,
+        )
+
+
+def _at(values: FloatArray | None, place: int) -> str:
+    return significant(None if values is None else float(values[place]))
+
+
+def _parameter_rows(identified: Identified) -> Iterator[ParameterRow]:
+    marks = {"2 %": "sure", "10 %": "used"}
+    base = identified.base
+    for name, own, value, sigma, told in zip(
+        base.names,
+        base.independent,
+        identified.values,
+        identified.sigmas,
+        identified.determined,
+        strict=True,
+    ):
+        yield ParameterRow(
+            name,
+            matched(float(value), float(sigma)),
+            significant(float(sigma)),
+            unit_of(base.model.names[own]),
+            told,
+            marks.get(told, "rejected"),
+        )
+
+
+def unit_of(name: str) -> str:
+    """The unit of a standard parameter."""
+    if "*" in name:
+        return _FIRST_MOMENT
+    return next(unit for start, unit in _UNITS.items() if name.startswith(start))
+
+
+def _counts(identified: Identified) -> str:
+    told = identified.determined
+    kinds = dict.fromkeys(("2 %", "10 %", *told))
+    return "; ".join(f"{it}: {told.count(it)}" for it in kinds)
+
+
+def _link_rows(identified: Identified) -> Iterator[LinkRow]:
+    if identified.inertias is None:
+        return
+    found, known = identified.inertias.masses, identified.robot.masses
+    for at, joint in enumerate(identified.robot.joint_names):
+        centre = ", ".join(f"{it:.1f}" for it in 1e3 * found.centres_m[at])
+        before = significant(None if known is None else float(known.kg[at]), 3)
+        yield LinkRow(joint, significant(float(found.kg[at]), 3), before, centre)
+
+
+def _hump_facts(identified: Identified) -> Iterator[Fact]:
+    for row in stribeck_rows(identified):
+        share, share_sigma = row["static_over_coulomb"], row["static_over_coulomb_sigma"]
+        speed, speed_sigma = 1e3 * row["speed_rad_s"], 1e3 * row["speed_sigma_rad_s"]
+        yield Fact(
+            identified.robot.joint_names[row["joint"] - 1],
+            f"{matched(share, share_sigma)} {content.PLUS_MINUS} {significant(share_sigma)} times",
+            f"fading over {matched(speed, speed_sigma)} {content.PLUS_MINUS} "
+            f"{significant(speed_sigma)} mrad/s",
+        )

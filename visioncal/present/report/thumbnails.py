@@ -1,0 +1,127 @@
+"""Small pictures of views with what was detected and predicted drawn over them."""
+
+import base64
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image
+from visioncal.results.evidence import ViewEvidence
+from visioncal.vision.finders.imaging import decode_image
+
+_WIDTH_PX = 720
+_JPEG_QUALITY = 78
+# A crop is this many times as large as the corners' extent, and a little of the image more.
+_ROOM, _LEAST_SHARE = 1.25, 0.05
+
+
+@dataclass(frozen=True)
+class Residual:
+    """One corner in image coordinates [px]: where it was seen, and the tip of its arrow."""
+
+    x: float
+    y: float
+    tip_x: float
+    tip_y: float
+
+
+@dataclass(frozen=True)
+class Thumbnail:
+    """A picture and its overlay, both in the full image's pixel coordinates.
+
+    Attributes:
+        view: The view's number.
+        caption: What to say below it.
+        jpeg_uri: The picture as a data URI.
+        left: Image x of the picture's left edge [px]; pixel centres are at integers.
+        top: Image y of its upper edge [px].
+        width: Its width [px].
+        height: Its height [px].
+        corners: (n, 2) detected corners [px].
+        residuals: Arrows from detected corners towards their predictions, magnified.
+    """
+
+    view: int
+    caption: str
+    jpeg_uri: str
+    left: float
+    top: float
+    width: float
+    height: float
+    corners: tuple[tuple[float, float], ...] = ()
+    residuals: tuple[Residual, ...] = ()
+
+    @property
+    def mark(self) -> float:
+        """Radius of a corner's circle [px]."""
+        return self.width / 130.0
+
+
+def thumbnail(
+    image_bytes: bytes, evidence: ViewEvidence | None, caption: str, view: int, magnify: int
+) -> Thumbnail | None:
+    """Draws one view, cropped to the target where corners were found.
+
+    Args:
+        image_bytes: The encoded image.
+        evidence: What was found in it, if anything.
+        caption: What to say below it.
+        view: The view's number.
+        magnify: How many times longer residuals are drawn than they are.
+
+    Returns:
+        The picture, or None where the bytes are no image that can be shown.
+    """
+    pixels = decode_image(image_bytes, colour=True)
+    return None if isinstance(pixels, str) else drawn(pixels, evidence, caption, view, magnify)
+
+
+def drawn(
+    pixels: Image, evidence: ViewEvidence | None, caption: str, view: int, magnify: int
+) -> Thumbnail:
+    """Draws one view on its (h, w, 3) pixels; see `thumbnail`."""
+    corners = None if evidence is None else evidence.corners
+    if evidence is None or corners is None or len(corners.px) == 0:
+        height, width = pixels.shape[:2]
+        return Thumbnail(view, caption, _jpeg_uri(pixels), -0.5, -0.5, width, height)
+    left, top, right, bottom = _around(corners.px, pixels.shape[1], pixels.shape[0])
+    return Thumbnail(
+        view,
+        caption,
+        _jpeg_uri(pixels[top:bottom, left:right]),
+        left - 0.5,
+        top - 0.5,
+        right - left,
+        bottom - top,
+        tuple((float(x), float(y)) for x, y in corners.px.round(2)),
+        _residuals(corners.px, evidence.predicted_px, magnify),
+    )
+
+
+def _residuals(
+    px: FloatArray, predicted_px: FloatArray | None, magnify: int
+) -> tuple[Residual, ...]:
+    if predicted_px is None:
+        return ()
+    tips = px + magnify * (predicted_px - px)
+    return tuple(
+        Residual(*(float(value) for value in row)) for row in np.hstack([px, tips]).round(2)
+    )
+
+
+def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of a crop around the corners, in the image's proportions [px]."""
+    low, high = px.min(axis=0), px.max(axis=0)
+    share = min(1.0, _ROOM * float(np.max((high - low) / (width, height))) + _LEAST_SHARE)
+    size = np.maximum(np.round(share * np.array([width, height])), 1.0)
+    start = np.clip(np.round(0.5 * (low + high - size)), 0.0, (width, height) - size)
+    left, top = (int(value) for value in start)
+    return left, top, left + int(size[0]), top + int(size[1])
+
+
+def _jpeg_uri(image: Image) -> str:
+    scale = min(1.0, _WIDTH_PX / image.shape[1])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")

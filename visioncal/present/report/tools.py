@@ -1,0 +1,131 @@
+"""What the report says of tools and fixtures."""
+
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from visioncal.core.number_format import significant
+from visioncal.present.recording.details import details
+from visioncal.present.report import bars, svg
+from visioncal.present.report.bars import Bar
+from visioncal.present.report.content import EdgeCard, Fact, edge_card, headline, readable_time
+from visioncal.results import Calibration, Frame, Observation
+
+_WIDTH_IN, _HEIGHT_IN = 5.0, 1.7
+_COLUMNS = 3
+# More characters than this below the bars run into each other, so their labels stand upright.
+_MOST_CHARACTERS, _LONGEST = 36, 12
+_MOST_LABELS = 24
+
+
+@dataclass(frozen=True)
+class ObservationRow:
+    """One touch, point or view, as text; `mark` is `used`, `look` or `left-out`."""
+
+    name: str
+    kind: str
+    mm: str
+    mark: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class FrameCard:
+    """A tool or a fixture.
+
+    Attributes:
+        pose: Its transform.
+        status: Of its verdict.
+        headline: The verdict in a few words.
+        reasons: Of the verdict.
+        facts: How it was obtained.
+        plot: What its observations are off; empty where that is not known.
+        suspects: The observations that something is wrong with.
+        columns: All observations, split into columns that stand side by side.
+        has_kinds: Whether the observations have kinds.
+    """
+
+    pose: EdgeCard
+    status: str
+    headline: str
+    reasons: tuple[str, ...]
+    facts: tuple[Fact, ...]
+    plot: Markup
+    suspects: tuple[ObservationRow, ...]
+    columns: tuple[tuple[ObservationRow, ...], ...]
+    has_kinds: bool
+
+
+def frame_cards(calibration: Calibration) -> tuple[FrameCard, ...]:
+    """The tools and fixtures of a calibration, in its order."""
+    return tuple(_card(name, frame) for name, frame in calibration.frames.items())
+
+
+def _card(name: str, frame: Frame) -> FrameCard:
+    rows = tuple(_row(it) for it in frame.observations)
+    height = max(-(-len(rows) // _COLUMNS), 1)
+    return FrameCard(
+        edge_card(name, frame.edge, oriented=frame.oriented),
+        frame.verdict.status,
+        headline(frame.verdict),
+        frame.verdict.reasons,
+        _facts(frame),
+        _plot(name, frame),
+        tuple(it for it in rows if it.mark != "used"),
+        tuple(rows[start : start + height] for start in range(0, len(rows), height)),
+        any(it.kind for it in rows),
+    )
+
+
+def _row(observation: Observation) -> ObservationRow:
+    doubtful = "look" if observation.reason else "used"
+    return ObservationRow(
+        observation.name,
+        observation.kind,
+        significant(observation.residual_mm),
+        doubtful if observation.used else "left-out",
+        observation.reason,
+    )
+
+
+def _facts(frame: Frame) -> tuple[Fact, ...]:
+    used = sum(it.used for it in frame.observations)
+    return (
+        Fact("method", frame.method),
+        Fact("source", frame.source),
+        Fact("created", readable_time(frame.created)),
+        Fact("observations", f"{used} used of {len(frame.observations)}"),
+        Fact("residual, rms", f"{significant(frame.rms_mm)} mm", "over those used"),
+        Fact("noise, per axis", f"{significant(frame.noise_mm)} mm"),
+        *(Fact(*it) for it in details(frame.details)),
+    )
+
+
+def _plot(name: str, frame: Frame) -> Markup:
+    """Bars of what each observation is off; the wrong ones in red."""
+    if all(it.residual_mm is None for it in frame.observations):
+        return Markup("")
+    labels = [_short(it.name) for it in frame.observations]
+    upright = sum(map(len, labels)) > _MOST_CHARACTERS
+    with svg.style():
+        figure = svg.new_figure(_WIDTH_IN, _HEIGHT_IN + (0.4 if upright else 0.0))
+        axes = figure.subplots()
+        shown = [
+            Bar(label, it.residual_mm, it.used, _colour(it))
+            for label, it in zip(labels, frame.observations, strict=True)
+        ]
+        bars.draw(axes, shown, frame.rms_mm, _MOST_LABELS)
+        axes.set_ylabel("off by [mm]")
+        if upright:
+            axes.tick_params(axis="x", rotation=90)
+        return svg.inline(figure, f"frame-{name}", f"Bars: what each observation of {name} is off")
+
+
+def _colour(observation: Observation) -> str:
+    if not observation.used:
+        return svg.BAD
+    return svg.CHECK if observation.reason else svg.ACCENT
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"

@@ -1,0 +1,116 @@
+"""Residuals over joint angles: what a hand-eye calibration cannot explain of the arm."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray
+from visioncal.present.recording.findings import target_frames
+from visioncal.present.report import svg
+from visioncal.results import Calibration
+from visioncal.results.evidence import ViewEvidence
+from visioncal.session import Session
+
+_AXES = (("x", svg.ACCENT), ("y", svg.CHECK), ("z", svg.GOOD))
+_WIDTH_IN, _ROW_IN = 9.2, 1.25
+# Few points beyond the scale do not flatten the cloud of the others.
+_ROOM, _KEPT_PERCENT = 1.3, 95.0
+# Half a point's width, in ranges of its joint.
+_DASH = 0.014
+
+
+def residuals_over_joints(
+    calibration: Calibration,
+    session: Session | None,
+    evidence: Sequence[ViewEvidence],
+    outlying: Collection[int] = (),
+) -> Markup:
+    """Residuals of the used views along the target's axes, one column a joint.
+
+    Args:
+        calibration: The result.
+        session: Where the joint angles are.
+        evidence: The views' poses.
+        outlying: Numbers of used views to leave out, which would hide the others.
+
+    Returns:
+        The figure; empty where there are no joint angles.
+    """
+    if session is None:
+        return Markup("")
+    joints_rad = {view.number: view.joints_rad for view in session.views}
+    shown = {it.view for it in calibration.views if it.used and it.view not in outlying}
+    frames = target_frames(calibration, session)
+    pairs = [
+        (joints, residual)
+        for it in evidence
+        if it.view in shown
+        and (joints := joints_rad.get(it.view)) is not None
+        and (residual := twist_of(calibration, it, frames.get(it.view))) is not None
+    ]
+    if len(pairs) < 3:
+        return Markup("")
+    joints_deg = np.rad2deg([joints for joints, _ in pairs])
+    twists = np.array([residual for _, residual in pairs])
+    return _figure(joints_deg, 1e3 * twists[:, 3:], np.rad2deg(twists[:, :3]))
+
+
+def twist_of(
+    calibration: Calibration, seen: ViewEvidence, frame: str | None = None
+) -> FloatArray | None:
+    """Where a view places its target against where the result does.
+
+    Args:
+        calibration: The result.
+        seen: The view's poses.
+        frame: The frame of the target that it shows; that of an only one where None.
+
+    Returns:
+        (6,) of (rotation [rad], translation [m]) in the target's frame; None without poses.
+    """
+    if seen.base_from_flange is None or seen.cam_from_target is None:
+        return None
+    # The camera's edge is the first, targets' follow.
+    x, *targets = calibration.edges
+    eye_in_hand = calibration.mount == "eye-in-hand"
+    z = next((it for it in targets if it.endswith(f"_from_{frame}")), targets[0])
+    robot = seen.base_from_flange if eye_in_hand else invert(seen.base_from_flange)
+    edges = calibration.edges
+    return log(invert(edges[z].matrix) @ robot @ edges[x].matrix @ seen.cam_from_target)
+
+
+def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -> Markup:
+    """Draws (m, n) joint angles against (m, 3) residuals of position and of orientation."""
+    count = joints_deg.shape[1]
+    with svg.style():
+        figure = svg.new_figure(_WIDTH_IN, 2 * _ROW_IN + 0.5)
+        grid = figure.subplots(2, count, sharex="col", sharey="row", squeeze=False)
+        for row, values, label in ((0, away_mm, "position [mm]"), (1, away_deg, "rotation [deg]")):
+            reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
+            for joint in range(count):
+                _cloud(grid[row, joint], joints_deg[:, joint], values, reach)
+            grid[row, 0].set_ylabel(label)
+        for joint in range(count):
+            grid[1, joint].set_xlabel(f"q{joint + 1} [deg]")
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper right", ncols=3)
+        return svg.inline(figure, "trends", "Residuals of the used views over each joint's angle")
+
+
+def _cloud(axes: Axes, joint_deg: FloatArray, values: FloatArray, reach: float) -> None:
+    """Draws each axis's points as the dashes of one path: a mark each would take ten times more."""
+    axes.axhline(0.0, color=svg.INK, linewidth=0.7)
+    half_deg = _DASH * max(float(np.ptp(joint_deg)), 1e-3)
+    gap = np.full(len(joint_deg), np.nan)
+    dashes_deg = np.stack([joint_deg - half_deg, joint_deg + half_deg, gap], axis=1).ravel()
+    for column, (name, colour) in enumerate(_AXES):
+        shown = np.clip(values[:, column], -reach, reach)
+        heights = np.stack([shown, shown, gap], axis=1).ravel()
+        axes.plot(dashes_deg, heights, color=colour, linewidth=2.8, label=f"target {name}")
+    axes.set_ylim(-1.1 * reach, 1.1 * reach)
+    axes.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(4))

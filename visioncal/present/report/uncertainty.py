@@ -1,0 +1,115 @@
+"""Where the uncertainty comes from, in words: sources, noise, board and arm."""
+
+from visioncal.core.number_format import decimals_for, matched, significant
+from visioncal.core.types import Target
+from visioncal.present.recording.findings import Arm, Board, Uncertainty
+from visioncal.present.report.content import PLUS_MINUS, Fact, answering_solver, frame_words
+from visioncal.results import Calibration
+
+_UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg"}
+# What would lower each source's part.
+_REMEDIES = {
+    "pixels": "sharper images, or a board that fills more of them, would lower it",
+    "instrument": "a nearer or a better instrument would lower it",
+    "robot": "more stops would lower it",
+    "poses": "more poses would lower it",
+    "intrinsics": "views with the board near the image's edges would lower it",
+    "board": "squares measured over the whole board would lower it",
+    "arm": "what of it looks the same in all views stays, and a calibrated arm's poses make up "
+    "for it",
+    "temperature": "more views while the arm warms up would lower it",
+    "priors": "measuring more exactly by hand would lower it",
+    "held_values": "stating lens and board better, or letting them move, would lower it",
+    "misfit": "a cell that has warmed up and settled would lower it",
+}
+
+
+def summary(calibration: Calibration, found: Uncertainty) -> tuple[str, ...]:
+    """Sentences: how well a point is placed where the views look, and what limits it."""
+    parent, _, sensor = next(iter(calibration.edges)).partition("_from_")
+    where = "the views look" if calibration.camera is not None else "it was measured"
+    sentences = [
+        f"A point where {where}, {significant(found.distance_m)} m from {frame_words(sensor)}, is "
+        f"placed in the frame of {frame_words(parent)} with a sigma of "
+        f"{significant(found.total_mm)} mm; 95 % of such results are right to within "
+        f"{significant(found.radius95_mm)} mm."
+    ]
+    if found.total_mm > 0.0:
+        largest = next(iter(found.parts_mm))
+        remedy = f"; {_REMEDIES[largest]}" if largest in _REMEDIES else ""
+        sentences.append(
+            f"The largest part, {found.percent(largest)} of the variance, comes from the "
+            f"{largest.replace('_', ' ')}{remedy}."
+        )
+    return tuple(sentences)
+
+
+def noise_facts(calibration: Calibration, found: Uncertainty | None) -> tuple[Fact, ...]:
+    """The noise's levels, with the intervals that they lie in with 95 % where these are known."""
+    intervals = {} if found is None else found.noise_95
+    return tuple(
+        _noise_fact(name, value, intervals.get(name)) for name, value in calibration.noise.items()
+    )
+
+
+def _noise_fact(name: str, value: float, interval: tuple[float, float] | None) -> Fact:
+    stem, unit = name, ""
+    for suffix, word in _UNITS.items():
+        if name.endswith(suffix):
+            stem, unit = name.removesuffix(suffix), word
+    note = ""
+    if interval is not None:
+        low, high = interval
+        note = f"95 %: {significant(low)} to {significant(high)}"
+    return Fact(stem.replace("_", " "), f"{significant(value)} {unit}".strip(), note)
+
+
+def board_facts(calibration: Calibration, board: Board, target: Target | None) -> tuple[Fact, ...]:
+    """The board's size and shape, stated and found; empty where nothing was looked for."""
+    if not board.sigma:
+        return ()
+    if answering_solver(calibration) not in (None, "joint"):
+        return (Fact("size and shape", "as stated", "a closed form takes them as they are"),)
+    facts = [] if target is None else list(_size_facts(board, target))
+    if board.is_bent:
+        facts.append(Fact("bend", f"{significant(board.bend_mm)} mm", "of depth over its corners"))
+    else:
+        facts.append(Fact("bend", "none", "flat within what is seen"))
+    return tuple(facts)
+
+
+def _size_facts(board: Board, target: Target) -> tuple[Fact, ...]:
+    sigma_mm = 1e3 * target.square_sigma_m
+    stated = Fact(
+        "squares, stated",
+        f"{matched(1e3 * target.square_m, sigma_mm)} mm",
+        f"{PLUS_MINUS} {significant(sigma_mm)}",
+    )
+    moved = {"scale", "aspect"} & set(board.estimated)
+    if not moved:
+        return (stated, Fact("squares, found", "as stated", "nothing speaks against it"))
+    known_mm = 1e3 * target.square_m * board.sigma.get("scale", target.square_sigma_m)
+    decimals = decimals_for(known_mm)
+    x_mm, y_mm = (f"{1e3 * it:.{decimals}f}" for it in board.squares_m(target))
+    note = f"{PLUS_MINUS} {significant(known_mm)}"
+    if "scale" in moved:
+        note += ", between what is stated and what the robot's motion measures"
+    found = f"{x_mm} \N{MULTIPLICATION SIGN} {y_mm} mm"
+    return (stated, Fact("squares, found", found, note))
+
+
+def arm_facts(arm: Arm) -> tuple[Fact, ...]:
+    """The size of the errors that follow the arm's posture."""
+    treated = (
+        ("estimated along with the result", "what looks the same in all views is left, see above")
+        if arm.estimated
+        else ("not taken out", "no joint angles with a known robot model: only their size is known")
+    )
+    return (
+        Fact(
+            "a link is typically off by",
+            f"{significant(arm.sigma_mm)} mm, {significant(arm.sigma_deg)} deg",
+        ),
+        Fact("likelihood ratio", f"{arm.likelihood_ratio:.0f}", "noise alone stays under 15"),
+        Fact("its errors were", *treated),
+    )

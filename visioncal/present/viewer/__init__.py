@@ -1,0 +1,7 @@
+"""The rerun viewer: the layout of a recording, and ways to open it."""
+
+from visioncal.present.viewer.layout import blueprint
+from visioncal.present.viewer.native import review_native
+from visioncal.present.viewer.web import review_web
+
+__all__ = ["blueprint", "review_native", "review_web"]

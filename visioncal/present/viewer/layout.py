@@ -1,0 +1,304 @@
+"""The layout in which the rerun viewer opens a recording."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from visioncal.core.types import FloatArray
+from visioncal.present.recording import paths
+from visioncal.present.recording.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
+from visioncal.present.recording.kinematics import Kinematics
+from visioncal.present.recording.thermal import Drift
+from visioncal.results import Calibration
+from visioncal.session import Session
+
+# Distance of the eye from the cell's centre, in extents of all that the cell holds.
+EYE_DISTANCE = 0.8
+# And in extents of the workspace, whose corners are empty.
+MAP_DISTANCE = 0.55
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """What a session has to show."""
+
+    images: bool
+    joints: int
+    unused: bool
+    frames: bool
+    turns: bool = True
+    sight: bool = True
+
+
+def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
+    """Lays out a recording of a session and its result.
+
+    The first tab shows the verdict, the cell and the image; others the calibrated arm, the
+    residuals, what the views cover, and the solvers.
+
+    Args:
+        session: The session; what it does not have gets no room.
+        calibration: Its result, by which the eye finds camera and target too.
+
+    Returns:
+        The layout, to be written into the recording.
+    """
+    joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
+    results = () if calibration is None else calibration.views
+    contents = _Contents(
+        any(view.image or view.has_corners for view in session.views),
+        min(joints, default=0),
+        not all(view.used for view in results),
+        calibration is not None and bool(calibration.frames),
+        not results or any(view.residual_deg is not None for view in results),
+        session.mount != "instrument",
+    )
+    eye = _eye(session, calibration)
+    arm = None if calibration is None else Kinematics.of(calibration)
+    tabs = rrb.Tabs(
+        _overview(contents, eye),
+        *([] if arm is None or not arm.is_calibrated else [_arm(arm, eye)]),
+        *([] if calibration is None or Drift.of(calibration) is None else [_warming()]),
+        *([_explained()] if calibration is not None and "dense" in calibration.stages else []),
+        _residuals(contents),
+        _coverage(contents),
+        rrb.Horizontal(
+            rrb.TextDocumentView(name="Residuals, noise and uncertainty", origin=paths.FIGURES),
+            rrb.TextDocumentView(name="Solvers", origin=paths.SOLVERS),
+            name="Figures",
+            column_shares=[2, 3],
+        ),
+        active_tab=0,
+    )
+    return rrb.Blueprint(
+        tabs,
+        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.TIMELINE, play_state="paused"),
+        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
+        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+    )
+
+
+def _overview(contents: _Contents, eye: rrb.EyeControls3D | None) -> rrb.Container:
+    cell = rrb.Spatial3DView(
+        name="Cell",
+        origin="/",
+        contents=_cell_contents(contents),
+        eye_controls=eye,
+        spatial_information=rrb.SpatialInformation(
+            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        ),
+    )
+    plots = _plots(contents)
+    left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
+    verdict = _verdict(contents)
+    note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
+    if not contents.images:
+        right = rrb.Vertical(verdict, note, row_shares=[2, 1])
+        return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
+    image = rrb.Spatial2DView(
+        name="Image: green detected, blue predicted, red residual",
+        origin=paths.IMAGE,
+        contents=["$origin/**"],
+    )
+    right = rrb.Vertical(verdict, image, note, row_shares=[3.2, 4.4, 1.6])
+    return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
+
+
+def _explained() -> rrb.Container:
+    """The image, the board as it should look in it, and what is left."""
+    images = rrb.Horizontal(
+        *(
+            rrb.Spatial2DView(name=name, origin=entity, contents=["$origin"])
+            for name, entity in (
+                ("Image", paths.IMAGE),
+                ("As calibration, blur and light have it", paths.DRAWN),
+                ("Not explained", paths.REST),
+            )
+        )
+    )
+    note = rrb.TextDocumentView(name="What blurs it", origin=paths.BLUR_NOTE)
+    return rrb.Vertical(images, note, name="Images explained", row_shares=[4, 1])
+
+
+def _warming() -> rrb.Container:
+    """How the arm drifted, view by view, and how much warmer its warmest link was."""
+    return rrb.Vertical(
+        rrb.TimeSeriesView(name="Drift of the flange [mm]", origin=paths.DRIFT_MM),
+        rrb.TimeSeriesView(name="Rise of the warmest link [K]", origin=paths.RISE_K),
+        name="Temperature",
+    )
+
+
+def _arm(found: Kinematics, eye: rrb.EyeControls3D | None) -> rrb.Container:
+    """What the calibrated arm is worth, how views left out speak for it, and its parameters."""
+    # The places are all around the base, farther out than the views.
+    wider = eye if found.workspace is None else eye_on(found.workspace.places_m, MAP_DISTANCE)
+    cell = rrb.Spatial3DView(
+        name="Sigma of a tool's place over the workspace",
+        origin="/",
+        contents=[
+            f"+ {paths.BASE}/**",
+            f"+ {paths.ROBOT}/**",
+            f"+ {paths.STOPS}/{paths.USED}",
+            f"+ {paths.WORKSPACE}/**",
+            f"+ {paths.NOMINAL_ARM}/**",
+        ],
+        eye_controls=wider,
+        spatial_information=rrb.SpatialInformation(
+            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        ),
+    )
+    note = rrb.TextDocumentView(name="The arm", origin=paths.ARM_NOTE)
+    if not found.left_out:
+        return rrb.Horizontal(cell, note, name="Arm", column_shares=[1.4, 1])
+    # What else there is to say stands in the note; a title has little room.
+    words = "orange: as stated, blue: calibrated"
+    unseen = rrb.Horizontal(
+        *(
+            rrb.TimeSeriesView(
+                name=name,
+                origin=entity,
+                contents=["$origin/**"],
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for name, entity in (
+                (f"Left out [mm], {words}", paths.UNSEEN_MM),
+                *(
+                    [(f"Left out [deg], {words}", paths.UNSEEN_DEG)]
+                    if found.nominal.held_out_deg is not None
+                    else []
+                ),
+            )
+        )
+    )
+    left = rrb.Vertical(cell, unseen, row_shares=[2.4, 1])
+    return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
+
+
+def _verdict(contents: _Contents) -> rrb.Container | rrb.View:
+    """The verdict, and what is said of tools and fixtures behind it."""
+    verdict = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    if not contents.frames:
+        return verdict
+    tools = rrb.TextDocumentView(name="Tools and fixtures", origin=paths.TOOLS)
+    return rrb.Tabs(verdict, tools, active_tab=0)
+
+
+def _residuals(contents: _Contents) -> rrb.Container:
+    over_views = rrb.Horizontal(*_plots(contents))
+    if contents.joints == 0:
+        return rrb.Vertical(over_views, name="Residuals")
+    over_joints = rrb.Grid(
+        *(
+            rrb.BarChartView(
+                name=f"Position residual [mm] over q{joint + 1} [deg]",
+                origin=paths.over_joint(joint),
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for joint in range(contents.joints)
+        ),
+        grid_columns=min(contents.joints, 4) if contents.joints != 6 else 3,
+    )
+    return rrb.Vertical(over_views, over_joints, name="Residuals", row_shares=[1, 2])
+
+
+def _coverage(contents: _Contents) -> rrb.Container:
+    directions, axes = disc_views()
+    if not contents.sight:
+        return rrb.Horizontal(axes, name="Coverage")
+    if not contents.images:
+        return rrb.Horizontal(directions, axes, name="Coverage")
+    image = rrb.Spatial2DView(
+        name="Corners of all views in the image",
+        origin=paths.IMAGE_COVERAGE,
+        contents=["$origin/**"],
+    )
+    return rrb.Horizontal(
+        image, rrb.Vertical(directions, axes), name="Coverage", column_shares=[1.6, 1]
+    )
+
+
+def disc_views() -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
+    """The charts of where the camera looks from, and of the axes of rotation."""
+    directions = _disc(
+        "Where the camera looks from, about the target's normal",
+        paths.DIRECTIONS,
+        DIRECTIONS_RINGS_DEG,
+    )
+    axes = _disc(
+        "Axes of rotation from view to view, about the flange's z",
+        paths.ROTATION_AXES,
+        AXES_RINGS_DEG,
+    )
+    return directions, axes
+
+
+def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DView:
+    """A chart of directions, with room for the words around its rim."""
+    reach_deg = 1.2 * rings_deg[-1]
+    bounds = rrb.VisualBounds2D(x_range=(-reach_deg, reach_deg), y_range=(-reach_deg, reach_deg))
+    return rrb.Spatial2DView(
+        name=f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})",
+        origin=entity,
+        contents=["$origin/**"],
+        visual_bounds=bounds,
+    )
+
+
+def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
+    """Looks at the cell from the side, from where all of it fills the view."""
+    poses = [pose for view in session.views if (pose := view.base_from_flange()) is not None]
+    if not poses:
+        return None
+    edges = {} if calibration is None else calibration.transforms
+    fixed = [edge.translation for name, edge in edges.items() if name.startswith("base_from_")]
+    return eye_on(np.array([np.zeros(3), *(pose.translation for pose in poses), *fixed]))
+
+
+def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControls3D:
+    """Looks at (k, 3) places from where all of them fill the view [m]."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    forward = centre[:2] / max(float(np.linalg.norm(centre[:2])), 1e-9)
+    # From the robot's right and its front, above the table.
+    direction = np.array([forward[1] + 0.6 * forward[0], 0.6 * forward[1] - forward[0], 0.6])
+    return rrb.EyeControls3D(position=centre + distance * size_m * direction, look_target=centre)
+
+
+def _cell_contents(contents: _Contents) -> list[str]:
+    entities = [
+        paths.BASE,
+        paths.ROBOT,
+        paths.FLANGE,
+        paths.STOPS,
+        paths.CAMERA,
+        paths.TARGET,
+        paths.TARGETS,
+        paths.FRAMES,
+        paths.SEEN_TARGET,
+    ]
+    # The image's overlays would float as a crowd of points in the frustum.
+    hidden = [f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"] if contents.images else []
+    return [*(f"+ {entity}/**" for entity in entities), *hidden]
+
+
+def _plots(contents: _Contents) -> list[rrb.TimeSeriesView]:
+    wanted = [
+        ("Position residual [mm]", paths.POSITION_MM),
+        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.turns else []),
+    ]
+    if contents.images:
+        wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
+    # A legend would hide the marks at the top and at the bottom, of just these views.
+    legend = "; red: not used, \N{BLACK UP-POINTING TRIANGLE} off scale" if contents.unused else ""
+    return [
+        rrb.TimeSeriesView(
+            name=f"{name}{legend}",
+            origin=entity,
+            contents=["$origin/**"],
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        for name, entity in wanted
+    ]

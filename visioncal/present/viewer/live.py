@@ -1,0 +1,104 @@
+"""A viewer that is fed while a session is recorded."""
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from visioncal.core.errors import DriverError
+from visioncal.present.recording import paths
+from visioncal.present.viewer.process import viewer_process
+
+_HOST = "127.0.0.1"
+# A viewer that does not listen by then is not coming [s].
+_PATIENCE_S, _POLL_S, _WINDOW_S = 10.0, 0.1, 1.0
+# What was drawn last is on its way for so long at most [s].
+_FLUSH_S = 2.0
+
+
+@contextmanager
+def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
+    """Opens a viewer; leaving the block closes it.
+
+    Args:
+        name: What to call the recording.
+
+    Yields:
+        The stream that it shows.
+
+    Raises:
+        DriverError: It cannot be shown here.
+    """
+    with socket.socket() as free:
+        free.bind((_HOST, 0))
+        port = free.getsockname()[1]
+    with viewer_process("--bind", _HOST, "--port", str(port)) as process:
+        until = time.monotonic() + _PATIENCE_S
+        while process.poll() is None and time.monotonic() < until and not _listens(port):
+            time.sleep(_POLL_S)
+        # It listens before it opens its window, and ends where it cannot.
+        time.sleep(_WINDOW_S)
+        if process.poll() is not None or not _listens(port):
+            raise DriverError(
+                "rerun's viewer cannot be shown here; is there a display?",
+                next_step="Record without --view.",
+            )
+        stream = rr.RecordingStream(paths.APPLICATION)
+        stream.connect_grpc(f"rerun+http://{_HOST}:{port}/proxy")
+        stream.send_recording_name(name)
+        stream.send_blueprint(live_blueprint(), make_active=True, make_default=True)
+        try:
+            yield stream
+        finally:
+            if process.poll() is None:
+                stream.flush(timeout_sec=_FLUSH_S)
+            stream.disconnect()
+
+
+def live_blueprint() -> rrb.Blueprint:
+    """The layout of a recording at work: image and cell, coverage and predicted sigma."""
+    image = rrb.Spatial2DView(name="This view", origin=paths.IMAGE, contents=["$origin/**"])
+    cell = rrb.Spatial3DView(
+        name="Cell: views so far in blue",
+        origin="/",
+        contents=[
+            *(
+                f"+ {it}/**"
+                for it in (
+                    paths.BASE,
+                    paths.ROBOT,
+                    paths.FLANGE,
+                    paths.CAMERA,
+                    paths.TARGET,
+                    paths.STOPS,
+                )
+            ),
+            f"- {paths.DETECTED}/**",
+        ],
+        spatial_information=rrb.SpatialInformation(
+            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        ),
+    )
+    covered = rrb.Spatial2DView(
+        name="What corners have reached", origin=paths.IMAGE_COVERAGE, contents=["$origin/**"]
+    )
+    sigma = rrb.TimeSeriesView(name="Predicted sigma [mm]", origin=paths.LIVE_SIGMA)
+    note = rrb.TextDocumentView(name="This view", origin=paths.LIVE_NOTE)
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(image, cell, row_shares=[1, 1]),
+            rrb.Vertical(covered, sigma, note, row_shares=[2, 1, 1]),
+            column_shares=[1.6, 1],
+        ),
+        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
+        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+    )
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(_POLL_S)
+        return probe.connect_ex((_HOST, port)) == 0

@@ -1,0 +1,101 @@
+"""The layout in which the rerun viewer opens the preview of a plan."""
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from visioncal.core.types import FloatArray
+from visioncal.present.recording import paths
+from visioncal.present.recording.preview import Preview
+from visioncal.present.viewer.layout import EYE_DISTANCE, MAP_DISTANCE, disc_views, eye_on
+
+
+def plan_blueprint(preview: Preview) -> rrb.Blueprint:
+    """Lays out the preview of a plan.
+
+    Args:
+        preview: What it shows.
+
+    Returns:
+        The layout, to be written into the recording.
+    """
+    flange = preview.base_from_flange
+    placed = [pose for it in flange for pose in preview.placed(it)]
+    places = np.array([np.zeros(3), *flange[:, :3, 3], *(it[:3, 3] for it in placed)])
+    tabs = [_overview(places), _coverage()]
+    if len(preview.places_m):
+        tabs.insert(1, _workspace(preview))
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=0),
+        rrb.TimePanel(state=rrb.PanelState.Collapsed, timeline=paths.TIMELINE, play_state="paused"),
+        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
+        rrb.BlueprintPanel(state=rrb.PanelState.Collapsed),
+    )
+
+
+def _cell(
+    name: str, places: FloatArray, *more: str, distance: float = EYE_DISTANCE
+) -> rrb.Spatial3DView:
+    entities = (
+        paths.BASE,
+        paths.ROBOT,
+        paths.FLANGE,
+        paths.CAMERA,
+        paths.TARGET,
+        paths.OBSTACLES,
+        *more,
+    )
+    return rrb.Spatial3DView(
+        name=name,
+        origin="/",
+        # The predicted corners would float as a crowd of points in the frustum.
+        contents=[
+            *(f"+ {it}/**" for it in entities),
+            f"- {paths.IMAGE}/**",
+            f"+ {paths.IMAGE}",
+        ],
+        eye_controls=eye_on(places, distance),
+        spatial_information=rrb.SpatialInformation(
+            paths.BASE_FRAME, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        ),
+    )
+
+
+def _overview(places: FloatArray) -> rrb.Container:
+    note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
+    stop = rrb.TextDocumentView(name="This stop", origin=paths.STOP_NOTE)
+    image = rrb.Spatial2DView(
+        name="The board in the image, as predicted", origin=paths.IMAGE, contents=["$origin/**"]
+    )
+    cell = _cell("Cell: stops in blue, way in orange", places, paths.STOPS, paths.WAY)
+    right = rrb.Vertical(note, image, stop, row_shares=[3.4, 3.6, 1.6])
+    return rrb.Horizontal(cell, right, name="Plan", column_shares=[1.5, 1])
+
+
+def _workspace(preview: Preview) -> rrb.Container:
+    cell = _cell(
+        "Predicted sigma of a tool's place",
+        preview.places_m,
+        paths.WORKSPACE,
+        distance=MAP_DISTANCE,
+    )
+    return rrb.Horizontal(cell, name="Workspace")
+
+
+def _coverage() -> rrb.Container:
+    image = rrb.Spatial2DView(
+        name="Corners of all stops in the image",
+        origin=paths.IMAGE_COVERAGE,
+        contents=["$origin/**"],
+    )
+    sigma = rrb.BarChartView(
+        name="Predicted sigma [mm] after so many stops, the most telling first",
+        origin=paths.PREDICTED_SIGMA,
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+    return rrb.Horizontal(
+        rrb.Vertical(image, sigma, row_shares=[2, 1]),
+        rrb.Vertical(*disc_views()),
+        name="Coverage",
+        column_shares=[1.6, 1],
+    )

@@ -1,0 +1,177 @@
+"""A recording in a browser, from a server that only this machine reaches.
+
+Rerun's own server listens to the whole network and its page asks servers outside for fonts and
+news. This one answers for a handful of names with a page that may load nothing from elsewhere.
+"""
+
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes
+from visioncal.present.viewer.assets import MODULE, SCRIPT, viewer_assets
+from visioncal.present.viewer.process import until_interrupted
+
+_HOST = "127.0.0.1"
+_PAGE, _STYLE, _STARTER, _RECORDING = "review.html", "review.css", "review.js", "recording.rrd"
+_JAVASCRIPT = "text/javascript; charset=utf-8"
+
+_HEADERS = {
+    "Content-Security-Policy": "; ".join(
+        (
+            "default-src 'none'",
+            "script-src 'self' 'wasm-unsafe-eval'",
+            f"connect-src 'self' http://{_HOST}:*",
+            # The viewer styles its canvas itself, and shows pictures that it has made.
+            "style-src 'self' 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "base-uri 'none'",
+            "form-action 'none'",
+            "frame-ancestors 'none'",
+        )
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    # Another recording may be shown at the same address later.
+    "Cache-Control": "no-store",
+}
+
+
+@dataclass(frozen=True)
+class _Route:
+    """What is handed out under one name.
+
+    Attributes:
+        media_type: Its type.
+        source: The bytes, or the file that is read anew for each request.
+    """
+
+    media_type: str
+    source: bytes | Path
+
+    def open(self) -> tuple[BinaryIO, int]:
+        """Opens the content: (stream, length in bytes)."""
+        if isinstance(self.source, bytes):
+            return BytesIO(self.source), len(self.source)
+        file = self.source.open("rb")
+        return file, self.source.stat().st_size
+
+
+def review_web(recording: Path, port: int, opened: Callable[[str], None]) -> None:
+    """Serves a recording with the viewer to this machine, until Ctrl-C or SIGTERM comes.
+
+    Args:
+        recording: The `.rrd`.
+        port: Where to listen; 0 for any free port.
+        opened: Called with the page's URL once it can be visited.
+
+    Raises:
+        DataError: The port cannot be had.
+        DriverError: Rerun's command does not hand out its web viewer.
+    """
+    with until_interrupted(), _server(_routes(recording), port) as server:
+        opened(f"http://{_HOST}:{server.server_port}/")
+        server.serve_forever()
+
+
+def _routes(recording: Path) -> dict[str, _Route]:
+    """All that can be asked for; no path is ever made of a request."""
+    own = {name: read_bytes(Path(__file__).with_name(name)) for name in (_PAGE, _STYLE, _STARTER)}
+    assets = viewer_assets()
+    return {
+        "/": _Route("text/html; charset=utf-8", own[_PAGE]),
+        f"/{_STYLE}": _Route("text/css; charset=utf-8", own[_STYLE]),
+        f"/{_STARTER}": _Route(_JAVASCRIPT, own[_STARTER]),
+        f"/{SCRIPT}": _Route(_JAVASCRIPT, assets[SCRIPT]),
+        f"/{MODULE}": _Route("application/wasm", assets[MODULE]),
+        f"/{_RECORDING}": _Route("application/octet-stream", recording),
+    }
+
+
+def _server(routes: Mapping[str, _Route], port: int) -> ThreadingHTTPServer:
+    try:
+        # A browser keeps connections in reserve; a thread for each keeps them apart.
+        return _Server((_HOST, port), partial(_Handler, routes))
+    except OSError as error:
+        raise DataError(
+            f"port {port} of {_HOST} cannot be used: {error.strerror or error}.",
+            next_step="Choose another --port; 0 takes one that is free.",
+        ) from error
+
+
+class _Server(ThreadingHTTPServer):
+    """A server that takes it calmly when a page is closed while it is sent."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - its interface
+        """Reports what went wrong with a request; that a connection ended is nothing wrong."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers one request out of the routes."""
+
+    server_version = "visioncal"
+    sys_version = ""
+
+    def __init__(self, routes: Mapping[str, _Route], *arguments: object) -> None:
+        self._routes = routes
+        super().__init__(*arguments)  # type: ignore[arg-type]
+
+    def do_GET(self) -> None:
+        """Sends the content of a route."""
+        self._answer(with_content=True)
+
+    def do_HEAD(self) -> None:
+        """Sends what `do_GET` would, without the content."""
+        self._answer(with_content=False)
+
+    def _answer(self, *, with_content: bool) -> None:
+        if not self._asked_for_here():
+            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+            return
+        route = self._routes.get(self.path)
+        if route is None:
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        try:
+            stream, length = route.open()
+        except OSError:
+            self.send_error(HTTPStatus.GONE)
+            return
+        with stream:
+            self.send_response(HTTPStatus.OK)
+            self.send_header("Content-Type", route.media_type)
+            self.send_header("Content-Length", str(length))
+            self.end_headers()
+            if with_content:
+                shutil.copyfileobj(stream, self.wfile)
+
+    def _asked_for_here(self) -> bool:
+        """Whether the page's own address was asked for.
+
+        Another name that leads here is how a foreign page would read this server through the
+        browser (DNS rebinding).
+        """
+        port = self.connection.getsockname()[1]
+        return self.headers.get("Host", "") in (f"{_HOST}:{port}", f"localhost:{port}")
+
+    def end_headers(self) -> None:
+        """Adds the headers that all answers carry."""
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
+
+    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
+        """Keeps the terminal quiet."""

@@ -1,0 +1,355 @@
+"""The result of aligning a whole cell: every frame of it, with respect to every other."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.core.documents import parse_stored
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, read_bytes, write_atomically
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
+from visioncal.core.version import __version__
+from visioncal.estimation.tree import Branch, Step, Tree
+from visioncal.results.edge import Edge, edge_document, read_covariance, read_edge
+from visioncal.results.forms import CAMERA, MOVED, SCHEMA, UNTIED, VERDICT, VIEW, Form, check
+from visioncal.results.frame import Frame, present
+from visioncal.results.lens import camera_document, read_camera
+from visioncal.results.parts import CameraResult, NeedMet, RobotResult, Verdict
+from visioncal.results.verdicts import (
+    need_document,
+    read_need,
+    read_verdict,
+    verdict_document,
+)
+
+FILE = "alignment.json"
+_FORM: Form = {
+    "created": str,
+    "session": {"name": str, "sha256": str},
+    "reference": str,
+    "frames": {"": str},
+    "robots": {"": str},
+    "transforms": {"": {}},
+    "cameras": {"": CAMERA},
+    "noise": {"": {"": float}},
+    "observations": [{"stop": int, "seer": str, "seen": str, **VIEW}],
+    "moved": [MOVED],
+    "untied": [UNTIED],
+    "weakest": str,
+    "verdict": VERDICT,
+    "details": {},
+}
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What became of one observation. A figure that could not be computed is None.
+
+    Attributes:
+        view: The number of its row.
+        stop: Its stop, or the view's number where the session has none.
+        seer: The frame of the camera or instrument.
+        seen: The frame of the target or point.
+        used: Whether the fit used it.
+        reason: Why it was not used, in words; empty for a used one.
+        residual_mm: How far it is from what the rest of the cell predicts [mm].
+        residual_deg: The same in rotation [deg]; None where a place alone was read.
+        corners: How many corners were found in its image.
+        rms_px: Reprojection error through the whole chain of frames [px].
+        left_out_mm: How far it is from what a fit predicts that was made without its stop [mm].
+        left_out_deg: The same in rotation [deg].
+        left_out_px: Reprojection error by such a fit [px].
+    """
+
+    view: int
+    stop: int
+    seer: str
+    seen: str
+    used: bool
+    reason: str = ""
+    residual_mm: float | None = None
+    residual_deg: float | None = None
+    corners: int | None = None
+    rms_px: float | None = None
+    left_out_mm: float | None = None
+    left_out_deg: float | None = None
+    left_out_px: float | None = None
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A frame that moved while the session was taken.
+
+    Attributes:
+        frame: The frame; its transform in the result is where it stood last.
+        before: Its name in the result until then.
+        last_stop: The last stop at which it was seen where it stood before.
+        first_stop: The first stop at which it stands elsewhere.
+        shift_mm: How far its origin moved [mm].
+        turn_deg: How far it turned [deg].
+        rivals: Frames that may have moved in its place: the session cannot tell.
+    """
+
+    frame: str
+    before: str
+    last_stop: int
+    first_stop: int
+    shift_mm: float
+    turn_deg: float
+    rivals: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Untied:
+    """A frame that nothing ties to the rest, and what would, in a sentence."""
+
+    frame: str
+    remedy: str
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A whole cell in one frame; `save` writes it as alignment.json.
+
+    Attributes:
+        session_name: The session's name.
+        session_sha256: Digest of the session's canonical content.
+        created: When, in ISO 8601.
+        reference: The frame that stands for the cell: the cell's frame is its.
+        frames: What each frame hangs on, by its name.
+        robots: The robot of each flange, by the flange's frame.
+        edges: The estimated transforms by name, as `cell_from_base_b`, in the order of
+            `joint_covariance`.
+        joint_covariance: (6 k, 6 k) covariance of all of them together, in that order.
+        cameras: The cameras by their frames.
+        noise: Estimated standard deviations, by frame or robot and by name.
+        sights: One entry for each observation.
+        moved: What moved while the session was taken.
+        untied: Frames that nothing ties to the rest.
+        weakest: The weakest link, in words.
+        verdict: Whether to trust it.
+        details: Further figures, as they stand on disk.
+        arms: The robots by name; one that has no name goes by `robot`.
+        targets: What was printed, by name as it is described.
+        placed: Tools and fixtures by the transform that places them, as `flange_a_from_tool`.
+        stages: Further sections of calibration.json by name: `boards`, `rigs`, `joint_fit`,
+            `uncertainty`.
+        left_out: How observations were left out of fits in turn, in words; empty where none was.
+        need: What the task needs, and how likely picks meet it; None where that is not said.
+    """
+
+    session_name: str
+    session_sha256: str
+    created: str
+    reference: str
+    frames: Mapping[str, str]
+    robots: Mapping[str, str]
+    edges: Mapping[str, Edge]
+    joint_covariance: FloatArray
+    cameras: Mapping[str, CameraResult]
+    noise: Mapping[str, Mapping[str, float]]
+    sights: tuple[Sight, ...]
+    moved: tuple[Moved, ...]
+    untied: tuple[Untied, ...]
+    weakest: str
+    verdict: Verdict
+    details: Mapping[str, Any] = field(default_factory=dict)
+    arms: Mapping[str, RobotResult] = field(default_factory=dict)
+    targets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    placed: Mapping[str, Frame] = field(default_factory=dict)
+    stages: Mapping[str, Any] = field(default_factory=dict)
+    left_out: str = ""
+    need: NeedMet | None = None
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """The estimated transforms by name."""
+        return {name: edge.transform for name, edge in self.edges.items()}
+
+    def edge_of(self, frame: str) -> Edge:
+        """How a frame hangs on its parent; the reference, exactly in the cell's place."""
+        if frame == self.reference:
+            return Edge(np.eye(4), np.zeros((6, 6)))
+        return self.edges[f"{self.frames[frame]}_from_{frame}"]
+
+    def between(
+        self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
+    ) -> Edge:
+        """Places any frame in any other, with the covariance that the whole cell gives it.
+
+        Args:
+            first: The one.
+            second: The other.
+            poses: (4, 4) `base_from_flange` by robot, where the two move before each other by it;
+                they count as exact.
+
+        Returns:
+            `first_from_second`.
+
+        Raises:
+            DataError: There is no such frame, or a robot's pose is needed.
+        """
+        matrix, slope = self.way(first, second, poses)
+        return Edge(matrix, slope @ self.joint_covariance @ slope.T)
+
+    def way(
+        self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """The transform of `between`, (4, 4), and (6, 6 k) how it moves with all edges."""
+        tree, poses = self._tree, poses or {}
+        for frame in (first, second):
+            if frame != tree.root and frame not in tree.branches:
+                known = [tree.root, *tree.branches]
+                raise DataError(
+                    f"no frame {frame!r}: this alignment has {', '.join(known)}.",
+                    culprits=[frame],
+                    next_step=did_you_mean(frame, known),
+                )
+        way, places = tree.path(first, second), {it: at for at, it in enumerate(self.edges)}
+        rest, slope = np.eye(4), np.zeros((6, 6 * len(places)))
+        for step in reversed(way):
+            edge = self._matrix(step, poses)
+            before = invert(edge) @ rest if step.is_up else edge @ rest
+            moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+            at = places.get(f"{self.frames[step.frame]}_from_{step.frame}")
+            if at is not None:
+                slope[:, 6 * at : 6 * at + 6] += moved
+            rest = before
+        return rest, slope
+
+    @property
+    def _tree(self) -> Tree:
+        return Tree(
+            "cell",
+            {name: Branch(on, self.robots.get(name, "")) for name, on in self.frames.items()},
+        )
+
+    def _matrix(self, step: Step, poses: Mapping[str, FloatArray]) -> FloatArray:
+        if not step.robot:
+            return self.edge_of(step.frame).matrix
+        if step.robot not in poses:
+            raise DataError(
+                f"{step.frame} moves with robot {step.robot!r}: its pose is needed.",
+                culprits=[step.frame],
+                next_step=f'Give poses={{"{step.robot}": base_from_flange}}.',
+            )
+        return np.asarray(poses[step.robot], dtype=float)
+
+    def document(self) -> dict[str, Any]:
+        """Builds the content of alignment.json; what was not computed is absent."""
+        return {
+            "schema": SCHEMA,
+            "visioncal": __version__,
+            "created": self.created,
+            "session": {"name": self.session_name, "sha256": self.session_sha256},
+            "reference": self.reference,
+            "frames": dict(self.frames),
+            "robots": dict(self.robots),
+            "transforms": {name: edge_document(edge) for name, edge in self.edges.items()},
+            "joint_covariance": {
+                "order": list(self.edges),
+                "matrix": self.joint_covariance.tolist(),
+            },
+            "cameras": {name: camera_document(it) for name, it in self.cameras.items()},
+            "noise": {name: dict(it) for name, it in self.noise.items()},
+            "observations": [present(vars(it)) for it in self.sights],
+            "moved": moved_document(self.moved),
+            "untied": [vars(it) for it in self.untied],
+            "weakest": self.weakest,
+            "verdict": verdict_document(self.verdict),
+            **need_document(self.need),
+            "details": dict(self.details),
+        }
+
+    def save(self, path: Path | str) -> None:
+        """Writes alignment.json, whole or not at all."""
+        text = json.dumps(self.document(), indent=2, allow_nan=False) + "\n"
+        write_atomically(Path(path), text)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads an alignment.json, or the one in a folder.
+
+        Raises:
+            DataError: The file is missing or is not an alignment of a known schema.
+        """
+        file = Path(path)
+        file = file / FILE if file.is_dir() else file
+        return cls.from_json(read_bytes(file), str(file))
+
+    @classmethod
+    def from_json(cls, text: bytes | str, label: str) -> Self:
+        """Reads the content of an alignment.json.
+
+        Args:
+            text: The content.
+            label: What it came from, for messages.
+
+        Raises:
+            DataError: It is not an alignment of a known schema.
+        """
+        try:
+            return cls.from_document(parse_stored(text, label))
+        except DataError as error:
+            raise error.within(label) from error
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(
+                f"{label}: not an alignment that this version can read: {error!r}.",
+                culprits=[label],
+                next_step="Run visioncal align again.",
+            ) from error
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Self:
+        """Reads what `document` built.
+
+        Raises:
+            LookupError, TypeError, ValueError, AttributeError: It is another.
+        """
+        return cls(**_fields(document))
+
+
+def is_alignment(document: Mapping[str, Any]) -> bool:
+    """Tells an alignment by its content: the calibration of one camera has no reference."""
+    return {"reference", "transforms"} <= document.keys()
+
+
+def moved_document(moved: Iterable[Moved]) -> list[dict[str, Any]]:
+    """Writes what moved."""
+    return [{**vars(it), "rivals": list(it.rivals)} for it in moved]
+
+
+def read_moved(document: Iterable[Mapping[str, Any]]) -> tuple[Moved, ...]:
+    """Reads what `moved_document` wrote."""
+    return tuple(Moved(**{**it, "rivals": tuple(it["rivals"])}) for it in document)
+
+
+def _fields(document: Mapping[str, Any]) -> dict[str, Any]:
+    if document.get("schema") != SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {SCHEMA}")
+    check(document, _FORM)
+    return {
+        "session_name": document["session"]["name"],
+        "session_sha256": document["session"]["sha256"],
+        "created": document["created"],
+        "reference": document["reference"],
+        "frames": dict(document["frames"]),
+        "robots": dict(document["robots"]),
+        "edges": {name: read_edge(edge, name) for name, edge in document["transforms"].items()},
+        "joint_covariance": read_covariance(document["joint_covariance"], "matrix", (-1, -1)),
+        "cameras": {name: read_camera(it) for name, it in document["cameras"].items()},
+        "noise": {name: dict(it) for name, it in document["noise"].items()},
+        "sights": tuple(Sight(**it) for it in document["observations"]),
+        "moved": read_moved(document["moved"]),
+        "untied": tuple(Untied(**it) for it in document["untied"]),
+        "weakest": document["weakest"],
+        "verdict": read_verdict(document["verdict"]),
+        "need": read_need(document),
+        "details": dict(document["details"]),
+    }

@@ -1,0 +1,416 @@
+"""Two calibrations of one cell, side by side: what changed between them, and what is noise."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtrc, fdtrc
+
+from visioncal.core.files import some_of
+from visioncal.core.transforms import inverse_right_jacobian, invert, log, pose_difference
+from visioncal.core.types import Camera, FloatArray, Mount
+from visioncal.results import Calibration, CameraResult, Edge, VerdictStatus
+from visioncal.session.choosing import ANY, Choice
+from visioncal.vision.camera import intrinsics
+
+# How often two calibrations of an unchanged cell may be told apart, over all tests of a pair.
+FALSE_ALARMS = 0.01
+# No cell is known better [rad and m]; exact data would otherwise measure rounding by zero.
+_LEAST_SIGMA = 1e-9
+
+
+@dataclass(frozen=True)
+class Significance:
+    """Whether a difference is more than noise.
+
+    Attributes:
+        p_value: How often noise alone makes a difference at least as large.
+        limit: A smaller `p_value` is a change.
+    """
+
+    p_value: float
+    limit: float
+
+    @property
+    def is_change(self) -> bool:
+        """Whether noise does not explain the difference."""
+        return self.p_value < self.limit
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeChange:
+    """How one transform differs between two calibrations.
+
+    Attributes:
+        name: Its name, such as `flange_from_cam`.
+        twist: (6,) of (rotation [rad], translation [m]) that leads from the first to the second,
+            on the right: `second = first * exp(twist)`.
+        covariance: (6, 6) of the twist, where nothing changed.
+        moved_mm: Distance between the two origins [mm].
+        moved_deg: Angle between the two orientations [deg].
+        translation: Whether the distance is more than noise.
+        rotation: Whether the angle is more than noise.
+    """
+
+    name: str
+    twist: FloatArray
+    covariance: FloatArray
+    moved_mm: float
+    moved_deg: float
+    translation: Significance
+    rotation: Significance
+
+    @property
+    def sigma_mm(self) -> float:
+        """Root of the trace of the translation's covariance [mm]."""
+        return float(1e3 * np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def sigma_deg(self) -> float:
+        """Root of the trace of the rotation's covariance [deg]."""
+        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+    @property
+    def is_change(self) -> bool:
+        """Whether noise does not explain the difference."""
+        return self.translation.is_change or self.rotation.is_change
+
+
+@dataclass(frozen=True, eq=False)
+class LensChange:
+    """How the intrinsics differ between two calibrations.
+
+    Attributes:
+        names: fx, fy, cx, cy and the names of the distortion's coefficients.
+        a: (k,) their values in the first.
+        b: (k,) their values in the second.
+        sigmas: (k,) standard deviations of the differences; None where not both were estimated.
+        significance: Whether they differ by more than noise, all together; None likewise.
+    """
+
+    names: tuple[str, ...]
+    a: FloatArray
+    b: FloatArray
+    sigmas: FloatArray | None = None
+    significance: Significance | None = None
+
+    @property
+    def is_change(self) -> bool:
+        """Whether the camera is another one: by more than noise, or as it was given."""
+        if self.significance is None:
+            return self.sigmas is None and not np.array_equal(self.a, self.b)
+        return self.significance.is_change
+
+
+@dataclass(frozen=True)
+class NoiseChange:
+    """One noise level of both calibrations; None where one of them has it not."""
+
+    name: str
+    a: float | None
+    b: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two calibrations, side by side.
+
+    Attributes:
+        mounts: How the camera is mounted in each; `whole cell` of one.
+        verdicts: The verdict of each.
+        same_session: Whether both come from the same recorded facts, so that they share their
+            noise and are no independent measurements.
+        edges: The transforms that both have.
+        only_in_a: Names of those that only the first has.
+        only_in_b: Names of those that only the second has.
+        lens: The intrinsics, where both have a camera of one model and resolution.
+        noise: The noise levels.
+        findings: What it means, in plain sentences.
+    """
+
+    mounts: tuple[str, str]
+    verdicts: tuple[VerdictStatus, VerdictStatus]
+    same_session: bool
+    edges: tuple[EdgeChange, ...]
+    only_in_a: tuple[str, ...]
+    only_in_b: tuple[str, ...]
+    lens: LensChange | None
+    noise: tuple[NoiseChange, ...]
+    findings: tuple[str, ...]
+
+    @property
+    def is_change(self) -> bool:
+        """Whether anything changed by more than noise."""
+        return any(edge.is_change for edge in self.edges) or (
+            self.lens is not None and self.lens.is_change
+        )
+
+
+def compare(
+    a: Calibration,
+    b: Calibration,
+    *,
+    camera: str | None = None,
+    robot: str | None = None,
+    target: str | None = None,
+) -> Comparison:
+    """Compares two calibrations as independent measurements of one cell.
+
+    Each transform has two tests, of its rotation and of its translation, on the components of
+    `log(a^-1 * b)`. Their covariances rest on scatter that few views show, so the squared distance
+    of Mahalanobis over three follows F (Hotelling 1931) with the degrees of freedom of both
+    noises together (Welch 1947). Intrinsics that both have estimated have one test, by chi-square:
+    thousands of corners show their noise. `FALSE_ALARMS` is divided among the tests (Bonferroni).
+
+    What both calibrations share is no noise here, and cancels: the same given intrinsics, the same
+    board. The errors of an arm that stands at other stops do not cancel, and no covariance holds
+    them: they look like a change.
+
+    Args:
+        a: The first, against which the second is measured.
+        b: The second.
+        camera: Which camera is meant, of a whole cell's. Two whole cells of which nothing is named
+            are compared by all transforms that both have.
+        robot: Which robot, likewise.
+        target: Which target, likewise.
+
+    Returns:
+        What differs, by how much, and whether noise explains it.
+
+    Raises:
+        DataError: There is no such thing, or one is of a whole cell and it is not clear what of it
+            is meant.
+    """
+    choice = Choice(camera, robot, target)
+    if choice or a.cell is None or b.cell is None:
+        # The names are of what is of a whole cell; where neither is, they are refused.
+        neither = a.cell is None and b.cell is None
+        a, b = (it.chosen(choice if neither or it.cell is not None else ANY) for it in (a, b))
+    names = [name for name in a.edges if name in b.edges]
+    # Two tests a transform, and one of the lens.
+    limit = FALSE_ALARMS / (2 * len(names) + 1)
+    freedom = (_freedom(a), _freedom(b))
+    edges = tuple(_edge_change(it, a.edges[it], b.edges[it], freedom, limit) for it in names)
+    levels = (_levels(a), _levels(b))
+    lens = _lens_change(a.camera, b.camera, limit)
+    return Comparison(
+        mounts=(_mount(a), _mount(b)),
+        verdicts=(a.verdict.status, b.verdict.status),
+        same_session=a.session_sha256 == b.session_sha256,
+        edges=edges,
+        only_in_a=tuple(name for name in a.edges if name not in b.edges),
+        only_in_b=tuple(name for name in b.edges if name not in a.edges),
+        lens=lens,
+        noise=tuple(
+            NoiseChange(name, levels[0].get(name), levels[1].get(name))
+            for name in {**levels[0], **levels[1]}
+        ),
+        findings=tuple(_findings(a, b, edges, lens)),
+    )
+
+
+def _mount(calibration: Calibration) -> str:
+    return calibration.mount if calibration.cell is None else "whole cell"
+
+
+def _levels(calibration: Calibration) -> Mapping[str, float]:
+    """The noise by name; of a whole cell, with what it is of before it."""
+    if calibration.cell is None:
+        return calibration.noise
+    return {
+        f"{of} {name}": it
+        for of, levels in calibration.cell.noise.items()
+        for name, it in levels.items()
+    }
+
+
+def _freedom(calibration: Calibration) -> int:
+    """Degrees of freedom of each noise: three residuals a view, and half of twelve unknowns."""
+    used = sum(view.used for view in calibration.views)
+    return max(3 * used - 6, 1)
+
+
+def _edge_change(name: str, a: Edge, b: Edge, freedom: tuple[int, int], limit: float) -> EdgeChange:
+    first, second = a.matrix, b.matrix
+    twist = log(invert(first) @ second)
+    # log(exp(-error_a) * exp(twist) * exp(error_b)) to first order: both errors are carried into
+    # the twist's own space before their covariances are added.
+    of_a, of_b = inverse_right_jacobian(-twist), inverse_right_jacobian(twist)
+    spreads = (of_a @ a.covariance @ of_a.T, of_b @ b.covariance @ of_b.T)
+    moved_mm, moved_deg = pose_difference(first, second)
+    rotation, translation = (
+        _hotelling(twist[part], [it[part, part] for it in spreads], freedom, limit)
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return EdgeChange(
+        name, twist, spreads[0] + spreads[1], moved_mm, moved_deg, translation, rotation
+    )
+
+
+def _hotelling(
+    difference: FloatArray,
+    spreads: Sequence[FloatArray],
+    freedom: Sequence[int],
+    limit: float,
+) -> Significance:
+    """Tests a difference whose covariance is the sum of two, each of an estimated scale."""
+    sizes = np.array([np.trace(it) for it in spreads]) + _LEAST_SIGMA**2
+    together = sizes.sum() ** 2 / np.sum(sizes**2 / np.array(freedom))
+    squared, count = _squared_distance(difference, spreads[0] + spreads[1]), len(difference)
+    return Significance(float(fdtrc(count, together, squared / count)), limit)
+
+
+def _squared_distance(difference: FloatArray, covariance: FloatArray) -> float:
+    """Squared distance of Mahalanobis, scaled: intrinsics are many powers of ten apart."""
+    sigmas = np.sqrt(np.diag(covariance) + _LEAST_SIGMA**2)
+    correlation = covariance / np.outer(sigmas, sigmas)
+    np.fill_diagonal(correlation, 1.0)
+    scaled = difference / sigmas
+    return float(scaled @ np.linalg.lstsq(correlation, scaled, rcond=None)[0])
+
+
+def _lens_change(a: CameraResult | None, b: CameraResult | None, limit: float) -> LensChange | None:
+    if a is None or b is None or not _are_of_one_kind(a.camera, b.camera):
+        return None
+    first, second = intrinsics(a.camera), intrinsics(b.camera)
+    change = LensChange(intrinsics_names(a.camera), first, second)
+    if a.covariance is None or b.covariance is None:
+        return change
+    covariance = a.covariance + b.covariance
+    squared = _squared_distance(second - first, covariance)
+    significance = Significance(float(chdtrc(len(first), squared)), limit)
+    return replace(change, sigmas=np.sqrt(np.diag(covariance)), significance=significance)
+
+
+def _are_of_one_kind(a: Camera, b: Camera) -> bool:
+    return (a.model, a.resolution, a.distortion.size) == (b.model, b.resolution, b.distortion.size)
+
+
+def intrinsics_names(camera: Camera) -> tuple[str, ...]:
+    """Names of a camera's intrinsics, by OpenCV's names and in its order."""
+    brown, fisheye = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), ("k1", "k2", "k3", "k4")
+    lens = fisheye if camera.model == "fisheye" else brown
+    return ("fx", "fy", "cx", "cy", *lens[: camera.distortion.size])
+
+
+def _findings(
+    a: Calibration, b: Calibration, edges: Sequence[EdgeChange], lens: LensChange | None
+) -> Iterator[str]:
+    if a.session_sha256 == b.session_sha256:
+        yield (
+            "Both come from the same session and share its noise: their sigmas say nothing about "
+            "the difference."
+        )
+    changed = [it.name for it in edges if it.is_change]
+    if a.cell is not None:
+        yield _whole_finding(changed)
+    elif a.mount != b.mount:
+        yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
+    else:
+        yield _edge_finding(a.mount, changed)
+    if lens is not None and lens.is_change:
+        yield (
+            "The intrinsics differ: another camera, focus or zoom."
+            if lens.significance is not None
+            else "The intrinsics that were used differ, and they move the camera's edge with them."
+        )
+    if lens is None and a.camera is not None and b.camera is not None:
+        yield "The cameras differ in model or resolution; their intrinsics were not compared."
+    for name, calibration in (("first", a), ("second", b)):
+        if calibration.verdict.status != "good":
+            yield (
+                f"The {name} has the verdict {calibration.verdict.status}: see its report before "
+                "anything is made of the difference."
+            )
+
+
+_CAMERA_MOVED = {
+    "eye-in-hand": "The camera moved on the flange, or the controller's tool frame was redefined",
+    "eye-to-hand": "The camera moved in the cell, or the controller's base frame was redefined",
+    "instrument": "The instrument was set up elsewhere, or the controller's base frame was "
+    "redefined",
+}
+_BOARD_MOVED = {
+    "eye-in-hand": "The board was moved in the cell, or the controller's base frame was redefined",
+    "eye-to-hand": "The board was moved on the flange, or the controller's tool frame was "
+    "redefined",
+    "instrument": "The probe was moved on the flange, or the controller's tool frame was redefined",
+}
+
+
+def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
+    """Says which of the two bodies moved; an edge is told by the body at its end."""
+    ends = [name.rpartition("_from_")[2] for name in changed]
+    camera = any(it.startswith(("cam", "instrument")) for it in ends)
+    board = any(it.startswith(("target", "probe")) for it in ends)
+    sensor, seen = ("instrument", "probe") if mount == "instrument" else ("camera", "board")
+    if camera and board:
+        both = f"{sensor.capitalize()} and {seen} both moved."
+        return f"{both} {_CAMERA_MOVED[mount]}. {_BOARD_MOVED[mount]}."
+    if camera:
+        return f"{_CAMERA_MOVED[mount]}; the {seen} did not: use the second calibration."
+    if board:
+        return f"{_BOARD_MOVED[mount]}; the {sensor} did not: its calibration still holds."
+    return "No transform changed: noise explains what differs."
+
+
+def _whole_finding(changed: Sequence[str]) -> str:
+    """Says which frames of a whole cell moved."""
+    if not changed:
+        return "No transform changed: noise explains what differs."
+    frames = [it.partition("_from_")[2] for it in changed]
+    return f"{some_of(frames)} moved, or what they hang on was redefined; the others did not."
+
+
+def to_document(comparison: Comparison) -> dict[str, Any]:
+    """Builds what `visioncal diff --json` prints; what was not computed is absent."""
+    document: dict[str, Any] = {
+        "is_change": comparison.is_change,
+        "findings": list(comparison.findings),
+        "same_session": comparison.same_session,
+        "mounts": list(comparison.mounts),
+        "verdicts": list(comparison.verdicts),
+        "transforms": {edge.name: _edge_document(edge) for edge in comparison.edges},
+        "only_in_first": list(comparison.only_in_a),
+        "only_in_second": list(comparison.only_in_b),
+        "noise": {it.name: _present({"first": it.a, "second": it.b}) for it in comparison.noise},
+    }
+    if comparison.lens is not None:
+        document["camera"] = _lens_document(comparison.lens)
+    return document
+
+
+def _edge_document(edge: EdgeChange) -> dict[str, Any]:
+    return {
+        "is_change": edge.is_change,
+        "moved_mm": edge.moved_mm,
+        "moved_deg": edge.moved_deg,
+        "sigma_mm": edge.sigma_mm,
+        "sigma_deg": edge.sigma_deg,
+        "twist": edge.twist.tolist(),
+        "covariance": edge.covariance.tolist(),
+        "translation": _significance_document(edge.translation),
+        "rotation": _significance_document(edge.rotation),
+    }
+
+
+def _lens_document(lens: LensChange) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "is_change": lens.is_change,
+        "names": list(lens.names),
+        "first": lens.a.tolist(),
+        "second": lens.b.tolist(),
+    }
+    if lens.sigmas is not None and lens.significance is not None:
+        document["sigmas"] = lens.sigmas.tolist()
+        document["test"] = _significance_document(lens.significance)
+    return document
+
+
+def _significance_document(it: Significance) -> dict[str, Any]:
+    return {"is_change": it.is_change, "p_value": it.p_value, "limit": it.limit}
+
+
+def _present(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}

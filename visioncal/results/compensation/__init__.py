@@ -1,0 +1,6 @@
+"""Compensation: what to tell a nominal controller so that the real arm goes where it is wanted."""
+
+from visioncal.results.compensation.arms import CalibratedArm
+from visioncal.results.compensation.correction import WIDEST_RAD, Corrected, correct
+
+__all__ = ["WIDEST_RAD", "CalibratedArm", "Corrected", "correct"]

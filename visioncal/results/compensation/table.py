@@ -1,0 +1,226 @@
+"""Tables of targets: read from views.csv's columns, and written with what to send instead."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.documents import TextTable, is_number, read_table
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.transforms import compose, invert, rotation_angle
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.results.compensation.correction import FAR_M, WIDE_RAD, Corrected
+from visioncal.robot import Robot
+from visioncal.session.columns import POSE, joint_columns
+
+# What is added to each row; a table that has them already has been corrected.
+ADDED = ("moved_mm", "moved_deg", "sigma_mm", "off_deg")
+# Rounding to four digits leaves a unit quaternion's norm within this of 1.
+_NORM_TOLERANCE = 1e-3
+_SHOWN = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """The rows of a table of targets, m in all.
+
+    Attributes:
+        table: The table itself.
+        places: (m,) where each row stands: `targets.csv, line 3`.
+        base_from_tool: (m, 4, 4) the targets, of the flange or of a tool [m].
+        q_seed: (m, n) joints to look near to [rad or m], NaN in a row without.
+    """
+
+    table: TextTable
+    places: tuple[str, ...]
+    base_from_tool: FloatArray
+    q_seed: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+def read_targets(path: Path, robot: Robot) -> Targets:
+    """Reads targets.
+
+    Args:
+        path: A table with x_m ... qw; q1_rad ... may say which posture is meant; other columns are
+            kept.
+        robot: Whose joints these are.
+
+    Raises:
+        DataError: It cannot be read, has been corrected already, or rows are no targets in metres
+            and radians.
+    """
+    table = read_table(path)
+    _check_columns(table)
+    places = tuple(table.place(it) for it in range(len(table.rows)))
+    poses = _numbers(table, POSE, needed=True)
+    _check_poses(poses, places)
+    turns = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    return Targets(table, places, compose(turns, poses[:, :3]), _seeds(table, places, robot))
+
+
+def _check_columns(table: TextTable) -> None:
+    name, columns = table.path.name, table.columns
+    done = [it for it in ADDED if it in columns]
+    if done:
+        raise DataError(
+            f"{name} has the column {some_of(done)}, which visioncal correct writes: these targets "
+            "look corrected, and would be so twice.",
+            culprits=done,
+            next_step="Correct the targets that they came from, or rename the column.",
+        )
+    missing = [it for it in POSE if it not in columns]
+    if missing:
+        other = [it for it in columns if it.lower() in ("x_mm", "y_mm", "z_mm")]
+        hint = did_you_mean(missing[0], columns)
+        raise DataError(
+            f"{name}: the columns {', '.join(missing)} are missing; there are {some_of(columns)}.",
+            culprits=missing,
+            next_step="Write metres, in x_m, y_m, z_m."
+            if other
+            else f"{hint} A header row names x_m, y_m, z_m [m] and qx, qy, qz, qw.".strip(),
+        )
+
+
+def _numbers(table: TextTable, names: Sequence[str], *, needed: bool) -> FloatArray:
+    """Columns of numbers (m, k); a row leaves all of them empty or none, and none where needed."""
+    at = [table.columns.index(it) for it in names]
+    values = np.full((len(table.rows), len(names)), np.nan)
+    problems: list[tuple[str, str]] = []
+    for row, cells in enumerate(table.rows):
+        chosen = [cells[it] for it in at]
+        if not needed and not any(chosen):
+            continue
+        for column, cell in enumerate(chosen):
+            value = float(cell) if is_number(cell) else np.nan
+            values[row, column] = value
+            if not np.isfinite(value):
+                words = f"{table.place(row)}: {names[column]} is {cell[:40]!r}"
+                problems.append((table.place(row), words))
+    if problems:
+        more = len(problems) - _SHOWN
+        shown = [it for _, it in problems[:_SHOWN]] + ([f"and {more} more"] if more > 0 else [])
+        raise DataError(
+            f"{'; '.join(shown)}: finite numbers are needed"
+            f"{'' if needed else ', or none at all in that row'}.",
+            culprits=[it for it, _ in problems],
+        )
+    return values
+
+
+def _rows_where(mask: Mask) -> list[int]:
+    return [int(it) for it in np.flatnonzero(mask)]
+
+
+def _check_poses(poses: FloatArray, places: Sequence[str]) -> None:
+    away = np.linalg.norm(poses[:, :3], axis=1)
+    far = _rows_where(away > FAR_M)
+    if far:
+        raise DataError(
+            f"{places[far[0]]}: its position is {away[far[0]]:.4g} m from the base, and no arm "
+            f"reaches {FAR_M:g} m: these look like millimetres.",
+            culprits=[places[it] for it in far],
+            next_step="Write metres.",
+        )
+    norms = np.linalg.norm(poses[:, 3:], axis=1)
+    off = _rows_where(np.abs(norms - 1.0) > _NORM_TOLERANCE)
+    if off:
+        raise DataError(
+            f"{places[off[0]]}: the quaternion's norm is {norms[off[0]]:.6g}, but must be 1 to "
+            f"within {_NORM_TOLERANCE:g}.",
+            culprits=[places[it] for it in off],
+            next_step="qx, qy, qz, qw are a unit quaternion, w last.",
+        )
+
+
+def _seeds(table: TextTable, places: Sequence[str], robot: Robot) -> FloatArray:
+    names = joint_columns(table.columns)
+    wanted = joint_names(robot)
+    if not names:
+        return np.full((len(places), len(wanted)), np.nan)
+    if names != wanted:
+        raise DataError(
+            f"{table.path.name}: its joints are {', '.join(names)}; {robot.name} has "
+            f"{', '.join(wanted)}.",
+            culprits=names,
+            next_step="Name one for each joint, or none.",
+        )
+    seeds = _numbers(table, names, needed=False)
+    turns = np.where(robot.chain.prismatic, 0.0, np.abs(np.nan_to_num(seeds))).max(axis=1)
+    wide = _rows_where(turns > WIDE_RAD)
+    if wide:
+        raise DataError(
+            f"{places[wide[0]]}: a joint stands at {turns[wide[0]]:.4g} rad, more than two turns: "
+            "these look like degrees.",
+            culprits=[places[it] for it in wide],
+            next_step="Write radians.",
+        )
+    return seeds
+
+
+def joint_names(robot: Robot) -> tuple[str, ...]:
+    """The columns of a robot's joints."""
+    return tuple(f"q{it}_rad" for it in range(1, robot.joint_count + 1))
+
+
+def columns_to_send(
+    targets: Targets,
+    corrected: Corrected,
+    base_from_tool: FloatArray,
+    sigma_mm: FloatArray,
+) -> dict[str, FloatArray]:
+    """The numbers of each target to send, (m,) by the names of their columns.
+
+    Args:
+        targets: The rows as they were read.
+        corrected: What to send.
+        base_from_tool: (m, 4, 4) Cartesian targets to send, of the flange or the tool [m].
+        sigma_mm: (m,) predicted sigma of each [mm]; NaN where there is none.
+    """
+    names = tuple(f"q{it}_rad" for it in range(1, corrected.q.shape[1] + 1))
+    turns = Rotation.from_matrix(base_from_tool[:, :3, :3]).as_quat(canonical=True)
+    between = invert(targets.base_from_tool) @ base_from_tool
+    columns: dict[str, FloatArray] = {
+        **dict(zip(POSE, np.column_stack([base_from_tool[:, :3, 3], turns]).T, strict=True)),
+        **dict(zip(names, corrected.q.T, strict=True)),
+        "moved_mm": 1e3 * np.linalg.norm(between[:, :3, 3], axis=1),
+        "moved_deg": np.rad2deg(rotation_angle(between)),
+    }
+    if np.isfinite(sigma_mm).all():
+        columns["sigma_mm"] = sigma_mm
+    if len(names) < 6:
+        columns["off_deg"] = np.rad2deg(corrected.off_rad)
+    return columns
+
+
+def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: IntArray) -> str:
+    """Writes some rows as CSV: all that they had, with what to send in place.
+
+    Args:
+        targets: The rows as they were read.
+        columns: What to send, of `columns_to_send`.
+        rows: Which rows.
+    """
+    own = targets.table.columns
+    names = [*own, *(it for it in columns if it not in own)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    for row in rows:
+        cells = dict(zip(own, targets.table.rows[row], strict=True))
+        cells |= {name: written(name, float(numbers[row])) for name, numbers in columns.items()}
+        writer.writerow([cells[it] for it in names])
+    return text.getvalue()
+
+
+def written(name: str, value: float) -> str:
+    """Writes a number with the digits that count: 0.1 nm of a place, 1e-12 of a quaternion."""
+    digits = 4 if name in ADDED else 12 if name in POSE[3:] else 10
+    return f"{value:.{digits}f}"

@@ -1,0 +1,163 @@
+"""A tool's or a fixture's frame, and the file of frames that belong to no calibration."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from visioncal.core.documents import parse_stored
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.version import __version__
+from visioncal.results.edge import Edge, edge_document, read_edge
+from visioncal.results.forms import FRAME, check
+from visioncal.results.parts import Verdict
+from visioncal.results.verdicts import read_verdict, verdict_document
+
+_SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One touch, point or view that a frame was placed by; what is unknown is None.
+
+    Attributes:
+        name: Which it is: the row's view number, or the point's name.
+        used: Whether the fit used it.
+        reason: What is wrong with it, in words; empty where nothing is.
+        kind: What was touched, as `point`, `z`, `xz`; empty where it has no kinds.
+        residual_mm: How far it is off from the frame [mm].
+    """
+
+    name: str
+    used: bool
+    reason: str = ""
+    kind: str = ""
+    residual_mm: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where a tool sits on the flange, or a fixture in the base.
+
+    Attributes:
+        edge: `flange_from_tool` or `base_from_fixture`, by its owner's name for it.
+        oriented: Whether the rotation was measured; else it is the parent's own, by declaration,
+            and has no covariance.
+        method: How it was obtained, in words.
+        source: What it was obtained from: a file's or a session's name.
+        created: When, in ISO 8601.
+        rms_mm: Root mean square of what the used observations are off [mm].
+        noise_mm: Estimated standard deviation of one observation, per axis [mm].
+        observations: One entry for each touch, point or view.
+        verdict: Whether to trust it.
+        details: Further figures of the method, as they stand on disk.
+    """
+
+    edge: Edge
+    oriented: bool
+    method: str
+    source: str
+    created: str
+    rms_mm: float
+    noise_mm: float
+    observations: tuple[Observation, ...]
+    verdict: Verdict
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFile:
+    """Frames that belong to no calibration: of a robot without a camera.
+
+    Attributes:
+        frames: The frames by the transform that places them.
+    """
+
+    frames: Mapping[str, Frame]
+
+    def save(self, path: Path | str) -> None:
+        """Writes the file, whole or not at all."""
+        document = {
+            "schema": _SCHEMA,
+            "visioncal": __version__,
+            "frames": frames_document(self.frames),
+        }
+        write_atomically(Path(path), json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads such a file.
+
+        Raises:
+            DataError: It is missing, or no file of frames of a known schema.
+        """
+        content = read_bytes(path)
+        try:
+            return cls(_read_file(parse_stored(content, str(path))))
+        except DataError as error:
+            raise error.within(str(path)) from error
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(
+                f"{path}: no frames that this version can read: {error!r}.",
+                culprits=[str(path)],
+                next_step="Run visioncal tcp or visioncal fixture again.",
+            ) from error
+
+
+def frames_document(frames: Mapping[str, Frame]) -> dict[str, Any]:
+    """Writes frames as JSON has them."""
+    return {name: _frame_document(frame) for name, frame in frames.items()}
+
+
+def _frame_document(frame: Frame) -> dict[str, Any]:
+    return edge_document(frame.edge) | {
+        "oriented": frame.oriented,
+        "method": frame.method,
+        "source": frame.source,
+        "created": frame.created,
+        "rms_mm": frame.rms_mm,
+        "noise_mm": frame.noise_mm,
+        "observations": [present(vars(it)) for it in frame.observations],
+        "verdict": verdict_document(frame.verdict),
+        "details": dict(frame.details),
+    }
+
+
+def present(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Drops what was not computed: on disk it is absent."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def read_frames(document: Mapping[str, Any]) -> dict[str, Frame]:
+    """Reads what `frames_document` wrote.
+
+    Raises:
+        LookupError, TypeError, ValueError: The document is another.
+    """
+    return {name: _read_frame(it, name) for name, it in document.items()}
+
+
+def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
+    if "transforms" in document:
+        raise ValueError("it is a calibration, whose folder is named with -c")
+    if document.get("schema") != _SCHEMA:
+        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {_SCHEMA}")
+    return read_frames(document["frames"])
+
+
+def _read_frame(document: Mapping[str, Any], name: str) -> Frame:
+    check(document, FRAME)
+    return Frame(
+        read_edge(document, name),
+        document["oriented"],
+        document["method"],
+        document["source"],
+        document["created"],
+        document["rms_mm"],
+        document["noise_mm"],
+        tuple(Observation(**it) for it in document["observations"]),
+        read_verdict(document["verdict"]),
+        dict(document["details"]),
+    )

@@ -1,0 +1,206 @@
+"""What a calibration is made of, beside its transforms."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.core.number_format import percent
+from visioncal.core.types import Camera, FloatArray, Need
+from visioncal.robot import Robot
+
+VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
+# Why a view is in no fit although nothing is wrong with it.
+HELD_BACK = "held out of the fit by the session (role = holdout)"
+# So many causes stand on top, if they are as likely as this.
+_SHOWN_CAUSES, _LEAST_LIKELY = 3, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class SolverResult:
+    """What one solver made of the used views.
+
+    Attributes:
+        matrices: (4, 4) both edges by name.
+        rms_mm: Scatter of the target's position over the used views [mm].
+        rms_deg: Scatter of the target's orientation over the used views [deg]; None where places
+            alone were read.
+    """
+
+    matrices: Mapping[str, FloatArray]
+    rms_mm: float
+    rms_deg: float | None = None
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """Both edges by name."""
+        return {name: RigidTransform.from_matrix(it) for name, it in self.matrices.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class CameraResult:
+    """The camera that the result was obtained with.
+
+    Attributes:
+        camera: The intrinsics.
+        estimated: Whether they were estimated from this session's images.
+        covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
+        edge_covariance: (k, 6 e) of these with the calibration's edges in the order of its
+            `joint_covariance`, where both were estimated together.
+    """
+
+    camera: Camera
+    estimated: bool
+    covariance: FloatArray | None = None
+    edge_covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RobotResult:
+    """A robot of a whole cell.
+
+    Attributes:
+        model: Its nominal model, where that is known.
+        stages: One document for each further stage that ran on it, by name, as `kinematics`.
+    """
+
+    model: Robot | None = None
+    stages: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """What became of one view. A figure that could not be computed is None, and absent on disk.
+
+    Attributes:
+        view: The view's number.
+        used: Whether the fit used it.
+        reason: Why it was not used, in words; empty for a used view.
+        corners: How many corners were found.
+        rms_px: Reprojection error through the whole chain of frames [px].
+        residual_mm: Distance of the target, as this view places it, from its mean place [mm].
+        residual_deg: The same in rotation [deg].
+    """
+
+    view: int
+    used: bool
+    reason: str = ""
+    corners: int | None = None
+    rms_px: float | None = None
+    residual_mm: float | None = None
+    residual_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Rms:
+    """Root mean square residuals.
+
+    `deg` is None where an instrument read places alone, `px` where no image was used.
+    """
+
+    mm: float
+    deg: float | None = None
+    px: float | None = None
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Residuals of views that the fit had not seen.
+
+    Attributes:
+        method: How views were left out, in words.
+        held_out: Their residuals, over all used views in turn.
+        holdout: Residuals of the views that the session declares as `holdout`.
+    """
+
+    method: str
+    held_out: Rms
+    holdout: Rms | None = None
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What may be why a result is not good.
+
+    Attributes:
+        cause: What it is, as a short name that stays.
+        probability: How likely it is.
+        sentence: What it is, with its figures.
+        without_it: What the result would be without it, in a sentence; empty where not computed.
+        do: What to do about it; a command where one does it.
+    """
+
+    cause: str
+    probability: float
+    sentence: str
+    without_it: str = ""
+    do: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the result can be trusted.
+
+    Attributes:
+        status: In one word.
+        reasons: Why, in plain sentences.
+        good_for_mm: The least need that it would be good for [mm]; None where something is
+            unexplained, and it is good for none.
+        causes: What may be why it is not good, likeliest first.
+    """
+
+    status: VerdictStatus
+    reasons: tuple[str, ...]
+    good_for_mm: float | None = None
+    causes: tuple[Cause, ...] = ()
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The reasons for people: the likeliest causes on top with how likely they are.
+
+        What a cause says in other words than a reason comes behind what it explains.
+        """
+        top = [it for it in self.causes if it.probability >= _LEAST_LIKELY][:_SHOWN_CAUSES]
+        told, words = [*self.reasons], []
+        for at, cause in enumerate(top):
+            mine = [it for it in told if it.startswith(cause.sentence)]
+            told = [it for it in told if it not in mine]
+            # A reason says itself what to do.
+            rest = (cause.without_it,) if mine else (cause.without_it, cause.do)
+            said = filter(None, (*(mine or [cause.sentence]), *rest))
+            how = "Then" if at else "Most likely"
+            words.append(f"{how} ({percent(cause.probability)}): {' '.join(said)}")
+        sentences = tuple(it.sentence for it in self.causes)
+        of_causes = [at for at, it in enumerate(self.reasons) if it.startswith(sentences)]
+        first = min(of_causes, default=len(self.reasons))
+        return (*told[:first], *words, *told[first:])
+
+
+@dataclass(frozen=True)
+class Picker:
+    """How likely picks by one robot of what one camera sees land within what is needed."""
+
+    camera: str
+    robot: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class NeedMet:
+    """What the task needs, and how likely a pick lands within it.
+
+    Attributes:
+        need: What it needs.
+        probability: How likely a pick lands within it; of a whole cell, by the worst of its pairs.
+        pairs: Each camera and robot of a whole cell that pick together; empty elsewhere.
+    """
+
+    need: Need
+    probability: float
+    pairs: tuple[Picker, ...] = ()
+
+    def of(self, camera: str, robot: str) -> "NeedMet":
+        """What is said of one camera and robot; of those that are no pair, of all."""
+        mine = [it for it in self.pairs if (it.camera, it.robot) == (camera, robot)]
+        return NeedMet(self.need, mine[0].probability) if mine else self

@@ -1,0 +1,321 @@
+"""The result of a calibration."""
+
+import json
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from visioncal.core.documents import parse_stored
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes, write_atomically
+from visioncal.core.types import FloatArray, Mount
+from visioncal.estimation.intervals import freedom_of
+from visioncal.results.alignment import FILE as ALIGNMENT
+from visioncal.results.alignment import Alignment, is_alignment
+from visioncal.results.document import KINDS, fields_from_document, to_document
+from visioncal.results.edge import Edge
+from visioncal.results.frame import Frame
+from visioncal.results.parts import (
+    CameraResult,
+    NeedMet,
+    Rms,
+    SolverResult,
+    Validation,
+    Verdict,
+    ViewResult,
+)
+from visioncal.results.selecting import selected_fields, whole_fields
+from visioncal.results.whole import is_whole, read_whole
+from visioncal.robot import Loads, Robot, bent_joints
+from visioncal.robot.thermal import ThermalModel
+from visioncal.session.choosing import PARTS, Choice, Part
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The result of calibrating one session; `save` writes it as calibration.json.
+
+    Attributes:
+        session_name: The session's name.
+        session_sha256: Digest of the session's canonical content.
+        created: When, in ISO 8601.
+        mount: How the camera is mounted.
+        edges: The estimated edges by name, in the order of `joint_covariance`.
+        joint_covariance: (6 k, 6 k) covariance of all edges together, in that order.
+        solvers: What every solver made of it.
+        noise: Estimated standard deviations by name.
+        views: One entry for each view of the session.
+        rms: Residuals over the used views.
+        validation: Residuals of views that were left out.
+        verdict: Whether to trust it.
+        camera: The camera, where the session has one.
+        robot: The nominal robot model, where the session names a known one.
+        frames: Tools and fixtures by the transform that places them, as `flange_from_tool`.
+        stages: One document for each further stage that ran, by name.
+        cell: The whole cell that it stands for, whose frames `edges` places; None for one camera,
+            one robot and their targets. What is of one camera or robot, `of` takes out of it.
+        need: What the task needs, and how likely picks meet it; None where that is not said.
+    """
+
+    session_name: str
+    session_sha256: str
+    created: str
+    mount: Mount
+    edges: Mapping[str, Edge]
+    joint_covariance: FloatArray
+    solvers: Mapping[str, SolverResult]
+    noise: Mapping[str, float]
+    views: tuple[ViewResult, ...]
+    rms: Rms
+    validation: Validation
+    verdict: Verdict
+    camera: CameraResult | None = None
+    robot: Robot | None = None
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+    stages: Mapping[str, Any] = field(default_factory=dict)
+    cell: Alignment | None = None
+    need: NeedMet | None = None
+
+    @classmethod
+    def whole(cls, cell: Alignment) -> Self:
+        """The calibration that stands for a whole cell."""
+        return cls(**whole_fields(cell))
+
+    def of(
+        self, camera: str | None = None, robot: str | None = None, target: str | None = None
+    ) -> Self:
+        """Returns the calibration of one camera, one robot and one target of a whole cell.
+
+        Both transforms follow through the cell's frames, with the covariance that all of it gives
+        them. Where there is one of each, it is the calibration itself.
+
+        Args:
+            camera: Its name, or its frame's; may be left out where only one fits.
+            robot: The robot that moves camera and target before each other; likewise.
+            target: The target; likewise.
+
+        Raises:
+            DataError: There is no such thing, several are meant, or this robot does not part these.
+        """
+        return self.chosen(Choice(camera, robot, target))
+
+    def chosen(self, choice: Choice, needs: Collection[Part] = PARTS) -> Self:
+        """As `of`, for what needs to know no more than some of the three.
+
+        Args:
+            choice: What is named.
+            needs: What has to be clear; of the rest, any that fits is taken, or none.
+
+        Raises:
+            DataError: See `of`.
+        """
+        if self.cell is not None:
+            return type(self)(**selected_fields(self.cell, choice, needs))
+        if choice:
+            raise DataError(
+                f"calibration {self.session_name!r} is of one camera and one robot, which have no "
+                "names.",
+                culprits=[f"--{it}" for it in PARTS if choice.of(it)],
+                next_step="Leave their names out.",
+            )
+        return self
+
+    @property
+    def transforms(self) -> dict[str, RigidTransform]:
+        """The estimated transforms by name, those of tools and fixtures among them."""
+        return {name: edge.transform for name, edge in self.placed.items()}
+
+    @property
+    def placed(self) -> dict[str, Edge]:
+        """The estimated transforms by name with their covariances, frames among them."""
+        return {**self.edges, **{name: frame.edge for name, frame in self.frames.items()}}
+
+    @property
+    def noise_dof(self) -> float:
+        """Degrees of freedom of the noise's levels; see `estimation.intervals.freedom_of`."""
+        intervals = self.stages.get("uncertainty", {}).get("noise_95", {})
+        return freedom_of(intervals.values()) if intervals else np.inf
+
+    def covariance(self, name: str) -> FloatArray:
+        """Covariance of one transform.
+
+        Args:
+            name: Its name, such as `flange_from_cam`.
+
+        Returns:
+            (6, 6) of (rotation [rad], translation [m]), right perturbation.
+
+        Raises:
+            DataError: There is no transform of that name.
+        """
+        placed = self.placed
+        if name not in placed:
+            raise DataError(f"no transform {name!r}: this calibration has {', '.join(placed)}.")
+        return placed[name].covariance
+
+    def base_from_flange(
+        self,
+        q: FloatArray,
+        *,
+        payload_kg: float | FloatArray = 0.0,
+        payload_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
+        force_n: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
+        temperatures_c: FloatArray | None = None,
+    ) -> RigidTransform:
+        """Forward kinematics of the calibrated robot, which bends where that was calibrated.
+
+        Args:
+            q: (m, n) joint angles [rad].
+            payload_kg: Mass on the flange beside the arm's own weight; one for all, or (m,) [kg].
+            payload_m: (3,) or (m, 3) its centre in the flange's frame [m].
+            force_n: (3,) or (m, 3) external force on the flange's origin, in the base's frame [N].
+            temperatures_c: (m, n) of the links behind the joints, or (n,) for all [deg C]; None for
+                those at which the views began. `OnlineCompensator` tells them.
+
+        Returns:
+            m transforms, as one batched RigidTransform.
+
+        Raises:
+            DataError: The session named no known robot, q has another number of joints, a load is
+                none, or temperatures are given and none were calibrated.
+        """
+        q = np.atleast_2d(q)
+        loads = Loads.alike(len(q), payload_kg, payload_m, force_n)
+        standing = self.standing(q, loads)
+        if temperatures_c is not None:
+            standing = standing @ self.drift.motion(q, np.asarray(temperatures_c, dtype=float))
+        return RigidTransform.from_matrix(standing)
+
+    def standing(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
+        """What `base_from_flange` gives, as (m, 4, 4).
+
+        Args:
+            q: (m, n) joint angles [rad].
+            loads: What the flange carries; the arm's own weight alone where None.
+
+        Raises:
+            DataError: The session named no known robot, or q has another number of joints.
+        """
+        arm = self.calibrated_robot
+        if arm is None:
+            raise DataError(
+                "this calibration holds no robot model.",
+                next_step="Name one in the session's [robot] table and calibrate again."
+                if self.cell is None
+                else "It is of a whole cell: take one robot out of it with of(robot=...).",
+            )
+        return arm.base_from_flange(
+            bent_joints(arm, q, self.compliance, loads, self.weight_moments)
+        )
+
+    @cached_property
+    def compliance(self) -> FloatArray:
+        """(n,) what each joint yields to a torque [rad/(N m)]; zero where that is not known."""
+        rows = self.stages.get("elastic", {}).get("joints", ())
+        if not rows:
+            return np.zeros(0 if self.robot is None else self.robot.joint_count)
+        return np.array([float(row["compliance_rad_per_nm"]) for row in rows])
+
+    @cached_property
+    def drift(self) -> ThermalModel:
+        """How the arm drifts with its temperature.
+
+        Raises:
+            DataError: That was not calibrated.
+        """
+        arm, found = self.calibrated_robot, self.stages.get("thermal")
+        if arm is None or found is None:
+            raise DataError(
+                f"calibration {self.session_name!r} does not tell how its arm drifts with "
+                "temperature.",
+                culprits=["temperatures"],
+                next_step="Record reference views while the arm warms up, with temp1_c ... or "
+                "current1_a ..., and calibrate with --level thermal.",
+            )
+        return ThermalModel.from_document(found, arm)
+
+    def at_temperatures(self, temperatures_c: FloatArray) -> Self:
+        """Returns the calibration of the arm as it is with its links at (n,) temperatures [deg C].
+
+        Raises:
+            DataError: It does not tell how the arm drifts, or has another number of joints.
+        """
+        warm = dict(self.drift.robot_at(np.asarray(temperatures_c, dtype=float)).document)
+        kinematics = {**self.stages.get("kinematics", {}), "robot": warm}
+        return replace(self, stages={**self.stages, "kinematics": kinematics})
+
+    @property
+    def arm_is_calibrated(self) -> bool:
+        """Whether the transforms go with a calibrated arm, and not with the controller's."""
+        return "robot" in self.stages.get("kinematics", {})
+
+    @cached_property
+    def calibrated_robot(self) -> Robot | None:
+        """The arm as it was calibrated, or else its nominal model, where there is one."""
+        found = self.stages.get("kinematics", {})
+        return Robot.from_document(found["robot"]) if "robot" in found else self.robot
+
+    @cached_property
+    def weight_moments(self) -> FloatArray | None:
+        """(n, 4 n) compliance times unknown masses and first moments; None where none were found.
+
+        What `bent_joints` takes of an arm whose model does not tell the masses of its links.
+        """
+        rows = self.stages.get("elastic", {}).get("weight_moments")
+        return None if rows is None else np.array(rows, dtype=float)
+
+    def save(self, path: Path | str) -> None:
+        """Writes calibration.json, whole or not at all."""
+        write_atomically(
+            Path(path), json.dumps(to_document(self), indent=2, allow_nan=False) + "\n"
+        )
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads a calibration.json or an alignment.json, or the one in a folder.
+
+        Raises:
+            DataError: The file is missing or is not a calibration of a known schema.
+        """
+        file = Path(path)
+        if file.is_dir():
+            before = file / ALIGNMENT
+            file = file / "calibration.json"
+            # A cell that was aligned by an older version.
+            file = before if before.is_file() and not file.exists() else file
+        return cls.from_json(read_bytes(file), str(file))
+
+    @classmethod
+    def from_json(cls, text: bytes | str, label: str) -> Self:
+        """Reads the content of a calibration.json.
+
+        Args:
+            text: The content.
+            label: What it came from, for messages.
+
+        Raises:
+            DataError: It is not a calibration of a known schema.
+        """
+        try:
+            document = parse_stored(text, label)
+            if is_whole(document):
+                return cls.whole(read_whole(document))
+            if is_alignment(document):
+                return cls.whole(Alignment.from_document(document))
+            read = cls(**fields_from_document(parse_stored(text, label, KINDS)))
+            # What is read of further stages when it is asked for: here, errors are the file's.
+            _ = read.calibrated_robot, read.compliance, read.weight_moments
+        except DataError as error:
+            raise error.within(label) from error
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(
+                f"{label}: not a calibration that this version can read: {error!r}.",
+                culprits=[label],
+                next_step="Calibrate the session again.",
+            ) from error
+        return read

@@ -1,0 +1,256 @@
+"""The calibration of one camera, one robot and one target out of that of a whole cell."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
+from visioncal.results.alignment import Alignment, Sight
+from visioncal.results.edge import Edge
+from visioncal.results.frame import Frame
+from visioncal.results.parts import CameraResult, Rms, RobotResult, Validation, Verdict
+from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
+from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
+from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
+
+NOT_LEFT_OUT = "none was left out: the residuals of the whole cell's fit"
+
+
+def whole_fields(cell: Alignment) -> dict[str, Any]:
+    """The fields of a calibration that stands for a whole cell."""
+    rms = rms_of(cell.sights)
+    cameras = frames_of_kind(cell.frames, "camera")
+    carried = [bool(robots_between(cell.frames, it, CELL)) for it in cameras]
+    return {
+        "session_name": cell.session_name,
+        "session_sha256": cell.session_sha256,
+        "created": cell.created,
+        "mount": "eye-in-hand" if carried and all(carried) else "eye-to-hand",
+        "edges": cell.edges,
+        "joint_covariance": cell.joint_covariance,
+        "solvers": {},
+        "noise": {},
+        "views": view_results(cell.sights),
+        "rms": rms,
+        "validation": _validation(cell, cell.sights),
+        "verdict": cell.verdict,
+        "frames": cell.placed,
+        "cell": cell,
+        "need": cell.need,
+    }
+
+
+def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) -> dict[str, Any]:
+    """The fields of the calibration of one camera, robot and target; see `Calibration.of`.
+
+    Raises:
+        DataError: There is no such thing, several are meant, or no robot parts these.
+    """
+    chosen = _chosen(cell, choice, needs)
+    chain = _chain(cell, chosen)
+    nothing = np.zeros((0, len(cell.joint_covariance)))
+    slopes = np.concatenate([nothing, *(it[1] for it in chain.values())])
+    spread = slopes @ cell.joint_covariance @ slopes.T
+    arm = cell.arms.get(chosen.robot or "robot", RobotResult())
+    sights = [
+        it
+        for it in cell.sights
+        if chosen.camera in ("", it.seer) and chosen.target in ("", it.seen)
+    ]
+    rms = rms_of(sights)
+    return whole_fields(cell) | {
+        "mount": chosen.mount,
+        "edges": {
+            name: Edge(matrix, spread[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
+            for at, (name, (matrix, _)) in enumerate(chain.items())
+        },
+        "joint_covariance": spread,
+        "noise": _noise(cell, chosen, rms),
+        "views": view_results(sights),
+        "rms": rms,
+        "validation": _validation(cell, sights),
+        "verdict": _verdict(cell),
+        "camera": _camera(cell.cameras.get(chosen.camera), slopes),
+        "robot": arm.model,
+        "frames": _placed(cell, chosen),
+        "stages": {
+            **arm.stages,
+            **_clock(cell, chosen),
+            **_intervals(cell, chosen),
+            **_shapes(cell, chosen),
+            **_joint_fit(cell, chosen, slopes),
+        },
+        "cell": None,
+        "need": None if cell.need is None else cell.need.of(*_pair(chosen)),
+    }
+
+
+def _validation(cell: Alignment, sights: Sequence[Sight]) -> Validation:
+    """Residuals of some observations by fits that were made without them."""
+    if not cell.left_out:
+        return Validation(NOT_LEFT_OUT, rms_of(sights), holdout_rms(sights))
+    return Validation(cell.left_out, left_out_rms(sights), holdout_rms(sights))
+
+
+def placed_name(cell: Alignment, choice: Choice, needs: Collection[Part], name: str) -> str:
+    """What a transform of the smaller calibration is called in the whole cell's."""
+    chosen = _chosen(cell, choice, needs)
+    parent, _, child = name.partition("_from_")
+    frames = {"flange": chosen.flange, "base": chosen.base}
+    return f"{frames[parent]}_from_{child}"
+
+
+def boards_before(cell: Alignment, choice: Choice, needs: Collection[Part]) -> dict[str, Edge]:
+    """The targets that stand still before a robot's base, as `base_from_target_floor`."""
+    base = _chosen(cell, choice, needs).base
+    return {
+        f"base_from_{it}": cell.between(base, it)
+        for it in frames_of_kind(cell.frames, "target")
+        if not robots_between(cell.frames, base, it)
+    }
+
+
+def _chosen(cell: Alignment, choice: Choice, needs: Collection[Part]) -> Chosen:
+    """What is meant, where all stood last; of what is neither needed nor named, nothing."""
+    before = {it.before for it in cell.moved}
+    frames = {name: on for name, on in cell.frames.items() if name not in before}
+    chosen = choose(frames, choice, needs, label=f"the cell {cell.session_name!r}")
+    kept = {*needs, *(part for part in PARTS if choice.of(part))}
+    return replace(
+        chosen,
+        camera=chosen.camera if "camera" in kept else "",
+        target=chosen.target if "target" in kept else "",
+    )
+
+
+def _pair(chosen: Chosen) -> tuple[str, str]:
+    """Camera and robot by the names of their tables."""
+    return thing_name(chosen.camera, "camera"), chosen.robot or "robot"
+
+
+def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Both transforms by name, as far as they are there, each with its slopes by all edges."""
+    in_hand = chosen.mount == "eye-in-hand"
+    of_camera, of_target = ("flange", "base") if in_hand else ("base", "flange")
+    frames = {"flange": chosen.flange, "base": chosen.base}
+    ends = {
+        f"{of_camera}_from_cam": (frames[of_camera], chosen.camera),
+        f"{of_target}_from_target": (frames[of_target], chosen.target),
+    }
+    return {name: cell.way(*pair) for name, pair in ends.items() if pair[1]}
+
+
+def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
+    """The noise of corners and of the robot.
+
+    Of poses that were measured without corners, that of camera and robot together is as this pair
+    scatters: the camera's own level is a mean over all that it sees, near and far.
+    """
+    robot, camera = (cell.noise.get(it, {}) for it in (chosen.robot or "robot", chosen.camera))
+    found = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
+    names = ("translation_mm", "rotation_deg")
+    found |= {f"robot_{name}": robot[name] for name in names if name in robot}
+    if chosen.camera and chosen.target and "pixel_px" not in camera:
+        each = (rms.mm, rms.deg or 0.0)
+        found |= {
+            f"combined_{name}": it / np.sqrt(3.0) for name, it in zip(names, each, strict=True)
+        }
+    return found
+
+
+def _camera(result: CameraResult | None, slopes: FloatArray) -> CameraResult | None:
+    if result is None or result.edge_covariance is None:
+        return result
+    return CameraResult(
+        result.camera, result.estimated, result.covariance, result.edge_covariance @ slopes.T
+    )
+
+
+def _verdict(cell: Alignment) -> Verdict:
+    if "arms" not in cell.details:
+        return cell.verdict
+    words = (
+        "The whole cell was fitted with errors of its arms, which this part of it does not have: "
+        "by the poses as they are reported it is off by as much."
+    )
+    status = "check" if cell.verdict.status == "good" else cell.verdict.status
+    return Verdict(status, (words, *cell.verdict.reasons))
+
+
+def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
+    """Tools and fixtures of the robot, and in its base the fixtures of others beside it.
+
+    Of these, the way between both bases counts as independent of how the fixture was placed.
+    """
+    found: dict[str, Frame] = {}
+    for name, frame in cell.placed.items():
+        parent, _, child = name.partition("_from_")
+        if parent == chosen.flange:
+            found[f"flange_from_{child}"] = frame
+        elif parent == chosen.base:
+            found[f"base_from_{child}"] = frame
+        elif parent.startswith("base") and not robots_between(cell.frames, chosen.base, parent):
+            way, placed = cell.between(chosen.base, parent), frame.edge
+            carry = adjoint(invert(placed.matrix))
+            spread = carry @ way.covariance @ carry.T + placed.covariance
+            if not placed.oriented:
+                spread[:3], spread[:, :3] = 0.0, 0.0
+            edge = Edge(way.matrix @ placed.matrix, spread)
+            found[f"base_from_{child}"] = replace(frame, edge=edge)
+    return found
+
+
+def _clock(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+    """How far the camera's clock is ahead of the robot's."""
+    found = cell.details.get("clocks", {})
+    pair = f"{chosen.camera} and robot {chosen.robot or 'robot'}"
+    return {"clock": found[pair]} if pair in found else {}
+
+
+def _intervals(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+    """How well the robot's noise is known."""
+    found = cell.stages.get("uncertainty", {}).get("noise_95", {}).get(chosen.robot or "robot", {})
+    named = {f"robot_{name}": it for name, it in found.items()}
+    return {"uncertainty": {"noise_95": named}} if named else {}
+
+
+def _shapes(cell: Alignment, chosen: Chosen) -> dict[str, Any]:
+    """What the target was found to be like."""
+    name, stages = thing_name(chosen.target, "target"), cell.stages
+    parts = {"board": stages.get("boards", {}), "rig": stages.get("rigs", {})}
+    return {kind: it[name] for kind, it in parts.items() if name in it}
+
+
+def _joint_fit(cell: Alignment, chosen: Chosen, slopes: FloatArray) -> dict[str, Any]:
+    """What `verify` predicts with: both edges, and lens and board as far as they are free."""
+    fit = cell.stages.get("joint_fit")
+    if fit is None or not (chosen.camera and chosen.target):
+        return {}
+    target = thing_name(chosen.target, "target")
+    camera = thing_name(chosen.camera, "camera")
+    lens_count = 0
+    if (known := cell.cameras.get(chosen.camera)) is not None:
+        lens_count = 4 + len(known.camera.distortion)
+    looks: list[int] = []
+    columns: list[int] = []
+    at = slopes.shape[1]
+    for part, name, first in (("cameras", camera, 0), ("targets", target, lens_count)):
+        for it, places in fit[part].items():
+            if it == name:
+                looks += [first + place for place in places]
+                columns += range(at, at + len(places))
+            at += len(places)
+    full = np.array(fit["covariance"], dtype=float)
+    carried = block_diag(slopes, np.eye(at)[columns][:, slopes.shape[1] :])
+    return {
+        "joint_fit": {
+            "targets": {"": cell.targets[target]} if target in cell.targets else {},
+            "looks": looks,
+            "boards": [""],
+            "covariance": (carried @ full @ carried.T).tolist(),
+        }
+    }

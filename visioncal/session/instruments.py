@@ -1,0 +1,111 @@
+"""Measuring instruments: how noisy their readings are, by a table of known systems."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table, did_you_mean, parse_toml, read_text
+from visioncal.core.types import FloatArray
+
+_FILE = Path(__file__).with_name("instruments.toml")
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Noise of an instrument's readings, as standard deviations.
+
+    Attributes:
+        words: What it is, for people.
+        sigma_m: Of each coordinate of a place, at the instrument's origin [m].
+        sigma_per_m: What that grows by with the distance from there [m/m].
+        sigma_rad: Of a probe's rotation about each axis; None where it is not known [rad].
+    """
+
+    words: str
+    sigma_m: float
+    sigma_per_m: float = 0.0
+    sigma_rad: float | None = None
+
+    def sigmas_m(self, places: FloatArray) -> FloatArray:
+        """Standard deviations (m,) of each coordinate of (m, 3) places that it reads [m]."""
+        distance = np.linalg.norm(places, axis=-1)
+        return np.asarray(self.sigma_m + self.sigma_per_m * distance)
+
+
+def instrument_names() -> tuple[str, ...]:
+    """Lists the instruments whose noise is known."""
+    return tuple(sorted(_shipped()))
+
+
+def known_instrument(name: str) -> Instrument | None:
+    """Finds an instrument in the table; None where it is not there.
+
+    Raises:
+        DataError: It measures lengths or turns alone, and no places.
+    """
+    row = _shipped().get(name.strip().lower())
+    if row is None:
+        return None
+    words = row.text("words")
+    if "measures" in row.content:
+        raise DataError(
+            f"instrument {name!r}: the {words} measures {row.text('measures')}; readings of "
+            "places (meas_x_m, meas_y_m, meas_z_m) are needed.",
+            culprits=["session.toml: instrument.name"],
+        )
+    return Instrument(
+        words,
+        row.number("sigma_m"),
+        row.number("sigma_per_m", 0.0),
+        row.number("sigma_rad") if "sigma_rad" in row.content else None,
+    )
+
+
+def stated_instrument(
+    name: str, sigma_m: float | None, sigma_per_m: float | None, sigma_rad: float | None
+) -> Instrument:
+    """Puts together what a session says of its instrument; what it states comes before the table.
+
+    Args:
+        name: Its name, in the table or any other.
+        sigma_m: See `Instrument`; needed where the table does not have the name.
+        sigma_per_m: See `Instrument`.
+        sigma_rad: See `Instrument`.
+
+    Raises:
+        DataError: The name is unknown and nothing is stated, or what is stated is no noise.
+    """
+    known = known_instrument(name)
+    if sigma_m is None and known is None:
+        raise DataError(
+            f"session.toml: the instrument {name!r} is not in the table of known ones, and its "
+            "noise is not stated.",
+            culprits=["session.toml: instrument"],
+            next_step=f"{did_you_mean(name, instrument_names())} State sigma_m (and sigma_per_m) "
+            f"in [instrument], or name one of {', '.join(instrument_names())}.".strip(),
+        )
+    base = Instrument(name, 0.0) if known is None else known
+    stated = Instrument(
+        base.words,
+        base.sigma_m if sigma_m is None else sigma_m,
+        base.sigma_per_m if sigma_per_m is None else sigma_per_m,
+        base.sigma_rad if sigma_rad is None else sigma_rad,
+    )
+    for field, value in (("sigma_m", stated.sigma_m), ("sigma_rad", stated.sigma_rad)):
+        if value is not None and not value > 0.0:
+            raise DataError(
+                f"session.toml: instrument.{field} is {value:g}; no instrument is exact, and a "
+                "number above 0 is needed.",
+                culprits=[f"session.toml: instrument.{field}"],
+            )
+    return stated
+
+
+@cache
+def _shipped() -> Mapping[str, Table]:
+    rows = parse_toml(read_text(_FILE), _FILE.name)["instrument"]
+    return {row["name"]: Table(row, f"{_FILE.name}, {row['name']}") for row in rows}

@@ -1,0 +1,58 @@
+"""Finding a target's corners in an image: one module a kind of target."""
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.vision.finders.board import FINDERS, find_board
+from visioncal.vision.finders.charuco import fitting_layouts
+from visioncal.vision.finders.imaging import blur_at_corners
+from visioncal.vision.finders.marker import find_marker
+from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.tags import find_tags
+from visioncal.vision.finders.template import refine
+
+__all__ = ["NotFound", "Seen", "blur_of", "find_target", "fitting_layouts"]
+
+
+def find_target(image: Image, target: Target) -> Seen | NotFound:
+    """Finds a target's corners to sub-pixel accuracy.
+
+    Args:
+        image: (h, w) grey image.
+        target: What to look for.
+
+    Returns:
+        The corners, or why there are none.
+    """
+    match target.kind:
+        case "charuco" | "checkerboard" | "aprilgrid" | "circles":
+            return find_board(image, target)
+        case "marker":
+            return find_marker(image, target)
+        case "points" if target.point_tags:
+            return find_tags(image, target)
+        case "points":
+            return NotFound(
+                f"target {target.name} is a rig of points, which no image is searched for: "
+                "corners.csv has no rows of this view"
+            )
+
+
+def blur_of(image: Image, target: Target, ids: IntArray, px: FloatArray) -> float:
+    """Measures how wide edges are at corners that were found, in another image of them or the same.
+
+    Args:
+        image: (h, w) grey image.
+        target: What was found.
+        ids: (n,) the corners' numbers, n >= 1.
+        px: (n, 2) where they are, to a pixel or so [px].
+
+    Returns:
+        The width as a Gaussian's sigma, on a board in the direction in which edges are wider: what
+        moves is smeared in one alone [px].
+    """
+    if target.kind in FINDERS:
+        blur_px = float(refine(image, target, ids, px).blur_px.max())
+        if np.isfinite(blur_px):
+            return blur_px
+    return blur_at_corners(image, px)

@@ -1,0 +1,89 @@
+"""Finding a board in a small copy of a large image, and its corners in the image itself."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image, Target, TargetKind
+from visioncal.vision.finders.aprilgrid import find_aprilgrid
+from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.finders.checkerboard import find_checkerboard
+from visioncal.vision.finders.circles import find_circles
+from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.template import refine
+from visioncal.vision.targets import corner_positions
+
+# Images with longer sides are halved first, and at twice as much once more: detectors take as long
+# as there are pixels. Smaller images lose markers and gain nothing.
+_LONG_SIDE_PX = 2000
+# Corners that the template does not fit are left out: a detector is off there by up to a pixel. Of
+# views where fewer than these fit, the detector's corners serve, all of them, with a tenth of the
+# weight: so much less exact they are in the median of what was measured.
+_FEWEST_FITTED, _LEAST_FITTED, _DETECTED_WEIGHT = 6, 0.5, 0.1
+
+FINDERS: dict[TargetKind, Callable[[Image, Target], Seen | NotFound]] = {
+    "charuco": find_charuco,
+    "checkerboard": find_checkerboard,
+    "aprilgrid": find_aprilgrid,
+    "circles": find_circles,
+}
+
+
+def find_board(image: Image, target: Target) -> Seen | NotFound:
+    """Finds the corners of a board whose corners the template fits.
+
+    OpenCV finds them, in a small copy where an image is large and shows the whole board there;
+    the template of `refine` says where they are.
+
+    Args:
+        image: (h, w) grey image.
+        target: A target of one of the kinds of `FINDERS`.
+
+    Returns:
+        The corners, or why there are none.
+    """
+    find = FINDERS[target.kind]
+    for by in (4, 2):
+        if max(image.shape) <= by // 2 * _LONG_SIDE_PX or min(image.shape) < by:
+            continue
+        small = _shrunk(image, by)
+        seen = find(small, target)
+        if isinstance(seen, Seen) and _is_whole(seen, small, target):
+            # Where a pixel of the small image has its centre in the large one.
+            return _refined(image, target, Seen(seen.ids, by * seen.px + (by - 1) / 2))
+    seen = find(image, target)
+    return seen if isinstance(seen, NotFound) else _refined(image, target, seen)
+
+
+def _refined(image: Image, target: Target, seen: Seen) -> Seen:
+    refined = refine(image, target, seen.ids, seen.px)
+    fitted = np.array([not it for it in refined.reasons])
+    if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
+        return replace(seen, weights=np.full(len(fitted), _DETECTED_WEIGHT))
+    return Seen(seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max()))
+
+
+def _shrunk(image: Image, by: int) -> Image:
+    height, width = (by * (side // by) for side in image.shape)
+    size = (width // by, height // by)
+    small = cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
+def _is_whole(seen: Seen, image: Image, target: Target) -> bool:
+    """Whether no corner that the image should show is missing."""
+    places: FloatArray = corner_positions(target)[:, :2] / target.square_m
+    missing = np.setdiff1d(np.arange(len(places)), seen.ids)
+    if not len(missing):
+        return True
+    homography = cv2.findHomography(places[seen.ids], seen.px)[0] if len(seen.ids) > 3 else None
+    if homography is None:
+        return False
+    # A corner takes both markers beside it.
+    around = places[missing, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    ahead = around @ homography[2, :2] + homography[2, 2]
+    px = (around @ homography[:2, :2].T + homography[:2, 2]) / ahead[..., None]
+    inside = (ahead > 0) & ((px > 0) & (px < np.array(image.shape[::-1]) - 1)).all(axis=-1)
+    return not inside.all(axis=1).any()

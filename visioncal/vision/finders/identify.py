@@ -1,0 +1,354 @@
+"""Naming the target in a photograph of which nothing is known."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import Image, Target, TargetKind
+from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.finders.circles import seen_grids
+from visioncal.vision.finders.identify_aprilgrid import find_grid
+from visioncal.vision.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
+from visioncal.vision.finders.identify_checkerboard import find_squares
+from visioncal.vision.finders.identify_markers import Marker, decode_markers, genuine, holding
+from visioncal.vision.finders.imaging import why_hard_to_see
+from visioncal.vision.finders.result import Seen
+from visioncal.vision.targets import DEFAULT_RELATIVE_SIGMA
+
+# Edges wider than this hide the bits of small markers [px].
+_MAX_BLUR_PX = 6.0
+_LISTED = 12
+# A picture whose sides are twice as long or more is searched at this size too.
+_USUAL_PIXELS, _MUCH_LARGER = 2e6, 0.5
+# So many markers on one lattice are a board, even where its corners are not found.
+_SURE_MARKERS = 8
+_MAYBE_CHARUCO = (
+    "The light squares are not plain: rather a ChArUco board whose markers are too blurred to "
+    "read. Take a sharper picture."
+)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a photograph shows, all but its size.
+
+    Attributes:
+        kind: What is printed.
+        columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
+        rows: The same along y; of tags for an AprilGrid.
+        whole: Whether the board is seen to end there; where not, it may have more.
+        dictionary: The smallest dictionary that holds the markers; empty without markers.
+        larger: Other dictionaries that hold the same markers.
+        legacy: Whether a ChArUco board has the layout that OpenCV printed before 4.6; with an odd
+            number of rows both layouts are the same.
+        marker_share: A marker's side over a square's; 0 except for ChArUco.
+        marker_share_sigma: Standard deviation of that.
+        marker_ids: The ids that were decoded, ascending; of single markers, the target's first.
+        first_id: The least id of an AprilGrid.
+        spacing: White between its tags, as a share of their side.
+        border: Dark modules around their bits.
+        asymmetric: Whether every second row of circles is shifted.
+        diameter_share: Their diameter over the distance of rows; 0 without circles.
+        corners_seen: Corners that the finder of that kind finds.
+        corners: Corners that the target has.
+        notes: What else there is to know, in sentences.
+    """
+
+    kind: TargetKind
+    columns: int
+    rows: int
+    whole: bool
+    corners_seen: int
+    corners: int
+    dictionary: str = ""
+    larger: tuple[str, ...] = ()
+    legacy: bool = False
+    marker_share: float = 0.0
+    marker_share_sigma: float = 0.0
+    marker_ids: tuple[int, ...] = ()
+    first_id: int = -1
+    spacing: float = 0.0
+    border: int = 1
+    asymmetric: bool = False
+    diameter_share: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def target(self, name: str, square_m: float) -> Target:
+        """Builds the target.
+
+        Args:
+            name: Its name.
+            square_m: Measured side of a square, or of the marker for a single one [m].
+        """
+        return Target(
+            name,
+            self.kind,
+            self.columns,
+            self.rows,
+            square_m,
+            DEFAULT_RELATIVE_SIGMA * square_m,
+            marker_m=round(self.marker_share * square_m, 5),
+            dictionary=self.dictionary,
+            legacy=self.legacy,
+            marker_id=self.marker_ids[0] if self.kind == "marker" else self.first_id,
+            spacing=self.spacing,
+            border=self.border,
+            diameter_m=round(self.diameter_share * square_m, 5),
+            asymmetric=self.asymmetric,
+        )
+
+
+def identify(image: Image) -> Identity:
+    """Names the target in an image: ChArUco board, AprilGrid, checkerboard, circles or marker.
+
+    Args:
+        image: (h, w) grey image.
+
+    Returns:
+        The target whose corners are the most; others that are seen too are named in its notes.
+
+    Raises:
+        DataError: There is none; the message says what was looked for and what may help.
+    """
+    identity = _identity(image)
+    if identity is not None:
+        return identity
+    # Details of a picture much larger than what the finders were made for hide its board.
+    scale = (_USUAL_PIXELS / image.size) ** 0.5
+    if scale < _MUCH_LARGER:
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        identity = _identity(np.asarray(small, np.uint8))
+        if identity is not None:
+            note = f"It is found only in the picture reduced to {small.shape[1]} pixels in width."
+            return replace(identity, notes=(note, *identity.notes))
+    why = why_hard_to_see(image, _MAX_BLUR_PX)
+    height, width = image.shape
+    raise DataError(
+        f"No target is seen in this image of {width} x {height} pixels"
+        + (f": {why}." if why else ".")
+        + " Looked for were ChArUco boards and single markers of OpenCV's ArUco and AprilTag "
+        "dictionaries, AprilGrids, grids of circles, and checkerboards of 3 x 3 inner corners or "
+        "more; "
+        f"{len(decode_markers(image))} patterns looked like a marker.",
+        culprits=["image"],
+        next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
+        "nearer, and tilted by less than 60 degrees.",
+    )
+
+
+def _identity(image: Image) -> Identity | None:
+    """The target whose corners are the most; None where there is none."""
+    markers = decode_markers(image)
+    boards = _charucos(image, markers)
+    singles = _singles(tuple(it for it in genuine(markers) if it.family not in boards))
+    grids = _aprilgrids(image)
+    # Circles in staggered rows pass for a checkerboard.
+    found = [*boards.values(), *grids] or _circles(image) or [*_checkerboards(image), *singles]
+    if not found:
+        return None
+    best = max(found, key=lambda it: it.corners_seen)
+    # A grid's tags are no single ones.
+    around = () if best.kind == "aprilgrid" else singles
+    beside = (it for it in (*found, *around) if it is not best)
+    return replace(best, notes=(*best.notes, *dict.fromkeys(_notes_beside(beside))))
+
+
+def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
+    for it in others:
+        if it.kind == "marker":
+            yield f"Beside it, marker {it.marker_ids[0]} of {it.dictionary} is seen."
+        elif _MAYBE_CHARUCO in it.notes:
+            yield f"Squares are seen around it. {_MAYBE_CHARUCO}"
+
+
+def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
+    """The best board by its family."""
+    found = {}
+    for family in sorted({it.family for it in markers}):
+        members = [it for it in markers if it.family == family]
+        lattices = find_lattices(image, members) if len(members) >= LEAST_MARKERS else ()
+        named = [_charuco(image, family, it) for it in lattices]
+        boards = [it for it in named if it is not None]
+        if boards:
+            found[family] = _decided(boards)
+    return found
+
+
+def _decided(boards: list[Identity]) -> Identity:
+    """Of boards that the same markers may be of, the one with the most corners."""
+    best = max(boards, key=lambda it: it.corners_seen)
+    rivals = [it for it in boards if it is not best and it.corners_seen == best.corners_seen]
+    if not rivals:
+        return best
+    layouts = ", ".join(
+        f"{it.columns} x {it.rows}{' in the legacy layout' if it.legacy else ''}" for it in rivals
+    )
+    note = f"What is seen of it fits {layouts} as well: show more of the board."
+    return replace(best, whole=False, notes=(note, *best.notes))
+
+
+def _charuco(image: Image, family: str, lattice: Lattice) -> Identity | None:
+    """Names a board, and confirms it by the finder that calibrations use."""
+    ids = tuple(sorted({it.number for it in lattice.markers}))
+    names = holding(family, max(lattice.columns * lattice.rows // 2, ids[-1] + 1))
+    if not names:
+        return None
+    identity = Identity(
+        "charuco",
+        lattice.columns,
+        lattice.rows,
+        lattice.rows_certain,
+        corners_seen=0,
+        corners=(lattice.columns - 1) * (lattice.rows - 1),
+        dictionary=names[0],
+        larger=names[1:],
+        legacy=lattice.legacy,
+        marker_share=lattice.share,
+        marker_share_sigma=lattice.share_sigma,
+        marker_ids=ids,
+        notes=tuple(_charuco_notes(lattice, names)),
+    )
+    seen = find_charuco(image, identity.target("board", 1.0))
+    if isinstance(seen, Seen):
+        return replace(identity, corners_seen=len(seen.ids))
+    if len(lattice.markers) < _SURE_MARKERS:
+        return None
+    note = f"Its corners are not found in this image: {seen.reason}."
+    return replace(identity, notes=(note, *identity.notes))
+
+
+def _charuco_notes(lattice: Lattice, names: tuple[str, ...]) -> Iterator[str]:
+    if not lattice.rows_certain:
+        yield f"The board may go on below row {lattice.rows}: its end there is not in the image."
+    if len(names) > 1:
+        yield f"{_listed(names[1:])} hold the same markers: any of them finds this board."
+    if lattice.rows % 2 and lattice.rows_certain:
+        yield "With an odd number of rows the legacy layout is the same as the present one."
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _checkerboards(image: Image) -> list[Identity]:
+    squares = find_squares(image)
+    if squares is None:
+        return []
+    count = squares.columns * squares.rows
+    notes = []
+    if squares.filled:
+        notes.append(_MAYBE_CHARUCO)
+    if squares.cut:
+        notes.append("The board may go on outside the image.")
+    if not squares.found:
+        notes.append("The search for just this board fails in this image.")
+    if (squares.columns + squares.rows) % 2 == 0:
+        notes.append(
+            "This board looks the same upside down; one with an even and an odd number is better."
+        )
+    seen = count if squares.found else 0
+    whole = not squares.cut and squares.found
+    return [
+        Identity(
+            "checkerboard", squares.columns, squares.rows, whole, seen, count, notes=tuple(notes)
+        )
+    ]
+
+
+def _aprilgrids(image: Image) -> list[Identity]:
+    grid = find_grid(image)
+    if grid is None:
+        return []
+    target = grid.target
+    notes = [
+        "The white between its tags is estimated by the image, to a hundredth of their side: "
+        "measure it to be sure."
+    ]
+    if not grid.whole:
+        notes.append(f"The board may go on above row {target.rows}, counted from below.")
+    return [
+        Identity(
+            "aprilgrid",
+            target.columns,
+            target.rows,
+            grid.whole,
+            grid.corners,
+            4 * target.columns * target.rows,
+            dictionary=target.dictionary,
+            marker_ids=tuple(grid.ids.tolist()),
+            first_id=target.marker_id,
+            spacing=target.spacing,
+            border=target.border,
+            notes=tuple(notes),
+        )
+    ]
+
+
+def _circles(image: Image) -> list[Identity]:
+    # Of the ways to number them, one as wide as it is high or wider, as people count.
+    grids = sorted(seen_grids(image), key=lambda it: not it.asymmetric and it.columns < it.rows)
+    if not grids:
+        return []
+    grid = grids[0]
+    notes = ["The circles' diameter is estimated by the image, which corners hardly depend on."]
+    if not grid.asymmetric or grid.rows % 2 == 0:
+        notes.append(
+            "This board looks the same upside down; an asymmetric one of an odd number of rows is "
+            "better."
+        )
+    return [
+        Identity(
+            "circles",
+            grid.columns,
+            grid.rows,
+            whole=True,
+            corners_seen=len(grid.px),
+            corners=len(grid.px),
+            asymmetric=grid.asymmetric,
+            diameter_share=grid.share,
+            notes=tuple(notes),
+        )
+    ]
+
+
+def _singles(markers: tuple[Marker, ...]) -> list[Identity]:
+    """The family of which the most markers are seen, and its largest marker."""
+    if not markers:
+        return []
+    members: list[Marker] = []
+    # The likest marker comes first; of two families with as many, its own is taken.
+    for family in dict.fromkeys(it.family for it in markers):
+        its = [it for it in markers if it.family == family]
+        members = its if len(its) > len(members) else members
+    largest = max(members, key=lambda it: it.side_px)
+    others = tuple(sorted(it.number for it in members if it is not largest))
+    ids = (largest.number, *others)
+    names = holding(largest.family, max(ids) + 1)
+    notes = []
+    if others:
+        listed = ", ".join(map(str, others[:_LISTED])) + (" ..." if len(others) > _LISTED else "")
+        notes.append(
+            f"Also seen: {listed}. A target is one marker, and the largest is taken; where they "
+            "are a board's, show more of it; where they lie freely, describe them by a table of "
+            'their corners (kind = "points").'
+        )
+    if len(names) > 1:
+        notes.append(f"{_listed(names[1:])} hold the same markers: any of them finds this one.")
+    return [
+        Identity(
+            "marker",
+            1,
+            1,
+            whole=True,
+            corners_seen=4,
+            corners=4,
+            dictionary=names[0],
+            larger=names[1:],
+            marker_ids=ids,
+            notes=tuple(notes),
+        )
+    ]

@@ -1,0 +1,197 @@
+"""Inferring a ChArUco board from the ids and the places of its markers.
+
+The ids of a ChArUco board count its white squares row by row. Hence the number of columns and the
+colour of the first square say where on the board each id lies, whatever the number of rows: a
+hypothesis is right where one view of a plane carries those places to the image, and the markers,
+carried back, are squares of one size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image, IntArray, Mask
+from visioncal.vision.finders.identify_markers import Marker, modules_along
+from visioncal.vision.finders.identify_plane import (
+    BENDS,
+    Lens,
+    Plane,
+    bent_plane,
+    lens_of,
+    robust_plane,
+)
+from visioncal.vision.finders.identify_saddles import alternating, contrasts, typical_contrast
+from visioncal.vision.finders.identify_share import marker_share
+
+# The widest board that is thought of; a printable one has fewer columns.
+_MOST_COLUMNS = 40
+_LEAST_COLUMNS = 3
+_MOST_ROWS = 100
+# Where a lens explains so many markers, no other is tried.
+_NEARLY_ALL = 0.95
+# Boards that explain the markers about as well as the best one, and how many are looked at.
+_SAME_MISFIT, _MOST_TIED = 1.2, 4
+# A homography takes four points; that the markers are square checks it.
+LEAST_MARKERS = 4
+# Distance of a marker's corners from where they should be, in squares. Lens distortion stays under
+# a twentieth; a wrong column moves them by a whole square.
+_MISFIT = 0.12
+_SHARES = (0.25, 0.98)
+# Corners of a marker around its centre.
+_AROUND = 0.5 * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+# Of the corners along a line between two rows, so many must be seen to believe or to exclude it.
+_HALF = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """How a board's markers lie.
+
+    Attributes:
+        columns: Squares along x.
+        rows: Squares along y; more where not `rows_certain`.
+        rows_certain: Whether the board is seen to end there.
+        legacy: Whether square 0 holds a marker.
+        share: A marker's side over a square's.
+        share_sigma: Standard deviation of that.
+        markers: The markers that fit.
+    """
+
+    columns: int
+    rows: int
+    rows_certain: bool
+    legacy: bool
+    share: float
+    share_sigma: float
+    markers: tuple[Marker, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    columns: int
+    legacy: bool
+    plane: Plane
+    share: float
+    fits: Mask
+    misfit: float
+
+    @property
+    def score(self) -> tuple[int, float]:
+        return int(self.fits.sum()), -self.misfit
+
+
+def find_lattices(image: Image, markers: Sequence[Marker]) -> tuple[Lattice, ...]:
+    """Infers a board from markers of one family.
+
+    Args:
+        image: (h, w) grey image.
+        markers: Markers of one family; some may be look-alikes.
+
+    Returns:
+        The boards that explain the most markers: more than one where too few rows are seen to tell
+        the number of columns, none where the markers do not lie as on a ChArUco board.
+    """
+    fits: list[_Fit] = []
+    for bend in BENDS:
+        lens = lens_of(image, bend)
+        for columns in range(_LEAST_COLUMNS, _MOST_COLUMNS + 1):
+            for legacy in (False, True):
+                fit = _fit(lens, columns, legacy, markers)
+                if fit is not None:
+                    fits.append(fit)
+        if any(it.fits.mean() > _NEARLY_ALL for it in fits):
+            break
+    # Half of the markers may be look-alikes, not more.
+    least = max(LEAST_MARKERS, len(markers) / 2)
+    best = max(fits, key=lambda it: it.score, default=None)
+    if best is None or best.score[0] < least:
+        return ()
+    # With the same markers in the same places the misfit is the same; noise alone tells no lattice.
+    tied = [
+        it for it in fits if it.score[0] == best.score[0] and it.misfit < _SAME_MISFIT * best.misfit
+    ]
+    first = {(it.columns, it.legacy): it for it in sorted(tied, key=lambda it: it.misfit)}
+    return tuple(_lattice(image, markers, it) for it in list(first.values())[:_MOST_TIED])
+
+
+def _lattice(image: Image, markers: Sequence[Marker], fit: _Fit) -> Lattice:
+    held = tuple(marker for marker, fits in zip(markers, fit.fits, strict=True) if fits)
+    squares = _places(np.array([it.number for it in held]), fit.columns, fit.legacy)
+    on_board = (squares + 0.5)[:, None] + fit.share * _AROUND
+    in_image = np.concatenate([it.px for it in held])
+    fit = replace(fit, plane=bent_plane(fit.plane, on_board.reshape(-1, 2), in_image))
+    rows, certain = _rows(image, fit, int(squares[:, 1].max()) + 1)
+    modules = modules_along(held[0].family)
+    share, sigma = marker_share(image, fit.plane, squares, modules, fit.share)
+    return Lattice(fit.columns, rows, certain, fit.legacy, share, sigma, held)
+
+
+def _places(ids: IntArray, columns: int, legacy: bool) -> FloatArray:
+    """Squares (x, y) that hold the markers with these ids, (n, 2)."""
+    # Two rows together hold one marker a column, the first of them the smaller half unless legacy.
+    first = (columns + legacy) // 2
+    pair, within = np.divmod(ids, columns)
+    lower = within >= first
+    place = np.where(lower, within - first, within)
+    # In the upper row of a pair the markers stand in the odd columns, in the even ones if legacy.
+    start = np.where(lower == legacy, 1, 0)
+    return np.stack([2 * place + start, 2 * pair + lower], axis=1).astype(float)
+
+
+def _fit(lens: Lens, columns: int, legacy: bool, markers: Sequence[Marker]) -> _Fit | None:
+    """Tries one hypothesis; None where the markers cannot be on such a board."""
+    places = _places(np.array([it.number for it in markers]), columns, legacy)
+    if np.ptp(places, axis=0).min() < 1:
+        return None
+    centres = np.array([it.centre for it in markers])
+    # Half a side of a marker away is another square, or a look-alike.
+    tolerance_px = 0.5 * float(np.median([it.side_px for it in markers]))
+    found = robust_plane(lens, places + 0.5, centres, tolerance_px)
+    if found is None or found[1].sum() < LEAST_MARKERS:
+        return None
+    plane, near = found
+    plane = bent_plane(plane, places[near] + 0.5, centres[near]) if lens.bend else plane
+    corners = np.array([it.px for it in markers])
+    offsets = plane.to_board(corners.reshape(-1, 2)).reshape(-1, 4, 2) - (places + 0.5)[:, None]
+    # Projections onto an ideal marker's corners, whose own squared length is two.
+    shares = (offsets * _AROUND).sum(axis=(1, 2)) / 2
+    share = float(np.median(shares[near]))
+    if not _SHARES[0] < share < _SHARES[1]:
+        return None
+    away = np.sqrt(((offsets - share * _AROUND) ** 2).sum(axis=2).mean(axis=1))
+    fits = away < _MISFIT
+    if fits.sum() < LEAST_MARKERS or np.ptp(places[fits], axis=0).min() < 1:
+        return None
+    return _Fit(columns, legacy, plane, share, fits, float(away[fits].mean()))
+
+
+def _rows(image: Image, fit: _Fit, least: int) -> tuple[int, bool]:
+    """Counts rows beyond those whose markers were decoded, and says whether the board ends there.
+
+    Below the last row the squares do not alternate, which needs the line below it in the image.
+    """
+    reach = (1.0 - fit.share) / 4
+    known = _line(fit.columns, np.arange(1, least))
+    typical = typical_contrast(contrasts(image, fit.plane, known, reach), known)
+    rows, certain = least, False
+    while rows < _MOST_ROWS:
+        below = _line(fit.columns, np.array([rows]))
+        below = below[fit.plane.shows(image, below + np.array([0.0, reach]))]
+        if len(below) < _HALF * (fit.columns - 1):
+            break
+        seen = alternating(contrasts(image, fit.plane, below, reach), below, typical)
+        if seen.mean() < _HALF:
+            certain = True
+            break
+        rows += 1
+    if fit.legacy and rows % 2:
+        # An odd number of rows never starts with a marker.
+        return rows + 1, False
+    return rows, certain
+
+
+def _line(columns: int, rows: IntArray) -> FloatArray:
+    """Corners between the columns on the lines above the given rows, (n, 2)."""
+    x, y = np.meshgrid(np.arange(1, columns), rows)
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)

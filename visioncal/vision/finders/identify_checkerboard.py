@@ -1,0 +1,226 @@
+"""Finding a checkerboard of unknown size."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image
+from visioncal.vision.finders.identify_plane import BENDS, Plane, bent_plane, lens_of, robust_plane
+from visioncal.vision.finders.identify_saddles import alternating, contrasts, typical_contrast
+
+# The corner finder takes a second for ten million pixels, and needs squares of some ten.
+_SEARCH_PIXELS = 1.5e6
+_SEED = (3, 3)
+_MOST = 100
+# How far from a corner its four squares are looked at, in squares.
+_REACH = 0.25
+# The same beyond the last corners, where the image may show little white around the board.
+_REACHES_OUT = (_REACH, 0.1, 0.05)
+# Of the corners along one more line, so many must alternate for the line to belong to the board.
+_MOST_OF = 0.8
+# Fewer of them in the image do not tell whether the board goes on.
+_ENOUGH = 0.5
+_OUTWARD = {"left": (-1.0, 0.0), "top": (0.0, -1.0), "right": (1.0, 0.0), "bottom": (0.0, 1.0)}
+# Places in a square, from its middle, where a marker would be, in squares.
+_INSIDE = np.stack(np.meshgrid(*2 * [np.linspace(-0.3, 0.3, 7)]), axis=-1).reshape(-1, 2)
+# Grey levels that scatter more in light squares than in dark ones, by this share of the contrast,
+# are no shading.
+_TEXTURE = 0.1
+# A corner that is farther off is none of the board's, in squares.
+_OFF = 0.15
+_ATTEMPTS = (
+    0,
+    cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
+)
+
+
+@dataclass(frozen=True)
+class Squares:
+    """A checkerboard.
+
+    Attributes:
+        columns: Inner corners along its longer side.
+        rows: The same along the other.
+        cut: Whether it may go on outside the image.
+        found: Whether the corner finder finds a board of just this size.
+        filled: Whether the light squares are not plain, as where markers are too blurred to read.
+    """
+
+    columns: int
+    rows: int
+    cut: bool
+    found: bool
+    filled: bool
+
+
+@dataclass(frozen=True)
+class _Extent:
+    """Lines of corners that belong to the board, in the numbering of the seed: both ends count."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def corners(self) -> FloatArray:
+        x, y = np.meshgrid(
+            np.arange(self.left, self.right + 1), np.arange(self.top, self.bottom + 1)
+        )
+        return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.right - self.left + 1, self.bottom - self.top + 1
+
+
+def find_squares(image: Image) -> Squares | None:
+    """Finds a checkerboard and counts its inner corners.
+
+    The corner finder (Duda and Frese 2018, through OpenCV) is allowed to find a larger board than
+    asked for, but then often stops early, or goes on over the rim. Its grid is therefore only a
+    start: lines of corners are taken off and added as the colours around them say.
+
+    Args:
+        image: (h, w) grey image.
+
+    Returns:
+        The largest board, confirmed by an exact search where that succeeds; None where there is
+        none.
+    """
+    scale = min(1.0, float(np.sqrt(_SEARCH_PIXELS / image.size)))
+    small = image
+    if scale < 1.0:
+        small = np.asarray(
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    best: Squares | None = None
+    for flags in _ATTEMPTS:
+        found, px, meta = cv2.findChessboardCornersSBWithMeta(
+            small, _SEED, cv2.CALIB_CB_LARGER | flags
+        )
+        if not found:
+            continue
+        grid = np.asarray(px, dtype=float).reshape(*np.asarray(meta).shape[:2], 2)
+        here = _counted(small, grid)
+        if here is not None and (best is None or _rank(here) > _rank(best)):
+            best = here
+        if best is not None and best.found:
+            break
+    return best
+
+
+def _rank(squares: Squares) -> tuple[bool, int]:
+    return squares.found, squares.columns * squares.rows
+
+
+def _counted(image: Image, grid: FloatArray) -> Squares | None:
+    """Counts a board's corners, starting from the (rows, columns, 2) ones that were found."""
+    rows, columns = grid.shape[:2]
+    extent = _Extent(0, 0, columns - 1, rows - 1)
+    plane = _plane(image, extent.corners(), grid.reshape(-1, 2))
+    if plane is None:
+        return None
+    corners = extent.corners()
+    typical = typical_contrast(contrasts(image, plane, corners, _REACH), corners)
+    if typical == 0.0:
+        return None
+    shrunk = _shrunk(image, plane, extent, typical)
+    if shrunk is None:
+        return None
+    grown, cut = _grown(image, plane, shrunk)
+    columns, rows = max(grown.size), min(grown.size)
+    if rows < _SEED[1]:
+        return None
+    found = _is_there(image, (columns, rows))
+    return Squares(columns, rows, cut, found, _filled(image, plane, shrunk, typical))
+
+
+def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
+    """Fits the view of the board that the most corners agree with."""
+    tolerance_px = _OFF * float(np.median(np.linalg.norm(np.diff(px, axis=0), axis=1)))
+    planes = [robust_plane(lens_of(image, bend), corners, px, tolerance_px) for bend in BENDS]
+    found = [it for it in planes if it is not None]
+    if not found:
+        return None
+    plane, right = max(found, key=lambda it: int(it[1].sum()))
+    return bent_plane(plane, corners[right], px[right])
+
+
+def _outermost(extent: _Extent, side: str) -> _Extent:
+    """The line of corners on one side."""
+    opposite = {"left": "right", "right": "left", "top": "bottom", "bottom": "top"}[side]
+    return replace(extent, **{opposite: getattr(extent, side)})
+
+
+def _moved(extent: _Extent, side: str, outward: int) -> _Extent:
+    step = outward if side in ("right", "bottom") else -outward
+    return replace(extent, **{side: getattr(extent, side) + step})
+
+
+def _share_alternating(image: Image, plane: Plane, corners: FloatArray, typical: float) -> float:
+    values = contrasts(image, plane, corners, _REACH)
+    return float(alternating(values, corners, typical).mean())
+
+
+def _alternate_as(
+    image: Image, plane: Plane, extent: _Extent, corners: FloatArray, reach: float
+) -> bool:
+    """Whether more corners alternate as those of the board do, seen equally near."""
+    known = extent.corners()
+    typical = typical_contrast(contrasts(image, plane, known, reach), known)
+    values = contrasts(image, plane, corners, reach)
+    return bool(alternating(values, corners, typical).mean() >= _MOST_OF)
+
+
+def _shrunk(image: Image, plane: Plane, extent: _Extent, typical: float) -> _Extent | None:
+    """Takes off the outer lines that do not alternate, the worst first."""
+    while min(extent.size) >= _SEED[0]:
+        shares = {
+            side: _share_alternating(image, plane, _outermost(extent, side).corners(), typical)
+            for side in _OUTWARD
+        }
+        worst = min(shares, key=shares.__getitem__)
+        if shares[worst] >= _MOST_OF:
+            return extent
+        extent = _moved(extent, worst, -1)
+    return None
+
+
+def _grown(image: Image, plane: Plane, extent: _Extent) -> tuple[_Extent, bool]:
+    """Adds the next lines that alternate; also says whether the image cuts one of them."""
+    cut = False
+    sides = list(_OUTWARD)
+    while sides and max(extent.size) < _MOST:
+        side = sides[0]
+        wider = _moved(extent, side, 1)
+        corners = _outermost(wider, side).corners()
+        for reach in _REACHES_OUT:
+            seen = plane.shows(image, corners + reach * np.array(_OUTWARD[side]))
+            enough = seen.mean() >= _ENOUGH
+            if enough:
+                break
+        goes_on = enough and _alternate_as(image, plane, extent, corners[seen], reach)
+        if goes_on and seen.all():
+            extent = wider
+            continue
+        cut = cut or goes_on or not enough
+        sides.pop(0)
+    return extent, cut
+
+
+def _filled(image: Image, plane: Plane, extent: _Extent, typical: float) -> bool:
+    """Whether the grey levels within light squares scatter as they do not in dark ones."""
+    inner = replace(extent, right=extent.right - 1, bottom=extent.bottom - 1)
+    squares = inner.corners()
+    scatter = plane.levels(image, squares[:, None] + 0.5 + _INSIDE).std(axis=1)
+    # Below and right of a corner at an even place the square is as light as `typical` says.
+    even = squares.sum(axis=1) % 2 == 0
+    light = even if typical > 0 else ~even
+    more = np.median(scatter[light]) - np.median(scatter[~light])
+    return bool(more > _TEXTURE * abs(typical))
+
+
+def _is_there(image: Image, size: tuple[int, int]) -> bool:
+    """Whether the corner finder, asked for just this board, finds it."""
+    return any(cv2.findChessboardCornersSB(image, size, flags=flags)[0] for flags in _ATTEMPTS)

@@ -1,0 +1,135 @@
+"""Decoding markers of every family at once, and telling real ones from look-alikes."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image
+from visioncal.vision.targets import aruco_dictionary
+
+# By family: its dictionaries from the smallest on. Each holds the markers of those before it under
+# the same ids, so that the largest decodes them all.
+FAMILIES: dict[str, tuple[str, ...]] = {
+    **{
+        bits: tuple(f"DICT_{bits}_{count}" for count in (50, 100, 250, 1000))
+        for bits in ("4X4", "5X5", "6X6", "7X7")
+    },
+    "original": ("DICT_ARUCO_ORIGINAL",),
+    "mip": ("DICT_ARUCO_MIP_36h12",),
+    "16h5": ("DICT_APRILTAG_16h5",),
+    "25h9": ("DICT_APRILTAG_25h9",),
+    "36h10": ("DICT_APRILTAG_36h10",),
+    "36h11": ("DICT_APRILTAG_36h11",),
+}
+# Pixels a module when a marker is compared with how it should look.
+_MODULE_PX = 4
+# White around a marker that is compared too, in modules: half of what it has to have.
+_RING = 0.5
+# Correlation with the ideal marker. A strongly bending lens lowers it to 0.55. Codes of sixteen
+# bits are found by chance in other markers' squares, with up to 0.8; longer codes are not.
+_LIKE, _SHORT_LIKE = 0.5, 0.83
+_SHORT_MODULES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A decoded marker.
+
+    Attributes:
+        family: Its family, a key of `FAMILIES`.
+        number: Its id.
+        px: (4, 2) corners in OpenCV's order [px].
+        likeness: Correlation of its picture with the ideal one, -1 to 1.
+    """
+
+    family: str
+    number: int
+    px: FloatArray
+    likeness: float
+
+    @cached_property
+    def centre(self) -> FloatArray:
+        """Where its diagonals meet, (2,), which perspective keeps [px]."""
+        a, b, c, d = self.px
+        across, along = c - a, d - b
+        turn = across[0] * along[1] - across[1] * along[0]
+        if turn == 0.0:
+            return np.asarray(self.px.mean(axis=0))
+        share = ((b - a)[0] * along[1] - (b - a)[1] * along[0]) / turn
+        return np.asarray(a + share * across)
+
+    @cached_property
+    def side_px(self) -> float:
+        """Mean length of its sides [px]."""
+        return float(np.linalg.norm(self.px - np.roll(self.px, 1, axis=0), axis=1).mean())
+
+
+def decode_markers(image: Image) -> tuple[Marker, ...]:
+    """Decodes the markers of all families (Garrido-Jurado et al. 2014; OpenCV).
+
+    Args:
+        image: (h, w) grey image.
+
+    Returns:
+        The markers, look-alikes included: a lattice or `Marker.likeness` tells them apart.
+    """
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionaries = [aruco_dictionary(names[-1]) for names in FAMILIES.values()]
+    detector = cv2.aruco.ArucoDetector(dictionaries, parameters)
+    corners, ids, _, which = detector.detectMarkersMultiDict(image)
+    if not corners:
+        return ()
+    families = list(FAMILIES)
+    markers = []
+    for px, number, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
+        quad = np.asarray(px, dtype=float).reshape(4, 2)
+        family = families[int(index)]
+        likeness = _likeness(image, quad, family, int(number))
+        markers.append(Marker(family, int(number), quad, likeness))
+    return tuple(markers)
+
+
+def genuine(markers: tuple[Marker, ...]) -> tuple[Marker, ...]:
+    """Keeps the markers that look as they should; of several at one place, the likest."""
+    kept: list[Marker] = []
+    for marker in sorted(markers, key=lambda it: -it.likeness):
+        apart = all(
+            np.linalg.norm(marker.centre - other.centre) > max(marker.side_px, other.side_px) / 2
+            for other in kept
+        )
+        short = modules_along(marker.family) <= _SHORT_MODULES
+        if marker.likeness > (_SHORT_LIKE if short else _LIKE) and apart:
+            kept.append(marker)
+    return tuple(kept)
+
+
+def holding(family: str, count: int) -> tuple[str, ...]:
+    """Lists the dictionaries of a family that have at least so many markers, smallest first."""
+    names = FAMILIES[family]
+    return tuple(it for it in names if len(aruco_dictionary(it).bytesList) >= count)
+
+
+def modules_along(family: str) -> int:
+    """Counts the modules along a marker's side, its dark border included."""
+    return int(aruco_dictionary(FAMILIES[family][0]).markerSize) + 2
+
+
+def _likeness(image: Image, px: FloatArray, family: str, number: int) -> float:
+    dictionary = aruco_dictionary(FAMILIES[family][-1])
+    side = modules_along(family) * _MODULE_PX
+    ring = round(_RING * _MODULE_PX)
+    ideal = cv2.aruco.generateImageMarker(dictionary, number, side)
+    ideal = np.pad(ideal, ring, constant_values=255).astype(np.float32)
+    # Pixel centres are at integers; the marker's edge runs half a pixel before its first one.
+    frame = ring - 0.5 + side * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    flat_from_image = cv2.getPerspectiveTransform(px.astype(np.float32), frame.astype(np.float32))
+    seen = cv2.warpPerspective(
+        image, flat_from_image, ideal.shape[::-1], borderMode=cv2.BORDER_REPLICATE
+    ).astype(np.float32)
+    seen -= seen.mean()
+    ideal -= ideal.mean()
+    scale = float(np.linalg.norm(seen) * np.linalg.norm(ideal))
+    return float((seen * ideal).sum()) / scale if scale > 0.0 else 0.0

@@ -1,0 +1,135 @@
+"""What a named target is called: as a description to keep, as JSON, and in words."""
+
+from typing import Any
+
+from visioncal.core.files import one_line
+from visioncal.vision.finders.identify import Identity
+from visioncal.vision.targets import target_document
+
+
+def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
+    """Writes an identity as the content of a JSON document; what does not apply is absent.
+
+    Args:
+        identity: The target.
+        square_m: Measured side of a square, or of a single marker [m], where it is known: the
+            document then holds the target's description too.
+    """
+    document: dict[str, Any] = {
+        "kind": identity.kind,
+        "corners_seen": identity.corners_seen,
+        "corners": identity.corners,
+        "notes": list(identity.notes),
+    }
+    if identity.kind != "marker":
+        document |= {
+            "columns": identity.columns,
+            "rows": identity.rows,
+            "whole": identity.whole,
+        }
+    if identity.dictionary:
+        document |= {
+            "dictionary": identity.dictionary,
+            "same_markers": list(identity.larger),
+            "marker_ids": list(identity.marker_ids),
+        }
+    if identity.kind == "charuco":
+        document |= {
+            "legacy": identity.legacy,
+            "marker_over_square": identity.marker_share,
+            "marker_over_square_sigma": identity.marker_share_sigma,
+        }
+    if identity.kind == "aprilgrid":
+        document |= {"spacing": identity.spacing, "border": identity.border}
+    if identity.kind == "circles":
+        document |= {
+            "asymmetric": identity.asymmetric,
+            "diameter_over_distance": identity.diameter_share,
+        }
+    if square_m is not None:
+        document["target"] = target_document(identity.target("board", square_m))
+    return document
+
+
+def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
+    """Writes an identity as a target's description.
+
+    Args:
+        identity: The target.
+        square_m: Measured side of a square, or of a single marker [m]. Where it is not known, the
+            sizes become comments that say what to measure.
+        source: Where it was seen, for the first line.
+    """
+    size, what, where = "square_m", "side of a square", "measured over many squares"
+    if identity.kind == "marker":
+        size, what, where = "size_m", "side of the dark square", "measured"
+    if identity.kind == "aprilgrid":
+        size, what, where = "size_m", "side of a tag", "measured over many tags"
+    if identity.kind == "circles":
+        what, where = "distance of neighbouring rows", "measured over all of them"
+    lines = [f"# Seen in {one_line(source)}: {describe(identity)}."]
+    lines += [f"# {note}" for note in identity.notes]
+    if square_m is None:
+        lines.append(
+            f"# Fill in what a picture cannot show, the {what}, and remove the # before it."
+        )
+    # Any size would do where it is not known: those lines are written out below.
+    document = target_document(identity.target("board", 1.0 if square_m is None else square_m))
+    sized = {size, "square_sigma_m", "marker_m", "diameter_m"}
+    for key, value in document.items():
+        if key not in sized or square_m is not None:
+            lines.append(f"{key} = {_literal(value)}{_remark(identity, key)}")
+        elif key == size:
+            lines.append(f"# {size} =  # the {what} [m], {where}")
+        elif key in ("marker_m", "diameter_m"):
+            lines.append(f"# {key} ={_remark(identity, key)}")
+    return "\n".join(lines) + "\n"
+
+
+def describe(identity: Identity) -> str:
+    """Names a target in a few words."""
+    seen = f"{identity.corners_seen} of {identity.corners} corners seen"
+    if identity.kind == "marker":
+        return f"marker {identity.marker_ids[0]} of {identity.dictionary}"
+    least = "" if identity.whole else "at least "
+    size = f"{least}{identity.columns} x {identity.rows}"
+    if identity.kind == "checkerboard":
+        return f"checkerboard of {size} inner corners, {seen}"
+    if identity.kind == "circles":
+        layout = "asymmetric" if identity.asymmetric else "symmetric"
+        share = f"diameter of {identity.diameter_share:.2f} of their rows' distance"
+        return f"{layout} grid of {size} circles, {share}, {seen}"
+    if identity.kind == "aprilgrid":
+        return (
+            f"AprilGrid of {size} tags, {identity.dictionary} from id {identity.first_id}, "
+            f"{identity.spacing:g} of a tag apart, {seen}"
+        )
+    layout = ", legacy layout" if identity.legacy else ""
+    return (
+        f"ChArUco board of {size} squares, {identity.dictionary}{layout}, "
+        f"markers of {identity.marker_share:.3f} of a square, {seen}"
+    )
+
+
+def _remark(identity: Identity, key: str) -> str:
+    if key == "square_sigma_m":
+        return "  # 0.1 %, as printers keep their size: replace it by how well you measured"
+    if key == "diameter_m":
+        return f"  # {identity.diameter_share:.2f} of square_m, by the image"
+    if key != "marker_m":
+        return ""
+    share, sigma = identity.marker_share, identity.marker_share_sigma
+    return f"  # {share:.3f} of square_m, to {sigma:.1g}, by the image; measure it to be sure"
+
+
+def _literal(value: object) -> str:
+    match value:
+        case bool():
+            return str(value).lower()
+        case str():
+            return f'"{value}"'
+        case float():
+            # Nine digits keep a nanometre, and 0.03 stays 0.03.
+            return f"{value:.9g}"
+        case _:
+            return str(value)

@@ -1,0 +1,164 @@
+"""Decoding image files, and measuring how sharp they are."""
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtri
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
+from visioncal.core.types import FloatArray, Image
+from visioncal.vision.finders.headers import MOST_PIXELS, SIGNATURES, claimed_size, start_of_scan
+
+# Half-widths of the window around a corner in which its edges' width is measured [px].
+_REACH_PX = (4, 12)
+# Corners measured in an image: the median of these is stable to some percent.
+_SAMPLE = 12
+# Rows that are scaled at a time.
+_STRIP = 256
+# Under this many grey levels a picture shows nothing that a detector could use.
+_LEAST_CONTRAST = 12
+
+
+def looks_like_image(data: bytes) -> bool:
+    """Tells whether a file begins as png, jpg, tif or bmp do; damage further on does not matter."""
+    return data.startswith(SIGNATURES)
+
+
+def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
+    """Decodes an image file as the sensor saw it: without EXIF rotation.
+
+    A camera's matrix belongs to the sensor's own orientation, so a viewer's hint to rotate the
+    picture is not followed.
+
+    Args:
+        data: The content of a png, jpg or tif file.
+        colour: Whether to keep colours, as blue, green and red; grey otherwise.
+
+    Returns:
+        The (h, w) or (h, w, 3) image, or why there is none, in words.
+    """
+    if not data:
+        return "unreadable: the file is empty"
+    if _is_cut_short(data):
+        return "unreadable: the file is cut short"
+    if data.startswith(b"\x89PNG") and _is_damaged_png(data):
+        return "unreadable: the file is damaged"
+    size = claimed_size(data)
+    if size is None:
+        return "unreadable: not an image that can be decoded (png, jpg or tif is needed)"
+    if size[0] * size[1] > MOST_PIXELS:
+        return (
+            f"too large: its header claims {size[0]} x {size[1]} px, and up to "
+            f"{MOST_PIXELS / 1e6:.0f} million are decoded"
+        )
+    flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None:
+        return "unreadable: not an image that can be decoded"
+    return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
+
+
+def read_image(path: Path) -> Image:
+    """Reads a (h, w) grey image; see `decode_image`.
+
+    Raises:
+        DataError: The file is missing, or no image that can be read.
+    """
+    image = decode_image(read_bytes(path, MOST_IMAGE_BYTES))
+    if isinstance(image, str):
+        raise DataError(
+            f"{path} is {image}.",
+            culprits=[str(path)],
+            next_step="A photograph is needed, as png, jpg or tif; a page of a PDF has to be saved "
+            "as one.",
+        )
+    return image
+
+
+def _to_eight_bits(image: npt.NDArray[Any]) -> Image:
+    """Scales by the brightest levels: cameras of 10 or 12 bits fill the lower part of 16."""
+    top = float(np.percentile(_levels(image[::4, ::4]), 99.9))
+    scaled = np.empty(image.shape, dtype=np.uint8)
+    # In strips: the largest images in floats would fill the memory.
+    for at in range(0, len(image), _STRIP):
+        strip = _levels(image[at : at + _STRIP])
+        scaled[at : at + _STRIP] = np.clip(strip * (255.0 / max(top, 1e-9)), 0, 255)
+    return scaled
+
+
+def _levels(image: npt.NDArray[Any]) -> FloatArray:
+    return np.nan_to_num(image.astype(np.float32))
+
+
+def _is_cut_short(data: bytes) -> bool:
+    """Looks for the end that PNG and JPEG files carry: decoders fill up what is missing."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data[-64:]
+    if data.startswith(b"\xff\xd8"):
+        scan = start_of_scan(data)
+        return scan < 0 or data.rfind(b"\xff\xd9") < scan
+    return False
+
+
+def _is_damaged_png(data: bytes) -> bool:
+    """Checks the sums of a PNG's chunks: decoders go on past damage, with other pixels."""
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return True
+        at = end + 4
+    return False
+
+
+def blur_at_corners(image: Image, px: FloatArray) -> float:
+    """Measures the width of the edges that meet in chessboard corners.
+
+    A step edge blurred by a Gaussian of sigma s has the central difference 2 Phi(1 / s) - 1 times
+    half the step at its steepest; solved for s, this holds down to half a pixel.
+
+    Args:
+        image: (h, w) grey image.
+        px: (n, 2) corners, n >= 1.
+
+    Returns:
+        The median sigma over a sample of the corners [px].
+    """
+    chosen = px[:: max(1, len(px) // _SAMPLE)]
+    spacing = np.linalg.norm(np.diff(px, axis=0), axis=1).min(initial=4 * _REACH_PX[1])
+    reach = int(np.clip(0.3 * spacing, *_REACH_PX))
+    offsets = np.arange(-reach, reach + 1)
+    centre = np.round(chosen).astype(int)
+    rows = np.clip(centre[:, 1, None] + offsets, 0, image.shape[0] - 1)
+    columns = np.clip(centre[:, 0, None] + offsets, 0, image.shape[1] - 1)
+    return float(np.median(_edge_sigma(image[rows[:, :, None], columns[:, None, :]])))
+
+
+def why_hard_to_see(image: Image, max_blur_px: float) -> str:
+    """Says what about an image hides a target: too little contrast, or blur; empty if neither."""
+    low, high = np.percentile(image[::4, ::4], [2, 98])
+    if high - low < _LEAST_CONTRAST:
+        return f"the image is almost uniform, with {high - low:.0f} grey levels of contrast"
+    blur = float(_edge_sigma(image[None])[0])
+    if blur > max_blur_px:
+        return f"the image is blurred, its sharpest edges are {blur:.0f} px wide"
+    return ""
+
+
+def _edge_sigma(patches: Image) -> FloatArray:
+    levels = patches.astype(np.float32)
+    by_row = (levels[:, 2:, 1:-1] - levels[:, :-2, 1:-1]) / 2
+    by_column = (levels[:, 1:-1, 2:] - levels[:, 1:-1, :-2]) / 2
+    slope = np.hypot(by_row, by_column).reshape(len(levels), -1)
+    low, high = np.percentile(levels.reshape(len(levels), -1), [2, 98], axis=1)
+    steepest = np.percentile(slope, 99.5, axis=1) / np.maximum(high - low, 1.0)
+    return np.asarray(1.0 / ndtri(0.5 + np.clip(steepest, 1e-3, 0.499)), dtype=float)

@@ -1,0 +1,107 @@
+"""Maps from pixels to a board about each of its corners, which those around it determine."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from visioncal.core.types import FloatArray, IntArray, Mask
+
+# Corners around a corner that shape its map, and how far away they count half [squares].
+_AROUND, _NEAR = 25, 1.5
+# Held by so much to a plain homography, a map stays determined where corners are few.
+_RIDGE = np.diag([1e-6, 1e-4, 1e-4, *[1e-2] * 7])
+
+
+def maps_about(
+    board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray
+) -> tuple[Callable[[FloatArray], FloatArray], IntArray, FloatArray]:
+    """The maps about the chosen m corners: a homography of all, and a cubic polynomial on top.
+
+    Args:
+        board: (n, 2) the corners on the board [squares].
+        px: (n, 2) where they are, to a part of a pixel [px].
+        good: (n,) those that make the maps.
+        chosen: (m,) those about which they are made.
+
+    Returns:
+        What maps pixels (m, k, 2) to the board, from each corner; the (m, k) corners around each;
+        and what makes polynomials of values there, (m, 10, k).
+
+    Raises:
+        numpy.linalg.LinAlgError: The corners lie as no board's do.
+    """
+    middle, scale = px.mean(axis=0), float(np.abs(px - px.mean(axis=0)).max())
+    found = cv2.findHomography((px - middle) / scale, board)[0]
+    if found is None:
+        raise np.linalg.LinAlgError
+    flat_from_px = np.asarray(found, float)
+
+    def flat(places: FloatArray) -> FloatArray:
+        return _mapped(flat_from_px, (places - middle) / scale)
+
+    own = flat(px[chosen])[:, None]
+    distances, around = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
+    off = flat(px)[around] - own
+    terms = _terms(off)
+    weighed = terms * (good[around] / (1.0 + (distances / _NEAR) ** 2))[..., None]
+    weighed = weighed.transpose(0, 2, 1)
+    smoother = np.linalg.solve(weighed @ terms + _RIDGE, weighed)
+    bends = smoother @ (board[around] - board[chosen, None] - off)
+    # The corner itself is where its map is zero.
+    bends[:, 0] = 0.0
+
+    def on_board(places: FloatArray) -> FloatArray:
+        off = flat(places) - own
+        return np.asarray(off + _terms(off) @ bends)
+
+    return on_board, around, smoother
+
+
+def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
+    """Maps (..., 2) places by a (3, 3) homography."""
+    ahead = places @ homography[2, :2] + homography[2, 2]
+    return np.asarray((places @ homography[:2, :2].T + homography[:2, 2]) / ahead[..., None])
+
+
+def _terms(at: FloatArray) -> FloatArray:
+    """(..., 10) powers and products of (..., 2) places, up to the third order."""
+    x, y = at[..., 0], at[..., 1]
+    ones, xx, xy, yy = np.ones_like(x), x * x, x * y, y * y
+    return np.stack([ones, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
+
+
+def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """One map from places to the whole board: a homography and a cubic polynomial on top.
+
+    Args:
+        board: (n, 2) corners on the board [squares].
+        places: (n, 2) where they are, by any two coordinates of a plane.
+
+    Returns:
+        What maps places (..., 2) to the board.
+
+    Raises:
+        numpy.linalg.LinAlgError: The corners lie as no board's do.
+    """
+    middle, scale = places.mean(axis=0), float(np.abs(places - places.mean(axis=0)).max())
+    found = cv2.findHomography((places - middle) / scale, board)[0]
+    if found is None:
+        raise np.linalg.LinAlgError
+    flat_from_places = np.asarray(found, float)
+    centre, size = board.mean(axis=0), float(np.abs(board - board.mean(axis=0)).max())
+
+    def flat(at: FloatArray) -> FloatArray:
+        return np.asarray((_mapped(flat_from_places, (at - middle) / scale) - centre) / size)
+
+    off = (board - centre) / size - flat(places)
+    terms = _terms(flat(places))
+    ridge = len(board) * _RIDGE
+    bends = np.linalg.solve(terms.T @ terms + ridge, terms.T @ off)
+
+    def on_board(at: FloatArray) -> FloatArray:
+        near = flat(at)
+        return np.asarray(centre + size * (near + _terms(near) @ bends))
+
+    return on_board

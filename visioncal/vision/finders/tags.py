@@ -1,0 +1,73 @@
+"""Finding tags whose corners are known points."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image, Target
+from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
+from visioncal.vision.finders.result import NotFound, Seen
+from visioncal.vision.finders.template import refine_tags
+from visioncal.vision.targets import aruco_dictionary, corner_positions, tag_corners
+
+# So many whole tags in one plane tell whether they lie as described.
+_LEAST_TAGS = 2
+_SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+def find_tags(image: Image, target: Target) -> Seen | NotFound:
+    """Finds the corners of a rig's tags.
+
+    Args:
+        image: (h, w) grey image.
+        target: A rig whose points are corners of tags.
+
+    Returns:
+        The corners, or why there are none.
+    """
+    if min(image.shape) < 2:
+        return NotFound("the image is a line")
+    dictionary = aruco_dictionary(target.dictionary)
+    found, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    numbers = [] if ids is None else [int(it) for it in ids.ravel()]
+    known = tag_corners(target)
+    quads = {
+        number: np.asarray(px, dtype=float).reshape(4, 2)
+        for number, px in zip(numbers, found, strict=True)
+        if number in known and numbers.count(number) == 1
+    }
+    if not quads:
+        seen = f"; seen instead: {', '.join(map(str, numbers[:5]))}" if numbers else ""
+        return NotFound(
+            f"no tag of the target's, of {target.dictionary}, is seen{seen}", misfit=bool(numbers)
+        )
+    places = _in_plane(target, quads)
+    if places is not None:
+        side = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
+        if layout_misfit(places / side, np.array(list(quads.values()))) > LAYOUT_MISFIT:
+            return NotFound("the tags do not lie as the target describes them", misfit=True)
+    modules = int(dictionary.markerSize) + 2
+    if places is None:
+        # Of each tag by itself it is known that it is square.
+        parts = [refine_tags(image, modules, _SQUARE[None], it[None]) for it in quads.values()]
+    else:
+        parts = [refine_tags(image, modules, places, np.array(list(quads.values())))]
+    points = np.concatenate([known[it] for it in quads])
+    fitted = np.array([not it for part in parts for it in part.reasons]) & (points >= 0)
+    if not fitted.any():
+        return NotFound("no corner of the tags seen is like the print")
+    px = np.concatenate([it.px for it in parts])[fitted]
+    order = np.argsort(points[fitted])
+    blur_px = float(np.nanmedian([it.blur_px.max() for it in parts]))
+    return Seen(points[fitted][order], px[order], blur_px=blur_px)
+
+
+def _in_plane(target: Target, quads: Mapping[int, FloatArray]) -> FloatArray | None:
+    """The (t, 4, 2) places of tags [m] where all are whole, two or more, in the plane z = 0."""
+    known = tag_corners(target)
+    numbers = np.array([known[it] for it in quads])
+    places = corner_positions(target)
+    if len(quads) < _LEAST_TAGS or (numbers < 0).any() or np.ptp(places[:, 2]) > 0.0:
+        return None
+    return np.asarray(places[numbers, :2])

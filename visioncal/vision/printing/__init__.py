@@ -1,0 +1,19 @@
+"""Printable boards: a target's dark shapes, laid out on a page and written at their exact size."""
+
+from visioncal.vision.printing.files import write_board
+from visioncal.vision.printing.page import Page, Sheet, arrange, pages_named
+from visioncal.vision.printing.pattern import Pattern, draw_pattern
+from visioncal.vision.printing.request import Request, requested_target, side_metres
+
+__all__ = [
+    "Page",
+    "Pattern",
+    "Request",
+    "Sheet",
+    "arrange",
+    "draw_pattern",
+    "pages_named",
+    "requested_target",
+    "side_metres",
+    "write_board",
+]

@@ -1,0 +1,176 @@
+"""Drawing a sheet as PDF, SVG and PNG, every one of them at its exact size.
+
+PDF and SVG carry coordinates to a millionth of a point. The dark of a board is one path, filled at
+once: there is no edge between neighbouring cells at which a renderer could leave a seam.
+"""
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+from matplotlib.transforms import Affine2D, Transform
+
+from visioncal.core.threads import DRAWING
+from visioncal.core.types import FloatArray
+from visioncal.vision.printing.page import FONT_PT, LINE_MM, Sheet
+
+_MM_PER_INCH = 25.4
+_PT_PER_MM = 72.0 / _MM_PER_INCH
+_FONT = "DejaVu Sans"
+_GREY = "#444444"
+_LINE_PT = 0.5
+# The ruler's line above the quiet zone, its ticks, its label, its arrow [mm].
+_BASE_MM, _TICK_MM, _END_TICK_MM, _LABEL_MM = 0.8, 0.8, 2.4, 1.2
+_HEAD_MM, _HALF_HEAD_MM, _TIP_MM, _LETTER_MM = 2.2, 0.6, 4.0, 5.5
+
+
+def to_pdf(sheet: Sheet) -> bytes:
+    """Draws a sheet as a PDF of one page."""
+    return _saved(sheet, "pdf", {"CreationDate": None, "Creator": "visioncal", "Producer": None})
+
+
+def to_svg(sheet: Sheet) -> bytes:
+    """Draws a sheet as SVG; its text is drawn as shapes, which need no font."""
+    return _saved(sheet, "svg", {"Date": None, "Creator": "visioncal"})
+
+
+def to_png(sheet: Sheet, dpi: float) -> bytes:
+    """Draws a sheet as PNG, whose grey at edges keeps their places to a part of a pixel.
+
+    Args:
+        sheet: The sheet.
+        dpi: Pixels an inch, which the file states too.
+    """
+    return _saved(sheet, "png", {"Software": "visioncal"}, dpi)
+
+
+def not_in_font(text: str) -> str:
+    """Gives the letters of a text that the sheets' font does not have."""
+    font = get_font(findfont(_FONT))
+    return "".join(it for it in text if not font.get_char_index(ord(it)))
+
+
+def _saved(
+    sheet: Sheet, kind: str, metadata: dict[str, str | None], dpi: float | None = None
+) -> bytes:
+    with _style():
+        figure = _figure(sheet)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind, dpi=dpi or "figure", metadata=metadata)
+    return buffer.getvalue()
+
+
+@contextmanager
+def _style() -> Iterator[None]:
+    """Settings under which the same sheet gives the same bytes, whatever a user has set."""
+    settings: dict[Any, Any] = {
+        "font.family": _FONT,
+        "path.simplify": False,
+        "pdf.compression": 9,
+        "pdf.fonttype": 3,
+        "svg.fonttype": "path",
+        "svg.hashsalt": "visioncal",
+        "savefig.bbox": None,
+        "savefig.facecolor": "white",
+        "savefig.transparent": False,
+        "text.usetex": False,
+    }
+    with DRAWING, mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(settings)
+        yield
+
+
+def _figure(sheet: Sheet) -> Figure:
+    page = sheet.page
+    figure = Figure(figsize=(page.width_mm / _MM_PER_INCH, page.height_mm / _MM_PER_INCH))
+    # From mm, y down from the page's top left corner, to inches, y up from its bottom left one.
+    inches_from_mm = Affine2D().translate(0.0, -page.height_mm).scale(1.0, -1.0)
+    on_page = inches_from_mm.scale(1.0 / _MM_PER_INCH) + figure.dpi_scale_trans
+    origin = np.array(sheet.origin_mm)
+    _fill(figure, [origin + 1e3 * loop for loop in sheet.pattern.loops], "black", on_page)
+    for axis in (0, 1):
+        _draw_ruler(figure, sheet, axis, on_page)
+    x, y = sheet.text_mm
+    for number, line in enumerate(sheet.lines):
+        figure.text(
+            x,
+            y + LINE_MM * number,
+            line,
+            transform=on_page,
+            fontsize=FONT_PT,
+            color="black" if number == 0 else _GREY,
+            va="top",
+            # A name may hold the signs that matplotlib takes for formulas.
+            parse_math=False,
+        )
+    return figure
+
+
+def _fill(figure: Figure, loops: list[FloatArray], colour: str, on_page: Transform) -> None:
+    """Fills loops [mm] as one path."""
+    paths = [Outline(np.vstack([loop, loop[:1]]), closed=True) for loop in loops]
+    patch = PathPatch(Outline.make_compound_path(*paths), facecolor=colour, linewidth=0.0)
+    patch.set_transform(on_page)
+    # Snapping would move edges to whole pixels.
+    patch.set_snap(False)
+    figure.add_artist(patch)
+
+
+def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> None:
+    """Draws the ruler along one axis of the target's frame, outside the quiet zone."""
+    length = sheet.ruler_mm[axis]
+    across = 1 - axis
+    side = 1e3 * (sheet.pattern.box[across] - sheet.pattern.quiet_m) - _BASE_MM
+
+    def at(along: float, away: float) -> FloatArray:
+        place = np.array(sheet.origin_mm)
+        place[axis] += along
+        place[across] += side - away
+        return place
+
+    half = _LINE_PT / _PT_PER_MM / 2
+    tip = length + _TIP_MM
+    # Lines are filled rectangles, so that every renderer puts them where they are.
+    bars = [_bar(at(-half, -half), at(tip - _HEAD_MM, half))]
+    for tick in np.arange(0.0, length + 1.0, 10.0):
+        tall = _END_TICK_MM if tick in (0.0, length) else _TICK_MM
+        bars.append(_bar(at(tick - half, 0.0), at(tick + half, tall)))
+    bars.append(
+        np.array(
+            [
+                at(tip, 0.0),
+                at(tip - _HEAD_MM, _HALF_HEAD_MM),
+                at(tip - _HEAD_MM, -_HALF_HEAD_MM),
+            ]
+        )
+    )
+    _fill(figure, bars, _GREY, on_page)
+    labels = [("xy"[axis], _LETTER_MM + length, 0.0)]
+    if length > 0.0:
+        labels.append((f"{length:g} mm", length / 2, _LABEL_MM + FONT_PT / _PT_PER_MM / 2.6))
+    for text, along, away in labels:
+        place = at(along, away)
+        figure.text(
+            float(place[0]),
+            float(place[1]),
+            text,
+            transform=on_page,
+            fontsize=FONT_PT - 1,
+            color=_GREY,
+            ha="center",
+            va="center_baseline" if text in "xy" else "center",
+            rotation=90 if axis and text not in "xy" else 0,
+        )
+
+
+def _bar(corner: FloatArray, opposite: FloatArray) -> FloatArray:
+    (x, y), (far_x, far_y) = corner, opposite
+    return np.array([[x, y], [far_x, y], [far_x, far_y], [x, far_y]])

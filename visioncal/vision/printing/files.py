@@ -1,0 +1,114 @@
+"""Writing a board's files."""
+
+from pathlib import Path
+
+import tomli_w
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, named_errors, read_toml, write_atomically
+from visioncal.core.output_generations import write_generation
+from visioncal.core.types import Target
+from visioncal.vision.printing.page import Sheet
+from visioncal.vision.printing.request import OF_TAGS
+from visioncal.vision.targets import target_document, target_from_document
+
+# Beyond this many pixels a page takes gigabytes to draw.
+_MOST_PIXELS = 2.5e8
+_LEAST_DPI = 50.0
+# Whatever its letters, such a name keeps below the 255 bytes that file systems take.
+_LONGEST_NAME = 60
+
+
+def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
+    """Writes a board as PDF, SVG, PNG and TOML, named after the target.
+
+    The files appear all at once. A `.toml` that is there and describes the
+    same target stays as it is, with its comments.
+
+    Args:
+        folder: Where to; it is made where there is none.
+        sheet: The arranged board.
+        dpi: Pixels an inch of the PNG.
+        force: Whether files that are there may be replaced.
+
+    Returns:
+        The files that were written, the PDF first.
+
+    Raises:
+        DataError: A file is there already, the folder cannot be written, or the PNG would be too
+            large.
+    """
+    # matplotlib takes half a second to import, which help and refusals need not wait for.
+    from visioncal.vision.printing.drawing import not_in_font, to_pdf, to_png, to_svg
+
+    name = sheet.target.name
+    _check_name(name, not_in_font(name))
+    _check_dpi(sheet, dpi)
+    files = {ending: folder / f"{name}.{ending}" for ending in ("pdf", "svg", "png", "toml")}
+    # The folder may have a name that no file system takes.
+    with named_errors(folder):
+        kept = _describes(files["toml"], sheet.target)
+        for ending, path in files.items():
+            if ending != "toml" or not kept:
+                check_free(path, force=force)
+    drawn: dict[str, bytes | str] = {
+        "pdf": to_pdf(sheet),
+        "svg": to_svg(sheet),
+        "png": to_png(sheet, dpi),
+    }
+    if not kept:
+        drawn["toml"] = _description(sheet)
+
+    def write(aside: Path) -> None:
+        for ending, content in drawn.items():
+            write_atomically(aside / files[ending].name, content)
+
+    write_generation(folder, [files[ending].name for ending in drawn], write)
+    return tuple(files[ending] for ending in drawn)
+
+
+def _check_name(name: str, not_in_font: str) -> None:
+    """Refuses what cannot be the name of a file, or be printed on the sheet."""
+    wrong = sorted({*not_in_font, *'/\\:*?"<>|'} & set(name))
+    if not name.strip() or name.startswith(".") or wrong or len(name) > _LONGEST_NAME:
+        raise DataError(
+            f"{name[:_LONGEST_NAME]!r} cannot be the name of files and stand on the print"
+            + (f": {' '.join(map(repr, wrong))} cannot." if wrong else "."),
+            culprits=[name[:_LONGEST_NAME]],
+            next_step=f"Use up to {_LONGEST_NAME} letters, digits, _ and -.",
+        )
+
+
+def _check_dpi(sheet: Sheet, dpi: float) -> None:
+    area_inch2 = sheet.page.width_mm * sheet.page.height_mm / 25.4**2
+    most = (_MOST_PIXELS / area_inch2) ** 0.5
+    if not _LEAST_DPI <= dpi <= most:
+        raise DataError(
+            f"--dpi is {dpi:g}; {_LEAST_DPI:g} to {most:.0f} are possible on {sheet.page}.",
+            culprits=["--dpi"],
+            next_step="The PDF and the SVG are exact at any magnification.",
+        )
+
+
+def _describes(path: Path, target: Target) -> bool:
+    """Whether a file is there and describes this very target."""
+    if not path.is_file():
+        return False
+    try:
+        there = target_from_document(read_toml(path, path.name), target.name)
+    except DataError:
+        return False
+    return there == target
+
+
+def _description(sheet: Sheet) -> str:
+    left, top, right, bottom = sheet.pattern.box
+    page = sheet.page
+    lying = "landscape" if page.width_mm > page.height_mm else "portrait"
+    size = "size_m" if sheet.target.kind in OF_TAGS else "square_m"
+    return (
+        f"# {1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, for {page.name}, {lying}.\n"
+        f"# {size} is what was meant to be printed: replace it by what you measure on paper,\n"
+        "# and square_sigma_m by how well you measured it.\n"
+        + tomli_w.dumps(target_document(sheet.target))
+    )

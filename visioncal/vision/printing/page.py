@@ -1,0 +1,306 @@
+"""Where a board, its rulers and its text go on a page."""
+
+import re
+import textwrap
+from dataclasses import dataclass, replace
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import did_you_mean
+from visioncal.core.types import Target
+from visioncal.vision.printing.pattern import Pattern, draw_pattern
+
+# Portrait: width and height [mm] (ISO 216; ANSI Y14.1).
+_PAGES_MM = {
+    "A5": (148.0, 210.0),
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+}
+_OWN_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)(?:\s*mm)?", re.IGNORECASE)
+_LEAST_MM, _MOST_MM = 20.0, 3000.0
+
+# Office printers leave this much of the paper's edge white.
+EDGE_MM = 5.0
+# Height of the strip that holds a ruler, its ticks and its label.
+RULER_MM = 4.0
+_FULL_RULER_MM, _STEP_MM = 100.0, 10.0
+# What a ruler's axis needs beyond its last tick: the arrow and its letter.
+ARROW_MM = 8.0
+
+FONT_PT = 7.0
+LINE_MM = 3.1
+# What is measured over whole squares.
+_OF_SQUARES = ("charuco", "checkerboard")
+# The text's gap to the white around the board.
+_GAP_MM = 0.5
+# Width of a line over its number of letters, with some room to spare.
+_LETTER_MM = 1.3
+# Text beside a narrow board may be this wide.
+_TEXT_MM = 170.0
+
+
+@dataclass(frozen=True)
+class Page:
+    """A sheet of paper: its name for messages, its width and height [mm]."""
+
+    name: str
+    width_mm: float
+    height_mm: float
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.width_mm:g} x {self.height_mm:g} mm)"
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A page with everything that is printed on it, in mm from its top left corner, y down.
+
+    Attributes:
+        target: The target.
+        pattern: Its shapes.
+        page: The paper.
+        origin_mm: Where the origin of the target's frame is.
+        ruler_mm: Lengths of the rulers along x and y; they start level with the origin.
+        lines: The text below the board.
+        text_mm: The text's top left corner.
+    """
+
+    target: Target
+    pattern: Pattern
+    page: Page
+    origin_mm: tuple[float, float]
+    ruler_mm: tuple[float, float]
+    lines: tuple[str, ...]
+    text_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Room:
+    """What a board needs: white on its left, top and right, and all of it [mm]."""
+
+    left: float
+    top: float
+    right: float
+    width: float
+    height: float
+
+
+def pages_named(text: str, landscape: bool | None) -> tuple[Page, ...]:
+    """Reads the name or the size of a page.
+
+    Args:
+        text: A name, as `A4`, or a size, as `500x300` (width x height, mm).
+        landscape: Turn the page on its long side; on its short side where False. None leaves a
+            named page open, and takes a size as it is given.
+
+    Returns:
+        The pages that the text allows, landscape first.
+
+    Raises:
+        DataError: There is no such page, or its size is out of range.
+    """
+    names = {name.lower(): name for name in _PAGES_MM}
+    own = _OWN_SIZE.fullmatch(text.strip())
+    if own is not None:
+        sides, name = (float(own[1]), float(own[2])), "page"
+    elif text.strip().lower() in names:
+        name = names[text.strip().lower()]
+        sides = _PAGES_MM[name]
+    else:
+        raise DataError(
+            f"There is no page named {text!r}; the names are {', '.join(_PAGES_MM)}.",
+            culprits=[text],
+            next_step=f"{did_you_mean(text, names)} A size of your own is given as 500x300, width "
+            "x height in mm.".strip(),
+        )
+    if not all(_LEAST_MM <= side <= _MOST_MM for side in sides):
+        raise DataError(
+            f"The page {text} is out of range: {_LEAST_MM:g} to {_MOST_MM:g} mm a side are "
+            "possible.",
+            culprits=[text],
+        )
+    long, short = max(sides), min(sides)
+    if landscape is None and own is not None:
+        return (Page(name, *sides),)
+    lying, standing = Page(name, long, short), Page(name, short, long)
+    if landscape is None:
+        return lying, standing
+    return (lying,) if landscape else (standing,)
+
+
+def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
+    """Arranges a target on the first of the pages that has room for it.
+
+    Raises:
+        DataError: None has; the message says what is needed, and what would fit.
+    """
+    pattern = draw_pattern(target)
+    for page in pages:
+        room = _room(target, pattern, page)
+        if room.width <= page.width_mm and room.height <= page.height_mm:
+            return _centred(target, pattern, page, room)
+    left, top, right, bottom = pattern.box
+    needed = _room(target, pattern, pages[0])
+    sides = {"charuco": "square", "checkerboard": "square", "circles": "distance"}
+    what = sides.get(target.kind, "side")
+    largest = largest_side_mm(target, pages)
+    smaller = f", or a {what} of {largest} mm, the largest that fits" if largest else ""
+    raise DataError(
+        f"{target.name} does not fit on {', '.join(map(str, pages))}: the print measures "
+        f"{1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, and with the white around it, "
+        f"the rulers and the text it needs {needed.width:.1f} x {needed.height:.1f} mm.",
+        culprits=[target.name],
+        next_step=f"Take a larger page (--page){smaller}.",
+    )
+
+
+def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
+    """Finds the largest square that fits, in whole millimetres; the marker's side for a marker.
+
+    Args:
+        target: The target; its markers grow with its squares.
+        pages: The pages that it may be printed on.
+
+    Returns:
+        The side [mm]; 0 where not even one millimetre fits.
+    """
+    fits, fails = 0, 1 + int(max(max(page.width_mm, page.height_mm) for page in pages))
+    while fails - fits > 1:
+        middle = (fits + fails) // 2
+        scale = 1e-3 * middle / target.square_m
+        tried = replace(
+            target,
+            square_m=scale * target.square_m,
+            marker_m=scale * target.marker_m,
+            diameter_m=scale * target.diameter_m,
+        )
+        pattern = draw_pattern(tried)
+        rooms = [(_room(tried, pattern, page), page) for page in pages]
+        if any(it.width <= page.width_mm and it.height <= page.height_mm for it, page in rooms):
+            fits = middle
+        else:
+            fails = middle
+    return fits
+
+
+def _room(target: Target, pattern: Pattern, page: Page) -> _Room:
+    left, top, right, bottom = (1e3 * side for side in pattern.box)
+    quiet_mm = 1e3 * pattern.quiet_m
+    lines = _lines(target, _text_width_mm(right - left, page))
+    above = EDGE_MM + RULER_MM + quiet_mm
+    beside = max(EDGE_MM, quiet_mm)
+    below = quiet_mm + _GAP_MM + LINE_MM * len(lines) + EDGE_MM
+    width, height = above + right - left + beside, above + bottom - top + below
+    return _Room(above, above, beside, width, height)
+
+
+def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet:
+    """Centres the print between the edges of a page that has room for it."""
+    left, top, right, bottom = (1e3 * side for side in pattern.box)
+    width, height = right - left, bottom - top
+    x = min(max((page.width_mm - width) / 2, room.left), page.width_mm - width - room.right)
+    y = (page.height_mm - room.height) / 2 + room.top
+    text_width = _text_width_mm(width, page)
+    lines = _lines(target, text_width)
+    across = _ruler_mm(page.width_mm - (x - left))
+    down = _ruler_mm(page.height_mm - LINE_MM * len(lines) - (y - top))
+    # The text stays clear of the board and of a ruler that is longer than the board.
+    below_board = y + height + 1e3 * pattern.quiet_m + _GAP_MM
+    below_ruler = y - top + down + ARROW_MM
+    return Sheet(
+        target,
+        pattern,
+        page,
+        origin_mm=(x - left, y - top),
+        ruler_mm=(across, down),
+        lines=lines,
+        text_mm=(
+            max(EDGE_MM, min(x, x + width / 2 - text_width / 2)),
+            max(below_board, below_ruler),
+        ),
+    )
+
+
+def _ruler_mm(room_mm: float) -> float:
+    """Length of a ruler that starts this far from the paper's edge."""
+    whole = _STEP_MM * ((room_mm - EDGE_MM - ARROW_MM) // _STEP_MM)
+    return min(max(whole, 0.0), _FULL_RULER_MM)
+
+
+def _text_width_mm(width_mm: float, page: Page) -> float:
+    return min(max(width_mm, _TEXT_MM), page.width_mm - 2 * EDGE_MM)
+
+
+def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
+    letters = max(int(width_mm / _LETTER_MM), 10)
+    return tuple(
+        line for text in _sentences(target) for line in textwrap.wrap(text, letters) or [""]
+    )
+
+
+def _sentences(target: Target) -> tuple[str, str, str]:
+    """What the board is, where its frame is, and what to do with it."""
+    side_mm = f"{1e3 * target.square_m:g} mm"
+    printed = "Print at 100 %, not fitted to the page, and check both rulers."
+    match target.kind:
+        case "marker":
+            what = f"marker {target.marker_id} of {target.dictionary}, {side_mm} a side"
+            origin = "the marker's centre"
+            measure = "Measure the dark square's side and write it into size_m, in metres."
+        case "checkerboard":
+            what = (
+                f"checkerboard, {target.columns} x {target.rows} inner corners, squares of "
+                f"{side_mm}"
+            )
+            origin = "the inner corner at the top left"
+        case "charuco":
+            layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
+            what = (
+                f"ChArUco, {target.columns} x {target.rows} squares of {side_mm}, markers of "
+                f"{1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}"
+            )
+            origin = "the print's top left corner"
+        case "aprilgrid":
+            what = (
+                f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm}, "
+                f"{1e3 * target.spacing * target.square_m:g} mm apart, {target.dictionary} from id "
+                f"{target.marker_id} at the lower left"
+            )
+            origin = "the upper left corner of the tag at the top left"
+            sides = target.columns + (target.columns - 1) * target.spacing
+            measure = (
+                f"Measure over all {target.columns} columns of tags, meant to be "
+                f"{1e3 * sides * target.square_m:g} mm; divide by {sides:g} and write the result "
+                "into size_m, in metres."
+            )
+        case "points":
+            what = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
+            origin = "the origin of the table of their corners"
+            measure = "Measure the tags' corners and write them into that table, in metres."
+        case "circles":
+            what = (
+                f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {target.columns} x "
+                f"{target.rows} circles of {1e3 * target.diameter_m:g} mm, rows {side_mm} apart"
+            )
+            origin = "the centre of the circle at the top left"
+            measure = (
+                f"Measure from the first row's centres to the last one's, meant to be "
+                f"{1e3 * (target.rows - 1) * target.square_m:g} mm; divide by {target.rows - 1} "
+                "and write the result into square_m, in metres."
+            )
+    if target.kind in _OF_SQUARES:
+        count = target.columns + (target.kind == "checkerboard")
+        measure = (
+            f"Measure over all {count} columns, meant to be {1e3 * count * target.square_m:g} mm; "
+            f"divide by {count} and write the result into square_m, in metres."
+        )
+    frame = (
+        f"Frame: origin at {origin}, level with the zeros of both rulers; x to the right, y down, "
+        "z into the page."
+    )
+    return f"{target.name}: {what}", frame, f"{printed} {measure}"

@@ -1,0 +1,95 @@
+"""The dark shapes of a target, in its own frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, Mask, Target
+from visioncal.vision.prints import dark_cells, dark_discs
+from visioncal.vision.targets import extent_m
+
+# White that finders need around squares; markers need one of their own modules.
+_QUIET_M = 0.0025
+# A circle: the middles of its sides are within a two-thousandth of its radius.
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """What is printed of a target.
+
+    Attributes:
+        loops: Closed outlines, (n, 2) each, in the target's frame [m]; the last point joins the
+            first. Dark is what they wind around once; a hole's outline runs the other way. No two
+            of them share more than a point, so that no renderer can leave a seam.
+        box: Left, top, right and bottom of the print in the target's frame [m].
+        quiet_m: White that has to stay around the print [m].
+    """
+
+    loops: tuple[FloatArray, ...]
+    box: tuple[float, float, float, float]
+    quiet_m: float
+
+
+def draw_pattern(target: Target) -> Pattern:
+    """Draws a target: its corners are where `targets.corner_positions` has them.
+
+    Raises:
+        DataError: It is a rig of points.
+    """
+    (left, top), (right, bottom) = (it.tolist() for it in extent_m(target))
+    grids = dark_cells(target)
+    loops = [
+        it.corner_m + it.cell_m * loop @ it.turn.T for it in grids for loop in outlines(it.dark)
+    ]
+    loops += [it + target.diameter_m / 2 * _CIRCLE for it in dark_discs(target)]
+    of_tags = target.kind in ("marker", "points")
+    quiet_m = max(it.cell_m for it in grids) if of_tags else _QUIET_M
+    return Pattern(tuple(loops), (left, top, right, bottom), quiet_m)
+
+
+def outlines(dark: Mask) -> tuple[FloatArray, ...]:
+    """Traces the borders of the dark cells of a grid.
+
+    Every dark cell has four directed sides, with the cell on their right as seen on the page. Sides
+    between two dark cells cancel; what is left joins to loops.
+
+    Args:
+        dark: (rows, columns) cells.
+
+    Returns:
+        (n, 2) loops of the corners (x, y), in cells; (0, 0) is the outer corner of the first cell.
+    """
+    sides: set[tuple[tuple[int, int], tuple[int, int]]] = set()
+    for y, x in np.argwhere(dark).tolist():
+        corners = ((x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1))
+        for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+            if (end, start) in sides:
+                sides.remove((end, start))
+            else:
+                sides.add((start, end))
+    onward: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for start, end in sorted(sides):
+        onward.setdefault(start, []).append(end)
+    loops = []
+    while onward:
+        at = first = next(iter(onward))
+        loop: list[tuple[int, int]] = []
+        while not loop or at != first:
+            loop.append(at)
+            # Where two cells touch in a point, either way closes a loop of the same windings.
+            ends = onward[at]
+            following = ends.pop()
+            if not ends:
+                del onward[at]
+            at = following
+        loops.append(_without_straight(np.array(loop, dtype=float)))
+    return tuple(loops)
+
+
+def _without_straight(loop: FloatArray) -> FloatArray:
+    """Drops the points of a loop at which it does not turn."""
+    before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
+    turns = before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]
+    return np.asarray(loop[turns])

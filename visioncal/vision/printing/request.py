@@ -1,0 +1,165 @@
+"""From a few wishes to a target: sizes that are left open become the largest that fit."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import Target, TargetKind
+from visioncal.vision.printing.page import Page, arrange, largest_side_mm
+from visioncal.vision.targets import (
+    APRILGRID_DICTIONARY,
+    LARGEST_M,
+    aruco_dictionary,
+    metres,
+    target_from_document,
+)
+
+# A marker's share of its square: it leaves at least one module of white on every side.
+_MARKER_SHARE = 0.75
+# Kalibr's pages have so much white between their tags, as a share of a tag's side.
+_SPACING = 0.3
+# The diameter of circles as a share of the distance of neighbours: as much edge as white between.
+_DIAMETER_SHARE = 0.5
+# Kinds whose size is that of a tag.
+OF_TAGS = ("marker", "aprilgrid")
+# Smaller squares are lost to the printer's dots.
+_LEAST_MM = 5
+# Nobody measures a smaller one to its 0.1 %.
+_SMALLEST_MM = 0.1
+_USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
+
+
+@dataclass(frozen=True)
+class Request:
+    """A board that somebody wants; None and empty texts are chosen.
+
+    Attributes:
+        kind: What is printed.
+        columns: Squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles
+            along x.
+        rows: The same along y.
+        square_mm: Side of a square; of the marker itself for a single marker and an AprilGrid [mm].
+        marker_mm: Side of the markers in a ChArUco board [mm].
+        dictionary: ArUco dictionary by OpenCV's name.
+        legacy: Whether a ChArUco board gets the layout that OpenCV printed before 4.6.
+        marker_id: The id of a single marker; the least one of an AprilGrid.
+        name: The target's name.
+        spacing: White between the tags of an AprilGrid, as a share of their side.
+        border: Dark modules around their bits.
+        diameter_mm: Diameter of circles [mm].
+        asymmetric: Whether every second row of them is shifted.
+    """
+
+    kind: TargetKind
+    columns: int | None = None
+    rows: int | None = None
+    square_mm: float | None = None
+    marker_mm: float | None = None
+    dictionary: str = ""
+    legacy: bool = False
+    marker_id: int | None = None
+    name: str = ""
+    spacing: float | None = None
+    border: int | None = None
+    diameter_mm: float | None = None
+    asymmetric: bool = False
+
+
+def side_metres(option: str, side_mm: float) -> float:
+    """Turns a side given in millimetres into metres.
+
+    Args:
+        option: By which option it was given, for messages.
+        side_mm: Side of a square or of a marker [mm].
+
+    Raises:
+        DataError: It is no number, or none that a board could have.
+    """
+    most_mm = 1e3 * LARGEST_M
+    if not _SMALLEST_MM <= side_mm <= most_mm:
+        raise DataError(
+            f"{option} is {side_mm:g}; {_SMALLEST_MM:g} to {most_mm:g} mm are possible.",
+            culprits=[option],
+        )
+    return metres(side_mm)
+
+
+def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
+    """Builds the target that is wished for.
+
+    Args:
+        request: The wishes. A side left out becomes the largest in whole millimetres that fits one
+            of the pages, a marker's side three quarters of its square's, in whole millimetres.
+        pages: The pages that it may be printed on.
+
+    Raises:
+        DataError: A wish is missing or cannot be met.
+    """
+    if request.square_mm is not None:
+        return _target(request, request.square_mm)
+    smallest = _target(request, _LEAST_MM)
+    largest = largest_side_mm(smallest, pages)
+    if largest < _LEAST_MM:
+        # Says what would be needed.
+        arrange(smallest, pages)
+    return _target(request, largest)
+
+
+def _target(request: Request, square_mm: float) -> Target:
+    document: dict[str, Any] = {"kind": request.kind}
+    of_tags = request.kind in OF_TAGS
+    side_m = side_metres("--size-mm" if of_tags else "--square-mm", square_mm)
+    document |= {"size_m" if of_tags else "square_m": side_m}
+    if of_tags:
+        document |= {"dictionary": request.dictionary or APRILGRID_DICTIONARY}
+    wishes: dict[str, float | None] = {"id": request.marker_id} if of_tags else {}
+    if request.kind != "marker":
+        wishes |= {"columns": request.columns, "rows": request.rows}
+    if request.kind == "aprilgrid":
+        spacing = _SPACING if request.spacing is None else request.spacing
+        wishes |= {"spacing": spacing, "border": request.border}
+    document |= {key: value for key, value in wishes.items() if value is not None}
+    if request.kind == "circles":
+        share = _DIAMETER_SHARE * (1.4 if request.asymmetric else 1.0)
+        diameter_mm = round(share * square_mm, 6)
+        if request.diameter_mm is not None:
+            diameter_mm = request.diameter_mm
+        document |= {
+            "diameter_m": side_metres("--diameter-mm", diameter_mm),
+            "asymmetric": request.asymmetric,
+        }
+    if request.kind == "charuco":
+        marker_mm = request.marker_mm
+        if marker_mm is None:
+            # Under ten millimetres a whole number would be too far from the share; a nanometre
+            # is as good as any number.
+            marker_mm = round(_MARKER_SHARE * square_mm, 6)
+            marker_mm = float(int(marker_mm)) if square_mm >= 2 * _LEAST_MM else marker_mm
+        document |= {
+            "marker_m": side_metres("--marker-mm", marker_mm),
+            "dictionary": request.dictionary or _enough(request),
+            "legacy": request.legacy,
+        }
+    label = request.name or request.kind
+    target = target_from_document(document, label)
+    return target if request.name else target_from_document(document, _name(target))
+
+
+def _enough(request: Request) -> str:
+    """The first of the usual dictionaries that has enough markers."""
+    needed = (request.columns or 0) * (request.rows or 0) // 2
+    for name in _USUAL:
+        if len(aruco_dictionary(name).bytesList) >= needed:
+            return name
+    return _USUAL[-1]
+
+
+def _name(target: Target) -> str:
+    side = f"{1e3 * target.square_m:g}mm"
+    if target.kind == "marker":
+        family = target.dictionary.removeprefix("DICT_").lower()
+        family = family if family.startswith("a") else f"aruco_{family}"
+        return f"{family}_id{target.marker_id}_{side}"
+    legacy = "_legacy" if target.legacy else ""
+    layout = "_asymmetric" if target.asymmetric else legacy
+    return f"{target.kind}_{target.columns}x{target.rows}_{side}{layout}"

@@ -1,0 +1,112 @@
+"""What is dark on a printed target: grids of cells, and discs."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, Mask, Target
+from visioncal.vision.targets import corner_positions, marked_squares, marker_cells, tag_corners
+
+# A tag's measured corners are off those of a square by no more of its side.
+_SQUARE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A grid of dark and light cells.
+
+    Attributes:
+        corner_m: (2,) the outer corner of the first cell in the target's frame [m].
+        cell_m: Side of a cell [m].
+        dark: (rows, columns) which cells are dark.
+        turn: (2, 2) the directions of its columns and of its rows, as columns of a rotation.
+    """
+
+    corner_m: FloatArray
+    cell_m: float
+    dark: Mask
+    turn: FloatArray = field(default_factory=lambda: np.eye(2))
+
+
+def dark_cells(target: Target) -> tuple[Cells, ...]:
+    """Lists what is dark on a target: no two grids share more than a point of their dark.
+
+    Raises:
+        DataError: It is a rig of points other than tags in the plane z = 0.
+    """
+    side = target.square_m
+    match target.kind:
+        case "marker":
+            dark = marker_cells(target.dictionary, target.marker_id)
+            return (Cells(np.full(2, -0.5 * side), side / len(dark), dark),)
+        case "checkerboard":
+            # The square diagonally outside corner 0 is dark.
+            row, column = np.indices((target.rows + 1, target.columns + 1))
+            return (Cells(np.full(2, -side), side, (row + column) % 2 == 0),)
+        case "charuco":
+            return _charuco(target)
+        case "aprilgrid":
+            return _aprilgrid(target)
+        case "circles":
+            return ()
+        case "points":
+            return _tags(target)
+
+
+def _tags(target: Target) -> tuple[Cells, ...]:
+    """The tags of a rig, as they lie by their corners."""
+    known, places = tag_corners(target), corner_positions(target)
+    if not known or np.ptp(places[:, 2]) > 0.0 or min(it.min() for it in known.values()) < 0:
+        raise DataError(
+            f"target {target.name} is a rig of points; a board can be printed, or a rig in one "
+            "plane z = 0 whose points are all four corners of tags.",
+            culprits=[target.name],
+        )
+    grids = []
+    for number, corners in known.items():
+        quad = places[corners, :2]
+        cells = marker_cells(target.dictionary, number)
+        across, down = quad[1] - quad[0], quad[3] - quad[0]
+        side_m = float(np.linalg.norm(across))
+        square = np.array([[-across[1], across[0]], quad[2] - quad[0] - across])
+        if np.abs(square - down).max() > _SQUARE * side_m:
+            raise DataError(
+                f"target {target.name}: the corners of tag {number} are no square, clockwise from "
+                "its upper left.",
+                culprits=[f"tag {number}"],
+            )
+        turn = np.stack([across, down], axis=1) / side_m
+        grids.append(Cells(quad[0], side_m / len(cells), cells, turn))
+    return tuple(grids)
+
+
+def dark_discs(target: Target) -> FloatArray:
+    """The (n, 2) middles of the dark discs on a target [m], of its diameter."""
+    return corner_positions(target)[:, :2] if target.kind == "circles" else np.zeros((0, 2))
+
+
+def _charuco(target: Target) -> tuple[Cells, ...]:
+    light = marked_squares(target)
+    dark = np.ones((target.rows, target.columns), dtype=bool)
+    dark[light[:, 1], light[:, 0]] = False
+    grids = [Cells(np.zeros(2), target.square_m, dark)]
+    inset = (target.square_m - target.marker_m) / 2
+    for marker_id, square in enumerate(light):
+        cells = marker_cells(target.dictionary, marker_id)
+        corner_m = target.square_m * square + inset
+        grids.append(Cells(corner_m, target.marker_m / len(cells), cells))
+    return tuple(grids)
+
+
+def _aprilgrid(target: Target) -> tuple[Cells, ...]:
+    """The tags, turned by half a turn as on Kalibr's pages, and a square off each corner of one."""
+    side, gap = target.square_m, target.square_m * target.spacing
+    corners = corner_positions(target)[::4, :2]
+    grids = []
+    for number, corner_m in enumerate(corners, start=target.marker_id):
+        cells = np.rot90(marker_cells(target.dictionary, number, target.border), 2)
+        grids.append(Cells(corner_m, side / len(cells), cells))
+    x, y = np.meshgrid(np.arange(target.columns + 1), np.arange(target.rows + 1))
+    squares = (side + gap) * np.stack([x, y], axis=-1).reshape(-1, 2) - gap
+    return (*grids, *(Cells(it, gap, np.ones((1, 1), bool)) for it in squares))

@@ -1,0 +1,581 @@
+"""Targets, printed ones and rigs of known points: their files, corners and symmetries.
+
+The target's frame: for a ChArUco board the origin is the outer corner of square 0, for a
+checkerboard inner corner 0, for circles the first one's centre, for an AprilGrid the outer corner
+of the tag at the upper left, for a single marker its centre; x runs along columns, y along rows
+(down the printed page), and z into the board. A rig of points has the frame that its table is in.
+"""
+
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+
+from visioncal.core import transforms
+from visioncal.core.documents.tables import TextTable, read_table
+from visioncal.core.errors import DataError
+from visioncal.core.files import Table, did_you_mean, find_described, is_inside, read_toml
+from visioncal.core.types import FloatArray, IntArray, Mask, Target, TargetKind
+
+# An undeclared square is known as well as office printers keep their scale: to 0.1 %.
+DEFAULT_RELATIVE_SIGMA = 1e-3
+
+# No square is known better, not even one etched in glass.
+LEAST_SIGMA_M = 1e-8
+
+# No printed square is larger; a larger number is in millimetres.
+LARGEST_M = 1.0
+
+# The columns of a rig's table; sigma_m may be absent, and tag and corner, together.
+RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
+_WHOLE_NUMBERS = ("point", "tag", "corner")
+# No rig of one cell is larger [m]: a larger number is in millimetres. A pose takes four points.
+_LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
+
+# Fewer do not determine a pose robustly; more do not fit a printable board.
+_MIN_SQUARES, _MAX_SQUARES = 3, 100
+
+# A tag has four corners, which do; Kalibr's page has tags of this family with borders of two
+# modules, and white of no more than a tag between them.
+_MIN_TAGS, _MOST_SPACING, _MOST_BORDER = 1, 1.0, 2
+APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
+# A marker's corners, clockwise from its upper left, in its sides.
+_CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+# Circles leave so much white between them that their edges are told apart.
+_WIDEST = 0.85
+# Kinds that are found where the image shows a part of them; so are rigs of tags.
+FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
+
+
+def _shipped() -> dict[str, Path]:
+    """The boards that come with visioncal, by name."""
+    package = Path(__file__).resolve().parent
+    # A wheel carries the boards inside the package; a source tree keeps them beside it.
+    for folder in (package / "boards", package.parents[1] / "targets"):
+        if folder.is_dir():
+            return {path.stem: path for path in folder.glob("*.toml")}
+    return {}
+
+
+def target_names() -> tuple[str, ...]:
+    """Lists the names of the boards that come with visioncal."""
+    return tuple(sorted(_shipped()))
+
+
+def load_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
+    """Loads a target's description.
+
+    Args:
+        name_or_path: A name among `target_names()`, or the path of a `.toml`.
+        folder: Relative paths start here; the working directory where None.
+
+    Returns:
+        The target, and the content of its file as it was read.
+
+    Raises:
+        DataError: There is no such target, or its description is wrong.
+    """
+    path = find_described(
+        name_or_path, what="target", shipped=_shipped(), suffixes=(".toml",), folder=folder
+    )
+    document = read_toml(path, path.name)
+    rig = document.get("points")
+    if document.get("kind") == "points" and isinstance(rig, str):
+        document["points"] = _read_rig(path.parent, rig.replace("\\", "/"))
+    return target_from_document(document, path.stem), document
+
+
+def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
+    """Reads the table of a rig's points, column by column; it lies beside the rig's description."""
+    path = folder / name
+    if not is_inside(path, folder):
+        raise DataError(
+            f"points = {name!r} leads out of the folder of the target's file.",
+            culprits=["points"],
+            next_step="Copy the table of points beside the target's file.",
+        )
+    table = read_table(path)
+    unknown = [it for it in table.columns if it not in RIG_COLUMNS]
+    missing = [it for it in RIG_COLUMNS[:4] if it not in table.columns]
+    if unknown or missing:
+        raise DataError(
+            f"{path}: its columns are {', '.join(table.columns)}; point, x_m, y_m, z_m and, where "
+            "it is known, sigma_m are needed; tag and corner where they are corners of tags.",
+            culprits=[f"{path.name}: {it}" for it in (*missing, *unknown)],
+        )
+    return {name: _column(table, at) for at, name in enumerate(table.columns)}
+
+
+def _column(table: TextTable, at: int) -> list[Any]:
+    read = int if table.columns[at] in _WHOLE_NUMBERS else float
+    values = []
+    for row, cells in enumerate(table.rows):
+        try:
+            values.append(read(cells[at]))
+        except ValueError:
+            what = "whole number" if read is int else "number"
+            raise DataError(
+                f"{table.place(row)}, column {table.columns[at]}: {cells[at]!r} is no {what}.",
+                culprits=[table.place(row)],
+            ) from None
+    return values
+
+
+def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
+    """Writes a rig's points, column by column, as the text of its table."""
+    columns = [it for it in RIG_COLUMNS if it in points]
+    rows = zip(*(points[it] for it in columns), strict=True)
+    return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
+
+
+def target_from_document(document: Mapping[str, Any], name: str) -> Target:
+    """Builds a target from the content of its `.toml`.
+
+    `square_sigma_m` left out becomes 0.1 % of the side, which is how well office printers keep
+    their scale.
+
+    Args:
+        document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for
+            a single marker kind, id, size_m, dictionary; for an AprilGrid kind, columns, rows,
+            size_m, spacing and, where they are not Kalibr's, id, dictionary, border; for circles
+            kind, columns, rows, square_m, diameter_m, asymmetric; for a rig kind and points, the
+            columns of its table as lists.
+        name: The name that the target gets.
+
+    Raises:
+        DataError: A field is missing, of another type, or out of range.
+    """
+    table = Table(document, f"target {name}")
+    kind = table.choice("kind", get_args(TargetKind))
+    if kind == "marker":
+        return _marker(table, name)
+    if kind == "aprilgrid":
+        return _aprilgrid(table, name)
+    if kind == "points":
+        return _rig(table, name)
+    if kind == "circles":
+        return _circles(table, name)
+    columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
+    rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    square_m = _size(table, "square_m")
+    sigma_m = _sigma(table, square_m)
+    if kind == "checkerboard":
+        return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
+    marker_m = table.number("marker_m", positive=True)
+    # OpenCV compares the sides in single precision, which does not hold all numbers.
+    if marker_m >= square_m or not 0.0 < np.float32(marker_m) < np.float32(square_m):
+        raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
+    dictionary = table.text("dictionary")
+    markers, needed = _dictionary_size(table, dictionary), columns * rows // 2
+    if markers < needed:
+        raise DataError(
+            f"{table.label}: dictionary {dictionary} has {markers} markers; a board of "
+            f"{columns} x {rows} squares needs {needed}.",
+            culprits=[f"{table.label}: dictionary"],
+        )
+    legacy = table.flag("legacy", default=False)
+    return Target(name, "charuco", columns, rows, square_m, sigma_m, marker_m, dictionary, legacy)
+
+
+def _size(table: Table, key: str) -> float:
+    size_m = table.number(key, positive=True)
+    if size_m > LARGEST_M:
+        raise table.refuse(key, size_m, f"metres, such as {1e-3 * size_m:g} for {size_m:g} mm")
+    return size_m
+
+
+def _sigma(table: Table, size_m: float) -> float:
+    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
+    if not LEAST_SIGMA_M <= sigma_m <= size_m:
+        needed = f"a standard deviation from {LEAST_SIGMA_M:g} m to the square's own {size_m:g} m"
+        raise table.refuse("square_sigma_m", sigma_m, needed)
+    return sigma_m
+
+
+def _marker(table: Table, name: str) -> Target:
+    size_m = _size(table, "size_m")
+    sigma_m = _sigma(table, size_m)
+    dictionary = table.text("dictionary")
+    marker_id = table.integer("id", 0, _dictionary_size(table, dictionary) - 1)
+    return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=marker_id)
+
+
+def _aprilgrid(table: Table, name: str) -> Target:
+    columns = table.integer("columns", _MIN_TAGS, _MAX_SQUARES)
+    rows = table.integer("rows", _MIN_TAGS, _MAX_SQUARES)
+    size_m = _size(table, "size_m")
+    sigma_m = _sigma(table, size_m)
+    spacing = table.number("spacing", positive=True)
+    if spacing > _MOST_SPACING:
+        raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3,")
+    dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
+    markers = _dictionary_size(table, dictionary)
+    first = table.integer("id", 0, markers - 1, 0)
+    if first + columns * rows > markers:
+        raise DataError(
+            f"{table.label}: dictionary {dictionary} has {markers} tags; {columns} x {rows} tags "
+            f"from id {first} on need {first + columns * rows}.",
+            culprits=[f"{table.label}: columns"],
+        )
+    border = table.integer("border", 1, _MOST_BORDER, _MOST_BORDER)
+    return Target(
+        name,
+        "aprilgrid",
+        columns,
+        rows,
+        size_m,
+        sigma_m,
+        dictionary=dictionary,
+        marker_id=first,
+        spacing=spacing,
+        border=border,
+    )
+
+
+def _circles(table: Table, name: str) -> Target:
+    columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
+    rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    square_m = _size(table, "square_m")
+    asymmetric = table.flag("asymmetric", default=False)
+    diameter_m = table.number("diameter_m", positive=True)
+    # Nearer circles would touch.
+    apart_m = square_m * np.sqrt(2.0) if asymmetric else square_m
+    if diameter_m >= _WIDEST * apart_m:
+        needed = f"less than {_WIDEST:g} of the distance of neighbours, {apart_m:g} m,"
+        raise table.refuse("diameter_m", diameter_m, needed)
+    return Target(
+        name,
+        "circles",
+        columns,
+        rows,
+        square_m,
+        _sigma(table, square_m),
+        diameter_m=diameter_m,
+        asymmetric=asymmetric,
+    )
+
+
+def _rig(table: Table, name: str) -> Target:
+    columns = table.content.get("points")
+    if not isinstance(columns, Mapping) or not all(it in columns for it in RIG_COLUMNS[:4]):
+        raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
+    names = [it for it in RIG_COLUMNS if it in columns]
+    lists = [columns[it] for it in names]
+    try:
+        values = np.array(lists, dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros((0, 0))
+    if values.ndim != 2 or not np.isfinite(values).all():
+        raise table.refuse("points", "a table with gaps", "a finite number in every cell")
+    numbers, places_m = values[0], values[1:4].T
+    sigmas_m = values[names.index("sigma_m")] if "sigma_m" in names else np.zeros(0)
+    if len(numbers) < _FEWEST_POINTS:
+        raise table.refuse("points", f"a table of {len(numbers)}", "four points or more")
+    repeated = sorted({int(it) for it in numbers if np.sum(numbers == it) > 1})
+    if repeated or (numbers != np.round(numbers)).any():
+        given = f"a table with point {repeated[0]} twice" if repeated else "a table"
+        raise table.refuse("points", given, "a whole number of its own for each point")
+    extent_m = float(np.ptp(places_m, axis=0).max())
+    if not 0.0 < extent_m <= _LARGEST_RIG_M:
+        needed = f"a rig of up to {_LARGEST_RIG_M:g} m, in metres"
+        raise table.refuse("points", f"a table over {extent_m:g} m", needed)
+    if (sigmas_m <= 0).any():
+        raise table.refuse("points", f"sigma_m = {sigmas_m.min():g}", "sigmas above 0")
+    return Target(
+        name,
+        "points",
+        len(numbers),
+        1,
+        extent_m,
+        0.0,
+        points_m=tuple((x, y, z) for x, y, z in places_m.tolist()),
+        point_numbers=tuple(numbers.astype(int).tolist()),
+        point_sigmas_m=tuple(sigmas_m.tolist()),
+        **_tags_of_rig(table, columns),
+    )
+
+
+def _tags_of_rig(table: Table, columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Which corners of which tags a rig's points are, and the tags' dictionary."""
+    given = [it for it in ("tag", "corner") if it in columns]
+    if not given:
+        return {}
+    if len(given) == 1:
+        raise table.refuse(
+            "points", f"a table with {given[0]} alone", "tag and corner, or neither,"
+        )
+    dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
+    markers = _dictionary_size(table, dictionary)
+    pairs = list(zip(columns["tag"], columns["corner"], strict=True))
+    for tag, corner in pairs:
+        if tag not in range(markers) or corner not in range(4):
+            given_here = f"a table with tag {tag}, corner {corner}"
+            raise table.refuse("points", given_here, f"tags 0 to {markers - 1}, corners 0 to 3,")
+        if pairs.count((tag, corner)) > 1:
+            twice = f"a table with corner {corner} of tag {tag} twice"
+            raise table.refuse("points", twice, "each corner once,")
+    return {
+        "dictionary": dictionary,
+        "point_tags": tuple((int(tag), int(corner)) for tag, corner in pairs),
+    }
+
+
+def _dictionary_size(table: Table, name: str) -> int:
+    """Counts the markers of one of OpenCV's dictionaries."""
+    known = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
+    if name not in known:
+        raise DataError(
+            f"{table.label}: dictionary is {name!r}, which OpenCV does not have.",
+            culprits=[f"{table.label}: dictionary"],
+            next_step=did_you_mean(name.upper(), known)
+            or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
+        )
+    return len(aruco_dictionary(name).bytesList)
+
+
+def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """Gives one of OpenCV's dictionaries, by a name that a target has."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def metres(millimetres: float) -> float:
+    """Turns millimetres into metres without rounding twice: 23.6 becomes 0.0236."""
+    return float(Decimal(str(millimetres)) / 1000)
+
+
+def target_document(target: Target) -> dict[str, Any]:
+    """Writes a target as the content of a `.toml`, which `target_from_document` reads back."""
+    document: dict[str, Any]
+    if target.kind == "marker":
+        return {
+            "kind": "marker",
+            "id": target.marker_id,
+            "size_m": target.square_m,
+            "square_sigma_m": target.square_sigma_m,
+            "dictionary": target.dictionary,
+        }
+    if target.kind == "aprilgrid":
+        return {
+            "kind": "aprilgrid",
+            "columns": target.columns,
+            "rows": target.rows,
+            "size_m": target.square_m,
+            "square_sigma_m": target.square_sigma_m,
+            "spacing": target.spacing,
+            "dictionary": target.dictionary,
+            "id": target.marker_id,
+            "border": target.border,
+        }
+    if target.kind == "points":
+        x_m, y_m, z_m = corner_positions(target).T.tolist()
+        tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
+        columns = (list(target.point_numbers), x_m, y_m, z_m, list(target.point_sigmas_m), *tags)
+        rig = dict(zip(RIG_COLUMNS, columns, strict=True))
+        document = {"kind": "points", "points": {name: it for name, it in rig.items() if it}}
+        return document | ({"dictionary": target.dictionary} if target.point_tags else {})
+    document = {
+        "kind": target.kind,
+        "columns": target.columns,
+        "rows": target.rows,
+        "square_m": target.square_m,
+        "square_sigma_m": target.square_sigma_m,
+    }
+    if target.kind == "circles":
+        document |= {"diameter_m": target.diameter_m, "asymmetric": target.asymmetric}
+    if target.kind == "charuco":
+        document |= {
+            "marker_m": target.marker_m,
+            "dictionary": target.dictionary,
+            "legacy": target.legacy,
+        }
+    return document
+
+
+def corner_positions(target: Target) -> FloatArray:
+    """Computes where the target's corners are.
+
+    Returns:
+        (n, 3) positions in the target's frame [m], in the order of the corners' numbers. A
+        marker's four corners come in OpenCV's order, clockwise from its top left; those of an
+        AprilGrid likewise on the page, tag by tag in the order of their ids; the points of a rig in
+        that of its table.
+    """
+    side = target.square_m
+    if target.kind == "points":
+        return np.array(target.points_m, dtype=float)
+    if target.kind == "marker":
+        return np.asarray(side * (_CLOCKWISE - np.array([0.5, 0.5, 0.0])))
+    if target.kind == "aprilgrid":
+        places = np.pad((1.0 + target.spacing) * tag_places(target), ((0, 0), (0, 1)))
+        return np.asarray(side * (places[:, None] + _CLOCKWISE).reshape(-1, 3))
+    if target.kind == "circles":
+        places = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
+        return np.asarray(side * np.pad(places, ((0, 0), (0, 1))), dtype=float)
+    inset = 1 if target.kind == "charuco" else 0
+    rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
+    flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
+    return np.asarray(side * flat, dtype=float)
+
+
+def tag_places(target: Target) -> IntArray:
+    """The (t, 2) columns and rows of an AprilGrid's tags, in the order of their ids.
+
+    As on Kalibr's pages the first tag is at the lower left, and ids run along the rows.
+    """
+    rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    return np.stack([columns, target.rows - 1 - rows], axis=1)
+
+
+def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
+    """The (n, 2) columns and rows of circles, row by row; of an asymmetric grid in half columns."""
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    return np.stack([2 * column + row % 2 if asymmetric else column, row], axis=1)
+
+
+def point_numbers(target: Target) -> tuple[int, ...]:
+    """The numbers that people give a target's corners, in the order of `corner_positions`."""
+    return target.point_numbers or tuple(range(len(corner_positions(target))))
+
+
+def numbered_positions(targets: Sequence[Target]) -> FloatArray:
+    """The (c, 3) corners of several targets, numbered through, each in its own target's frame."""
+    return np.concatenate([np.zeros((0, 3)), *map(corner_positions, targets)])
+
+
+def tag_corners(target: Target) -> dict[int, IntArray]:
+    """The places (4,) of a rig's tags' corners among its points, by their ids; -1 without one."""
+    found: dict[int, IntArray] = {}
+    for at, (tag, corner) in enumerate(target.point_tags):
+        found.setdefault(tag, np.full(4, -1))[corner] = at
+    return found
+
+
+def first_corners(targets: Sequence[Target]) -> IntArray:
+    """Numbers (b,) that the first corners of several targets get where all are numbered through."""
+    counts = [len(corner_positions(it)) for it in targets]
+    return np.cumsum([0, *counts], dtype=np.int64)[:-1]
+
+
+def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
+    """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
+    side = target.square_m
+    if target.kind == "points":
+        places = corner_positions(target)[:, :2]
+        return places.min(axis=0), places.max(axis=0)
+    if target.kind == "marker":
+        return np.full(2, -0.5 * side), np.full(2, 0.5 * side)
+    if target.kind == "aprilgrid":
+        # Small squares stand around the outermost tags too.
+        count = np.array([target.columns, target.rows])
+        high = side * (count * (1.0 + target.spacing))
+        return np.full(2, -side * target.spacing), high
+    if target.kind == "circles":
+        places, radius = corner_positions(target)[:, :2], target.diameter_m / 2
+        return places.min(axis=0) - radius, places.max(axis=0) + radius
+    # A checkerboard's origin is its first inner corner, one square inside.
+    low = np.full(2, 0.0 if target.kind == "charuco" else -side)
+    return low, side * np.array([target.columns, target.rows], dtype=float)
+
+
+def marker_cells(dictionary_name: str, marker_id: int, border: int = 1) -> Mask:
+    """The (n, n) dark cells of a marker, its border of so many cells included."""
+    dictionary = aruco_dictionary(dictionary_name)
+    size = dictionary.markerSize
+    code = dictionary.bytesList[marker_id : marker_id + 1]
+    bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
+    return np.pad(bits == 0, border, constant_values=True)
+
+
+def marked_squares(target: Target) -> IntArray:
+    """The (m, 2) light squares of a ChArUco board, as column and row, in the order of their ids.
+
+    Raises:
+        DataError: The target is of another kind.
+    """
+    # OpenCV says where the markers lie; the squares between them are dark.
+    places = np.asarray(charuco_board(target).getObjPoints(), dtype=float)[..., :2]
+    return np.asarray(np.floor(places.mean(axis=1) / target.square_m), dtype=np.int64)
+
+
+# Kept, because OpenCV warns of a narrow rim around the markers as often as it builds the board.
+@lru_cache(maxsize=64)
+def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
+    """Builds OpenCV's board for a ChArUco target.
+
+    Raises:
+        DataError: The target is of another kind.
+    """
+    if target.kind != "charuco":
+        raise DataError(f"target {target.name} is a {target.kind}; a charuco board is needed.")
+    board = cv2.aruco.CharucoBoard(
+        (target.columns, target.rows),
+        target.square_m,
+        target.marker_m,
+        aruco_dictionary(target.dictionary),
+    )
+    board.setLegacyPattern(target.legacy)
+    return board
+
+
+def rotation_transforms(target: Target) -> FloatArray:
+    """Lists the rotations in the plane that leave the printed pattern as it is.
+
+    Markers break every symmetry. The squares of a checkerboard of c x r inner corners have the
+    colour of (column + row) mod 2 over c + 1 columns and r + 1 rows. A half turn takes square
+    (i, j) to (c - i, r - j) and keeps the colours where c + r is even; a quarter turn takes it to
+    (c - j, i) and needs c = r, even. Circles have no colours: a symmetric grid looks the same after
+    a half turn, and an asymmetric one of an even number of rows.
+
+    Returns:
+        (k, 4, 4) `target_from_turned`, the identity first: the pattern, carried along by any of
+        them, covers itself.
+    """
+    identity = np.eye(4)
+    if target.kind == "circles":
+        return _turns_of_circles(target)
+    if target.kind != "checkerboard" or (target.columns + target.rows) % 2:
+        return identity[None]
+    width_m = target.square_m * (target.columns - 1)
+    height_m = target.square_m * (target.rows - 1)
+    half = transforms.compose(np.diag([-1.0, -1.0, 1.0]), np.array([width_m, height_m, 0.0]))
+    if target.columns != target.rows or target.columns % 2:
+        return np.stack([identity, half])
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    quarter = transforms.compose(turn, np.array([width_m, 0.0, 0.0]))
+    return np.stack([identity, quarter, half, transforms.invert(quarter)])
+
+
+def _turns_of_circles(target: Target) -> FloatArray:
+    """The turns about a grid's middle, by quarters, that carry every circle to one."""
+    places = corner_positions(target)
+    low, high = places.min(axis=0), places.max(axis=0)
+    turns = []
+    for quarters in range(4):
+        cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters]
+        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        turned = places @ turn.T
+        shift = (low + high - turned.min(axis=0) - turned.max(axis=0)) / 2
+        away = np.linalg.norm(turned[:, None] + shift - places, axis=2).min(axis=1)
+        if away.max() < 0.1 * target.square_m:
+            turns.append(transforms.compose(turn, shift))
+    return np.stack(turns)
+
+
+def rotations(target: Target) -> tuple[IntArray, ...]:
+    """Lists the corner numberings that the printed pattern itself cannot tell apart.
+
+    Returns:
+        Permutations p, the identity first, one for each of `rotation_transforms`: turned by that
+        transform, corner i lies where corner p[i] was.
+    """
+    positions = corner_positions(target)
+    permutations = []
+    for turn in rotation_transforms(target):
+        turned = positions @ turn[:3, :3].T + turn[:3, 3]
+        distance = np.linalg.norm(turned[:, None] - positions[None], axis=-1)
+        permutations.append(np.asarray(distance.argmin(axis=1), dtype=np.int64))
+    return tuple(permutations)
