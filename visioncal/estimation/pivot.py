@@ -2,7 +2,7 @@
 
 The linear solution starts a joint fit of the tool and of the touched points, whitened by what is
 known of the robot's noise, so that touches along the tool's axes carry the tip's uncertainty into
-its rotation. Touches that do not agree are left out (see `agreement`) and named.
+its rotation. Touches that do not agree are left out (see `group_outliers`) and named.
 """
 
 from dataclasses import dataclass, replace

@@ -77,7 +77,7 @@ class Solved:
         return self.agreed.problem.subset(self.agreed.used)
 
     def found_of_looks(self) -> Iterator[tuple[str, bool]]:
-        """Says what was found of lenses and boards; see `stages.found`."""
+        """Says what was found of lenses and boards; see `stages.fit_messages`."""
         if self.seen is not None:
             part = self.agreed.problem.subset(self.agreed.used)
             side = _side(self.cell, self.agreed, self.arms, self.late)

@@ -325,7 +325,7 @@ class RobotArm:
             fit: Their fit.
             spread: (p, p) its covariance.
             middles: (3,) the middle of each printed target by its frame, in that [m].
-            convention: Of the table that is wanted; see `stages.tell`.
+            convention: Of the table that is wanted; see `stages.arm_identifiability`.
         """
         drift = None
         if self.drift is not None and self.heat is not None:
